@@ -1,0 +1,87 @@
+"""Closed-loop mechanisms: simulation without drift, through singular configurations.
+
+The public names are imported on first use, so that ``import srm_mbs`` stays fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from srm_mbs.assembly import Assembly, assemble
+    from srm_mbs.closures import CLOSURE_TYPES
+    from srm_mbs.errors import (
+        AssemblyError,
+        InputError,
+        SimulationError,
+        SrmError,
+        SrmWarning,
+    )
+    from srm_mbs.loading import bundled_models, load, n_four_bar
+    from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
+    from srm_mbs.methods.psrm import PSRM
+    from srm_mbs.methods.tableaus import TABLEAUS, ButcherTableau
+    from srm_mbs.simulation import simulate
+    from srm_mbs.solution import Solution
+    from srm_mbs.storage import load_solution
+
+_HOME = {
+    "Anchor": "mechanism",
+    "Assembly": "assembly",
+    "AssemblyError": "errors",
+    "ButcherTableau": "methods.tableaus",
+    "CLOSURE_TYPES": "closures",
+    "InputError": "errors",
+    "LoopClosure": "mechanism",
+    "Mechanism": "mechanism",
+    "PSRM": "methods.psrm",
+    "SimulationError": "errors",
+    "Solution": "solution",
+    "SrmError": "errors",
+    "SrmWarning": "errors",
+    "TABLEAUS": "methods.tableaus",
+    "assemble": "assembly",
+    "bundled_models": "loading",
+    "load": "loading",
+    "load_solution": "storage",
+    "n_four_bar": "loading",
+    "simulate": "simulation",
+}
+
+__all__ = [
+    "CLOSURE_TYPES",
+    "TABLEAUS",
+    "PSRM",
+    "Anchor",
+    "Assembly",
+    "AssemblyError",
+    "ButcherTableau",
+    "InputError",
+    "LoopClosure",
+    "Mechanism",
+    "SimulationError",
+    "Solution",
+    "SrmError",
+    "SrmWarning",
+    "assemble",
+    "bundled_models",
+    "load",
+    "load_solution",
+    "n_four_bar",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

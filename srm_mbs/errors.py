@@ -1,0 +1,106 @@
+"""Exceptions and warnings of the package.
+
+Every exception carries the data that failed, so that a program can react to it without
+parsing the text.  Bad input raises :class:`InputError` before any stepping; a run that
+cannot go on returns a partial :class:`~srm_mbs.solution.Solution` and raises
+:class:`SimulationError` only on request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from srm_mbs.solution import Solution
+
+
+class SrmError(Exception):
+    """Base class of everything that this package raises on purpose."""
+
+
+class InputError(SrmError, ValueError):
+    """Bad input: what is wrong, where, and what to do about it.
+
+    Parameters
+    ----------
+    problem
+        What is wrong, without a final full stop.
+    file, element
+        The file and the element in it (a TOML key path, a URDF element, an argument) at fault.
+    remedy
+        What the reader can do.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: str | None = None,
+        element: str | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        self.problem = problem
+        self.file = file
+        self.element = element
+        self.remedy = remedy
+        super().__init__(problem)
+
+    def __str__(self) -> str:
+        where = ": ".join(part for part in (self.file, self.element) if part)
+        text = f"{where}: {self.problem}" if where else self.problem
+        return f"{text}. {self.remedy}" if self.remedy else text
+
+    def located(self, file: str) -> InputError:
+        """The same error with ``file`` filled in where it was unknown (the object itself)."""
+        if self.file is None:
+            self.file = file
+        return self
+
+
+class AssemblyError(InputError):
+    """The loops cannot be closed, or the held values or rates contradict each other.
+
+    Attributes
+    ----------
+    residuals
+        Gap of each loop, by name: (m or None, rad or None), at the closest configuration.
+    q
+        The closest configuration found, shape (nq,).
+    held
+        Names of the held joints that are to blame, where that could be found out.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        residuals: Mapping[str, tuple[float | None, float | None]],
+        q: Any,
+        held: tuple[str, ...] = (),
+        **where: Any,
+    ) -> None:
+        super().__init__(problem, **where)
+        self.residuals = dict(residuals)
+        self.q = q
+        self.held = held
+
+
+class EvaluationError(SrmError, ArithmeticError):
+    """The equations of motion could not be evaluated at one Runge-Kutta stage."""
+
+
+class ControllerError(SrmError):
+    """The user's controller raised, or returned something that is not a finite (nv,) vector."""
+
+
+class SimulationError(SrmError, RuntimeError):
+    """A run failed and the caller asked for an exception; ``solution`` holds what was computed."""
+
+    def __init__(self, message: str, solution: Solution) -> None:
+        super().__init__(message)
+        self.solution = solution
+
+
+class SrmWarning(UserWarning):
+    """A setting was changed to a safe value, or the input is unusual but usable."""

@@ -1,0 +1,250 @@
+"""``load``: from a bundled name or a file to an assembled mechanism."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.assembly import assemble
+from srm_mbs.coordinates import set_position, set_rate
+from srm_mbs.errors import InputError
+from srm_mbs.loading.bundled import bundled_models, generated_size, models_folder
+from srm_mbs.loading.description import Description, parse_description
+from srm_mbs.loading.generated import n_four_bar as _n_four_bar_texts
+from srm_mbs.loading.urdf import ROOT_JOINTS, build_urdf, lock_joints
+from srm_mbs.mechanism import Mechanism, SimulationDefaults, Source
+
+__all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]
+
+log = logging.getLogger(__name__)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError("there is no such file", file=str(path)) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"it is not UTF-8 text: {error}", file=str(path)) from error
+    except OSError as error:
+        raise InputError(f"it cannot be read: {error.strerror}", file=str(path)) from error
+
+
+def _check_joint_names(description: Description, model: pin.Model, file: str) -> None:
+    """Refuse names in [initial] and lock that are no moving joints."""
+    known = tuple(model.names)[1:]
+    places: list[tuple[str, Sequence[str]]] = [
+        ("lock", description.lock),
+        ("initial.q", list(description.initial.q)),
+        ("initial.v", list(description.initial.v)),
+        ("initial.guess", list(description.initial.guess)),
+    ]
+    for where, names in places:
+        for name in names:
+            if name not in known:
+                raise InputError(
+                    f"there is no moving joint {name!r}",
+                    file=file,
+                    element=where,
+                    remedy=f"Known: {', '.join(known)}",
+                )
+    for name in description.initial.q:
+        if name in description.initial.guess:
+            raise InputError(
+                f"joint {name!r} is held in initial.q and guessed in initial.guess",
+                file=file,
+                element="initial.guess",
+                remedy="Keep one of the two",
+            )
+
+
+def _without_locked(
+    description: Description, model: pin.Model, file: str
+) -> tuple[pin.Model, dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The model without the locked joints, and q, v and guess of those that remain."""
+    initial = description.initial
+    q, v, guess = dict(initial.q), dict(initial.v), dict(initial.guess)
+    if not description.lock:
+        return model, q, v, guess
+    whole = Mechanism(model)
+    frozen = np.array(whole.q0)
+    for name in description.lock:
+        value = q.pop(name, guess.pop(name, None))
+        if value is not None:
+            set_position(whole, frozen, name, value)
+        rate = np.zeros(model.nv)
+        set_rate(whole, rate, name, v.pop(name, np.zeros(whole.joint(name).nv)))
+        if rate.any():
+            raise InputError(
+                f"joint {name!r} is locked but has an initial rate",
+                file=file,
+                element="initial.v",
+                remedy="Remove the rate, or the joint from lock",
+            )
+    return lock_joints(model, list(description.lock), frozen), q, v, guess
+
+
+def _unassembled(
+    description: Description, source: Source
+) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
+    """The mechanism with the guess as its q0, and the held positions and rates."""
+    file = source.path
+    built = build_urdf(source.urdf, source.urdf_path, source.base)
+    built.model.gravity.linear = np.array(source.gravity)
+    _check_joint_names(description, built.model, file)
+    model, q, v, guess = _without_locked(description, built.model, file)
+    defaults = description.simulation
+    mechanism = Mechanism(
+        model,
+        description.closures(),
+        name=description.name or model.name,
+        source=source,
+        defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
+        notes=built.notes,
+    )
+    start = np.array(mechanism.q0)
+    for values in (guess, q):
+        for name, value in values.items():
+            set_position(mechanism, start, name, value)
+    return replace(mechanism, q0=start), q, v
+
+
+def rebuild(source: Source) -> Mechanism:
+    """The mechanism of a saved run; its q0 is the guess of the description, not assembled."""
+    return _unassembled(parse_description(source.description, source.path), source)[0]
+
+
+def _assembled(description: Description, source: Source) -> Mechanism:
+    mechanism, q, v = _unassembled(description, source)
+    state = assemble(mechanism, q, v)
+    # A fresh mechanism: its structure is analysed from the assembled state.
+    mechanism = replace(mechanism, q0=state.q, v0=state.v)
+    log.info(
+        "%s: %d degrees of freedom, rank %d",
+        mechanism.name,
+        mechanism.degrees_of_freedom,
+        mechanism.structure.rank,
+    )
+    return mechanism
+
+
+def _gravity(value: Any) -> tuple[float, float, float]:
+    array = np.asarray(value, dtype=float)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(f"gravity = {value!r} is not three finite numbers", element="gravity")
+    return (float(array[0]), float(array[1]), float(array[2]))
+
+
+def _load_text(
+    text: str,
+    file: str,
+    urdf: str | None,
+    overrides: Mapping[str, Any],
+) -> Mechanism:
+    """Load a description given as text; ``urdf`` is read from disk if None."""
+    description = parse_description(text, file)
+    urdf_path = Path(file).parent / description.urdf
+    if urdf is None:
+        try:
+            urdf = _read(urdf_path)
+        except InputError as error:
+            raise InputError(
+                f"cannot read the URDF {description.urdf!r} ({error.problem}: {urdf_path})",
+                file=file,
+                element="urdf",
+                remedy="The path is relative to the description",
+            ) from error
+    base = overrides.get("base") or description.base
+    if base not in ROOT_JOINTS:
+        raise InputError(
+            f"there is no base {base!r}", element="base", remedy=f"Known: {', '.join(ROOT_JOINTS)}"
+        )
+    gravity = overrides.get("gravity")
+    source = Source(
+        description=text,
+        urdf=urdf,
+        urdf_path=str(urdf_path),
+        path=file,
+        base=base,
+        gravity=_gravity(description.gravity if gravity is None else gravity),
+    )
+    return _assembled(description, source)
+
+
+def load(
+    path: str | Path,
+    *,
+    gravity: Sequence[float] | None = None,
+    base: str | None = None,
+) -> Mechanism:
+    """Load a mechanism and assemble its initial state.
+
+    Parameters
+    ----------
+    path
+        Name of a bundled mechanism (:func:`bundled_models`; ``n_four_bar_<N>`` for any N), or a
+        ``.toml`` description, or a ``.urdf`` without loops.
+    gravity : (3,) m/s^2
+        Instead of the description's.
+    base
+        ``fixed``, ``floating`` or ``planar``, instead of the description's.
+
+    Raises
+    ------
+    InputError
+        For anything that cannot be read, naming file, element and remedy.
+    AssemblyError
+        If the loops cannot close or held values contradict each other.
+    """
+    overrides = {"gravity": gravity, "base": base}
+    name = str(path)
+    is_name = not name.endswith((".toml", ".urdf")) and "/" not in name and "\\" not in name
+    if is_name and name in bundled_models():
+        path = models_folder() / f"{name}.toml"
+    elif is_name:
+        size = generated_size(name)
+        if size is None:
+            raise InputError(
+                f"there is no bundled mechanism {name!r}",
+                remedy=f"Bundled: {', '.join(bundled_models())}; or give a .toml or .urdf path",
+            )
+        return _generated(size, overrides)
+    path = Path(path)
+    file = str(path)
+    try:
+        if path.suffix == ".toml":
+            return _load_text(_read(path), file, None, overrides)
+        if path.suffix == ".urdf":
+            text = f'format = 1\nurdf = "{path.name}"\n'
+            return _load_text(text, file, _read(path), overrides)
+    except InputError as error:
+        raise error.located(file) from error.__cause__
+    raise InputError(
+        f"files of type {path.suffix!r} are not read by this version",
+        file=file,
+        remedy="Give a .toml description or a .urdf",
+    )
+
+
+def _generated(n: int, overrides: Mapping[str, Any]) -> Mechanism:
+    text, urdf = _n_four_bar_texts(n)
+    return _load_text(text, str(models_folder() / f"n_four_bar_{n}.toml"), urdf, overrides)
+
+
+def n_four_bar(n: int) -> Mechanism:
+    """The IFToMM N-four-bar benchmark with ``n`` loops (n >= 1), assembled.
+
+    Raises
+    ------
+    InputError
+        If n < 1.
+    """
+    if n < 1:
+        raise InputError(f"an N-four-bar needs n >= 1, not {n}", element="n")
+    return _generated(n, {})

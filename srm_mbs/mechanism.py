@@ -1,0 +1,349 @@
+"""Immutable descriptions: anchors, loop closures, mechanisms.
+
+Nothing here computes; :mod:`srm_mbs.systems` evaluates a mechanism.  A ``pin.Model`` cannot be
+frozen: the package treats it as constant and never attaches anything to it, and so should you.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.closures import CLOSURE_TYPES, FloatArray, RowSet
+from srm_mbs.errors import InputError
+
+if TYPE_CHECKING:
+    from srm_mbs.systems.structure import Structure
+
+WORLD = "world"
+"""Reserved link name: the fixed ground."""
+
+
+def _vector(values: Sequence[float], what: str) -> tuple[float, float, float]:
+    array = np.asarray(values, dtype=float)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} must be three finite numbers, not {values!r}",
+            element=what,
+            remedy="Give [x, y, z]",
+        )
+    return (float(array[0]), float(array[1]), float(array[2]))
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A frame fixed on a body: where a closure takes hold.
+
+    Parameters
+    ----------
+    link
+        Name of a link (a Pinocchio ``BODY`` frame), or ``"world"``.
+    frame
+        Name of any Pinocchio frame, instead of ``link``.
+    xyz : (3,) m
+        Origin of the anchor in the link's or frame's own frame.
+    rpy : (3,) rad
+        Its orientation there: fixed-axis roll, pitch, yaw as in URDF.
+
+    Raises
+    ------
+    InputError
+        If neither or both of ``link`` and ``frame`` are given, or a vector is malformed.
+    """
+
+    link: str | None = None
+    frame: str | None = None
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if (self.link is None) == (self.frame is None):
+            raise InputError(
+                "an anchor needs either a link or a frame",
+                element="anchor",
+                remedy='Write { link = "rod" } or { frame = "rod_tip" }, not both',
+            )
+        object.__setattr__(self, "xyz", _vector(self.xyz, "xyz"))
+        object.__setattr__(self, "rpy", _vector(self.rpy, "rpy"))
+
+    @property
+    def where(self) -> str:
+        """Name of the link or frame."""
+        return str(self.link if self.link is not None else self.frame)
+
+    def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
+        """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.
+
+        Raises
+        ------
+        InputError
+            If the model has no such link or frame; the message lists those it has.
+        """
+        offset = pin.SE3(pin.rpy.rpyToMatrix(np.array(self.rpy)), np.array(self.xyz))
+        if self.link == WORLD:
+            return 0, offset
+        if self.link is not None:
+            names = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
+            known = self.link in names
+            index = model.getFrameId(self.link, pin.FrameType.BODY) if known else -1
+        else:
+            names = [f.name for f in model.frames]
+            index = next((i for i, n in enumerate(names) if n == self.frame), -1)
+        if index < 0:
+            kind = "link" if self.link is not None else "frame"
+            shown = ", ".join(sorted(set(names) - {"universe"} | {WORLD}))
+            raise InputError(f"there is no {kind} {self.where!r}", remedy=f"Known: {shown}")
+        frame = model.frames[index]
+        return int(frame.parentJoint), frame.placement * offset
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """One loop closure between anchors ``a`` and ``b``.
+
+    Parameters
+    ----------
+    type
+        A key of :data:`srm_mbs.closures.CLOSURE_TYPES`.
+    a, b
+        The two anchors.
+    axis : (3,)
+        Direction in b's frame, for the types that have one; normalised here.
+    name
+        Unique name; by default made from the type and the links.
+
+    Raises
+    ------
+    InputError
+        For an unknown type, or an axis that is missing, zero or superfluous.
+    """
+
+    type: str
+    a: Anchor
+    b: Anchor
+    axis: tuple[float, float, float] | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", f"{self.type}_{self.a.where}_{self.b.where}")
+        kind = CLOSURE_TYPES.get(self.type)
+        if kind is None:
+            raise InputError(
+                f"there is no closure type {self.type!r}",
+                element=f"loop {self.name!r}",
+                remedy=f"This version knows {', '.join(CLOSURE_TYPES)}",
+            )
+        if kind.needs_axis != (self.axis is not None):
+            need = "needs an axis" if kind.needs_axis else "takes no axis"
+            raise InputError(
+                f"a {self.type} closure {need}",
+                element=f"loop {self.name!r}",
+                remedy='Give "axis = [x, y, z]", in b\'s frame'
+                if kind.needs_axis
+                else 'Remove "axis"',
+            )
+        if self.axis is not None:
+            axis = np.array(_vector(self.axis, "axis"))
+            length = float(np.linalg.norm(axis))
+            if length == 0.0:
+                raise InputError(
+                    "the axis is zero", element=f"loop {self.name!r}", remedy="Give a direction"
+                )
+            axis /= length
+            object.__setattr__(self, "axis", (float(axis[0]), float(axis[1]), float(axis[2])))
+
+    @cached_property
+    def rows(self) -> RowSet:
+        """The scalar rows of this closure, in its anchors."""
+        return CLOSURE_TYPES[self.type].rows(np.array(self.axis if self.axis else (0.0, 0.0, 0.0)))
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """``loop.row`` for every row."""
+        return tuple(f"{self.name}.{label}" for label in self.rows.labels)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a mechanism came from: enough to load it again, and to draw it.
+
+    Attributes
+    ----------
+    description
+        Text of the TOML description.
+    urdf
+        Text of the URDF as it was read.
+    urdf_path
+        Where that URDF lay, for mesh files relative to it; may be gone when a run is replayed.
+    path
+        The description's own path, for messages.
+    base, gravity
+        As used: the description's, unless the caller gave others.
+    """
+
+    description: str
+    urdf: str
+    urdf_path: str
+    path: str
+    base: str
+    gravity: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SimulationDefaults:
+    """Defaults of the command line from ``[simulation]``; ``None`` where the file is silent."""
+
+    t_end: float | None = None
+    rtol: float | None = None
+    atol: float | None = None
+
+
+def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
+    array = np.array(values, dtype=float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} has shape {array.shape} or is not finite",
+            element=what,
+            remedy=f"Give {shape[0]} finite numbers",
+        )
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """A mechanism: a Pinocchio tree, the closures of its loops, and an initial state.
+
+    Parameters
+    ----------
+    model
+        The spanning tree, gravity included; ``model.damping`` acts on the joints (N m s/rad,
+        N s/m).
+    loops
+        Loop closures; names must be unique.
+    q0 : (nq,), v0 : (nv,)
+        Initial state; by default the neutral configuration at rest.  :func:`srm_mbs.load`
+        assembles it; from a ``pin.Model`` in hand use :func:`srm_mbs.assemble`.
+    name
+        Name in messages and plots.
+    source, defaults, notes
+        Filled in by :func:`srm_mbs.load`: what the mechanism was read from, the defaults of its
+        description, and what the reader should know (elements that were ignored, and why).
+
+    Raises
+    ------
+    InputError
+        If loop names repeat, an anchor is unknown, a shape does not fit, or the model has
+        joint friction or mimic joints, which this version does not simulate.
+    """
+
+    model: pin.Model
+    loops: tuple[LoopClosure, ...] = ()
+    q0: FloatArray = None  # type: ignore[assignment]
+    v0: FloatArray = None  # type: ignore[assignment]
+    name: str = ""
+    source: Source | None = None
+    defaults: SimulationDefaults = field(default_factory=SimulationDefaults)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        model = self.model
+        set_ = object.__setattr__
+        set_(self, "loops", tuple(self.loops))
+        set_(self, "name", self.name or model.name)
+        q0 = pin.neutral(model) if self.q0 is None else self.q0
+        v0 = np.zeros(model.nv) if self.v0 is None else self.v0
+        q0 = _frozen_array(q0, (model.nq,), "q0")
+        if not pin.isNormalized(model, q0, 1e-9):
+            raise InputError(
+                "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
+                element="q0",
+                remedy="Use pinocchio.normalize(model, q0)",
+            )
+        set_(self, "q0", q0)
+        set_(self, "v0", _frozen_array(v0, (model.nv,), "v0"))
+        names = [loop.name for loop in self.loops]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(
+                    f"the loop name {name!r} is used twice",
+                    element=f"loop {name!r}",
+                    remedy="Give every loop its own name",
+                )
+        for loop in self.loops:
+            for side, anchor in (("a", loop.a), ("b", loop.b)):
+                try:
+                    anchor.resolve(model)
+                except InputError as error:
+                    error.element = f"loop {loop.name!r}, anchor {side}"
+                    raise
+            if loop.a.resolve(model)[0] == loop.b.resolve(model)[0]:
+                raise InputError(
+                    "both anchors lie on the same body",
+                    element=f"loop {loop.name!r}",
+                    remedy="Anchor it on two bodies that move relative to each other",
+                )
+        if np.any(model.friction != 0.0):
+            raise InputError(
+                "joint friction is not simulated by this version",
+                element="model.friction",
+                remedy="Set it to zero; viscous damping acts",
+            )
+
+    def with_state(self, q0: Any, v0: Any) -> Mechanism:
+        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
+        changed = replace(self, q0=q0, v0=v0)
+        if "structure" in self.__dict__:
+            changed.__dict__["structure"] = self.structure
+        return changed
+
+    @cached_property
+    def structure(self) -> Structure:
+        """Rank, redundancy and scales of the closures, found once by the walk of docs/notation.md.
+
+        The only upward import of the package: the analysis evaluates the mechanism.
+        """
+        from srm_mbs.systems.structure import analyse
+
+        return analyse(self)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """nv minus the structural rank of the closures."""
+        return int(self.model.nv) - self.structure.rank
+
+    @property
+    def redundant_rows(self) -> tuple[str, ...]:
+        """Names of the closure rows that are zero wherever the loops are closed; left out."""
+        return self.structure.redundant_rows
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the moving joints, in Pinocchio's order."""
+        return tuple(self.model.names)[1:]
+
+    def joint(self, name: str) -> Any:
+        """The Pinocchio joint model of ``name``.
+
+        Raises
+        ------
+        InputError
+            If there is no such joint; the message lists those there are.
+        """
+        if name not in self.joint_names:
+            raise InputError(
+                f"there is no joint {name!r}", remedy=f"Known: {', '.join(self.joint_names)}"
+            )
+        return self.model.joints[self.model.getJointId(name)]
+
+    def __repr__(self) -> str:
+        return (
+            f"Mechanism({self.name!r}, joints={list(self.joint_names)}, "
+            f"loops={[loop.name for loop in self.loops]})"
+        )

@@ -1,0 +1,1 @@
+"""How one step is made: the contract (``base``), the methods, and Runge-Kutta data."""

@@ -1,0 +1,139 @@
+"""The contract of a method: make one step, say how good it is.
+
+A method is a tableau plus where its multiplier comes from.  It proposes a state; whether the
+step stands is for step-size control to judge, and only :meth:`Method.accept` moves the memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.systems.base import System, Zone
+
+
+@dataclass(frozen=True)
+class ErrorNorm:
+    """Weighted root mean square of the thesis, (B.4).
+
+    xi = sqrt(mean_i (e_i / (atol_i + rtol max(|x_i|, |x_new,i|)))^2) over the tangent components.
+
+    Attributes
+    ----------
+    atol : (n,)
+        Absolute tolerance per tangent component.
+    rtol
+        Relative tolerance.
+    """
+
+    atol: FloatArray
+    rtol: float
+
+    def weights(self, magnitude: FloatArray) -> FloatArray:
+        """atol + rtol |x| (n,)."""
+        return self.atol + self.rtol * magnitude
+
+    def __call__(self, error: FloatArray, weights: FloatArray) -> float:
+        """The norm of ``error`` (n,) for ``weights`` (n,)."""
+        scaled = error / weights
+        return float(np.sqrt(scaled @ scaled / scaled.size))
+
+
+@dataclass
+class Memory:
+    """What a method carries from one accepted step to the next.
+
+    Attributes
+    ----------
+    rate : (n,)
+        Tangent rate at the current state: the first stage of the next step.
+    sigma
+        sigma there.
+    magnitude : (n,)
+        |x| of the error weights there.
+    history
+        Multipliers at recent step ends outside the zone; None without closures.
+    sigma_slope
+        |d sigma / dt| (1/s) seen by step-size control; it widens the zone for fast passages.
+    """
+
+    rate: FloatArray
+    sigma: float
+    magnitude: FloatArray
+    history: MultiplierHistory | None = None
+    sigma_slope: float = 0.0
+
+
+@dataclass(slots=True)
+class StepResult:
+    """A proposed step from ``t`` to ``t + h``.
+
+    Attributes
+    ----------
+    state
+        State at the end, corrected.
+    rates : (s + 1, n)
+        Chart rates of the stages and of the end point; what the dense output is made of.
+    end_rate : (n,)
+        Tangent rate at the corrected end point.
+    correction : (n,)
+        What was subtracted from the uncorrected end point x^-.
+    error_ratio
+        Error estimate over tolerance; 0 for a scheme without an embedded pair.
+    sigmas : (s + 1,)
+        sigma at the start, the inner stages and the end.
+    rank
+        Smallest number of rows in use at any stage.
+    zone
+        The zone, if any stage fell into it, else None.
+    history
+        The multiplier history behind that zone, else None.
+    multiplier : (m,) or None
+        yhat at the end point; None if the end point lies in the zone.
+    magnitude : (n,)
+        |x| of the error weights at the end.
+    """
+
+    t: float
+    h: float
+    state: FloatArray
+    rates: FloatArray
+    end_rate: FloatArray
+    correction: FloatArray
+    error_ratio: float
+    sigmas: FloatArray
+    rank: int
+    zone: Zone | None
+    history: MultiplierHistory | None
+    multiplier: FloatArray | None
+    magnitude: FloatArray
+
+
+class Method(Protocol):
+    """One-step method on a :class:`~srm_mbs.systems.base.System`."""
+
+    @property
+    def scheme(self) -> ButcherTableau:
+        """The Runge-Kutta data."""
+
+    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+        """Evaluate the first stage."""
+
+    def step(
+        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> StepResult:
+        """Propose a step; changes nothing but the system's workspace.
+
+        Raises
+        ------
+        EvaluationError
+            If a stage cannot be evaluated.
+        """
+
+    def accept(self, memory: Memory, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""

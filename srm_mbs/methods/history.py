@@ -1,0 +1,60 @@
+"""Multipliers of recent steps, extrapolated into the zone around a singular configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srm_mbs.closures import FloatArray
+
+POINTS = 5
+"""Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
+
+
+def lagrange_weights(nodes: FloatArray, t: float) -> FloatArray:
+    """Weights (k,) of the polynomial through ``nodes`` (k,), distinct times, at ``t``."""
+    k = len(nodes)
+    weights = np.ones(k)
+    for i in range(k):
+        for j in range(k):
+            if i != j:
+                weights[i] *= (t - nodes[j]) / (nodes[i] - nodes[j])
+    return weights
+
+
+@dataclass(frozen=True, eq=False)
+class MultiplierHistory:
+    """The last multipliers yhat outside the zone, oldest first.
+
+    Immutable: a step keeps the history that it used, for its dense output.
+
+    Attributes
+    ----------
+    times : (k,) s
+    values : (k, nv)
+    """
+
+    times: FloatArray
+    values: FloatArray
+
+    @classmethod
+    def begin(cls, t: float, value: FloatArray) -> MultiplierHistory:
+        """History with one node."""
+        return cls(np.array([t]), value[None].copy())
+
+    def extended(self, t: float, value: FloatArray) -> MultiplierHistory:
+        """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``POINTS`` nodes."""
+        times = np.concatenate([self.times, [t]])[-POINTS:]
+        return MultiplierHistory(times, np.concatenate([self.values, value[None]])[-POINTS:])
+
+    def predict(self, t: float) -> FloatArray:
+        """yhat (nv,) extrapolated to ``t``."""
+        return lagrange_weights(self.times, t) @ self.values  # type: ignore[no-any-return]
+
+    def uncertainty(self, t: float) -> FloatArray:
+        """|yhat_pred - the prediction without the oldest node| (nv,); 0 with a single node."""
+        if len(self.times) < 2:
+            return np.zeros(self.values.shape[1])
+        lower = lagrange_weights(self.times[1:], t) @ self.values[1:]
+        return np.abs(self.predict(t) - lower)  # type: ignore[no-any-return]

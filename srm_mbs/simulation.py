@@ -1,0 +1,388 @@
+"""``simulate``: from a mechanism and options to a :class:`~srm_mbs.solution.Solution`."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.errors import (
+    ControllerError,
+    EvaluationError,
+    InputError,
+    SimulationError,
+    SrmWarning,
+)
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.methods.base import ErrorNorm, Method
+from srm_mbs.methods.psrm import PSRM
+from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.progress import progress_bar
+from srm_mbs.solution import Settings, Solution, Statistics
+from srm_mbs.stepping.dense import StepData
+from srm_mbs.stepping.loop import RunRecord, Tick, integrate
+from srm_mbs.stepping.placement import SingularityPlacement
+from srm_mbs.stepping.stepsize import (
+    FixedStep,
+    PIControl,
+    StepSizeControl,
+    Verdict,
+    initial_step,
+)
+from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, make_system
+
+log = logging.getLogger(__name__)
+
+LOOSEST_RTOL = 1e-4
+"""Looser tolerances let a step jump to another branch at a change point (METHODS section 4)."""
+TIGHTEST_RTOL = 100 * np.finfo(float).eps
+CONSISTENT = 1e-8
+"""Largest scaled closure error and rate (per unit) of an initial state that is accepted."""
+SINGULAR_START = 1e-7
+"""sigma below which a start counts as singular."""
+BACKENDS = ("auto", "python")
+
+
+def _checked_rtol(rtol: float) -> float:
+    if not (math.isfinite(rtol) and rtol > 0.0):
+        raise InputError(f"rtol = {rtol!r} is not a positive number", element="rtol")
+    if rtol > LOOSEST_RTOL:
+        warnings.warn(
+            f"rtol = {rtol:g} is looser than {LOOSEST_RTOL:g}, from where a step may jump to "
+            f"another branch at a singular configuration: using {LOOSEST_RTOL:g}",
+            SrmWarning,
+            stacklevel=3,
+        )
+        return LOOSEST_RTOL
+    if rtol < TIGHTEST_RTOL:
+        warnings.warn(
+            f"rtol = {rtol:g} is below round-off: using {TIGHTEST_RTOL:.1e}",
+            SrmWarning,
+            stacklevel=3,
+        )
+        return float(TIGHTEST_RTOL)
+    return rtol
+
+
+def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
+    """Absolute tolerance per tangent component (2 nv,)."""
+    nv = mechanism.model.nv
+    units = mechanism.structure.units
+    if atol is None:
+        return rtol * np.concatenate([units.coordinate, units.coordinate * units.rate])
+    array = np.asarray(atol, dtype=float)
+    if array.shape not in ((), (nv,), (2 * nv,)) or not (array > 0.0).all():
+        raise InputError(
+            f"atol has shape {array.shape} or is not positive",
+            element="atol",
+            remedy=f"Give one positive number, {nv} (per coordinate) or {2 * nv} "
+            "(positions, then rates)",
+        )
+    if array.shape == (nv,):
+        array = np.tile(array, 2)
+    return np.broadcast_to(array, (2 * nv,)).copy()
+
+
+def _checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
+    if isinstance(method, str):
+        if method.lower() != "psrm":
+            raise InputError(
+                f"there is no method {method!r}",
+                element="method",
+                remedy='This version has "psrm"',
+            )
+        return PSRM() if tableau is None else PSRM(tableau)
+    if tableau is not None:
+        raise InputError(
+            "tableau is given beside a method object",
+            element="tableau",
+            remedy="Give the tableau to the method: PSRM(tableau=...)",
+        )
+    return method
+
+
+def _checked_times(t_eval: Any, t_end: float) -> FloatArray | None:
+    if t_eval is None:
+        return None
+    times = np.array(t_eval, dtype=float)
+    inside = times.ndim == 1 and np.isfinite(times).all()
+    if not inside or (times.size and (times.min() < 0.0 or times.max() > t_end)):
+        raise InputError(
+            "t_eval must be one-dimensional and lie within 0 and t_end", element="t_eval"
+        )
+    if np.any(np.diff(times) <= 0.0):
+        raise InputError("t_eval must increase", element="t_eval")
+    return times
+
+
+def _initial_state(
+    mechanism: Mechanism, q0: Any, v0: Any
+) -> tuple[Mechanism, FloatArray]:
+    """The mechanism with the requested start, and the state (q, v)."""
+    if q0 is not None or v0 is not None:
+        mechanism = mechanism.with_state(
+            mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
+        )
+    return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
+
+
+def _check_consistent(mechanism: Mechanism, system: ClosedSystem, state: FloatArray) -> None:
+    """Refuse a start that violates the closures or their rates."""
+    g, c = system.residuals(state)
+    speed = max(1.0, float(np.max(np.abs(state[system.nq :]), initial=0.0)))
+    for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
+        if np.max(np.abs(values)) > limit:
+            kept = [n for n, k in zip(mechanism.structure.row_names, mechanism.structure.kept) if k]
+            worst = kept[int(np.argmax(np.abs(values)))]
+            raise InputError(
+                f"the initial state violates the closures: row {worst} by "
+                f"{np.max(np.abs(values)):.1e} (scaled)",
+                element=what,
+                remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
+            )
+
+
+def _control(
+    system: OpenSystem | ClosedSystem,
+    method: Method,
+    step: float | None,
+    first_step: Callable[[], float],
+    t_end: float,
+) -> tuple[StepSizeControl, SingularityPlacement | None]:
+    scheme = method.scheme
+    inner: StepSizeControl
+    if step is not None:
+        inner = FixedStep(0.0, t_end, step)
+    else:
+        if scheme.controller_order is None:
+            raise InputError(
+                f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
+                element="tableau",
+                remedy="Give step=, or use tvd32, dopr54 or dop853",
+            )
+        inner = PIControl(t_end, first_step(), scheme.controller_order)
+    if not system.has_constraints:
+        return inner, None
+    placement = SingularityPlacement(inner, scheme)
+    return placement, placement
+
+
+def _positive(value: float | None, what: str) -> None:
+    if value is not None and not (math.isfinite(value) and value > 0.0):
+        raise InputError(f"{what} = {value!r} is not a positive number of seconds", element=what)
+
+
+def simulate(
+    mechanism: Mechanism,
+    t_end: float,
+    *,
+    q0: Any = None,
+    v0: Any = None,
+    method: str | Method = "psrm",
+    tableau: str | ButcherTableau | None = None,
+    rtol: float = 1e-6,
+    atol: Any = None,
+    step: float | None = None,
+    first_step: float | None = None,
+    max_step: float | None = None,
+    t_eval: Any = None,
+    controller: Controller | None = None,
+    progress: bool | Tick = False,
+    backend: str = "auto",
+    raise_on_failure: bool = False,
+) -> Solution:
+    """Simulate ``mechanism`` from t = 0 to ``t_end`` (s).
+
+    Parameters
+    ----------
+    mechanism
+        From :func:`srm_mbs.load`, or built from a ``pin.Model``.
+    t_end
+        End of the run (s), positive.
+    q0 : (nq,), v0 : (nv,)
+        Initial state instead of the mechanism's own; must satisfy the closures.
+    method
+        ``"psrm"`` or a method object such as :class:`srm_mbs.PSRM`.
+    tableau
+        Runge-Kutta scheme for a method given by name; ``"dop853"`` by default.
+    rtol
+        Relative tolerance, at most 1e-4; looser values are replaced with a warning.
+    atol
+        Absolute tolerance: a number, (nv,) or (2 nv,).  By default rtol times the unit of each
+        coordinate: 1 rad, the scene diagonal for lengths, and those times the mechanism's
+        characteristic rate for velocities (:class:`srm_mbs.systems.units.Units`).
+    step
+        Fixed step (s) instead of step-size control.  A step is split where a stage would lie on
+        a singular configuration; the run then returns to the grid.
+    first_step, max_step
+        First and longest step (s) of the step-size control.
+    t_eval : (n,)
+        Times (s) at which the solution is given; by default the ends of the steps.
+    controller
+        (t, q, v) -> generalised forces (nv,), N and N m, called at every stage.
+    progress
+        True for a progress bar (on a terminal only), or a callable (t, h, state).
+    backend
+        ``"auto"`` or ``"python"``.
+    raise_on_failure
+        Raise :class:`SimulationError` instead of returning a partial solution.
+
+    Returns
+    -------
+    Solution
+        With ``success`` False and everything computed so far if the run could not go on.
+
+    Raises
+    ------
+    InputError
+        For invalid input, before any stepping.
+    SimulationError
+        Only with ``raise_on_failure``.
+    """
+    _positive(t_end, "t_end")
+    for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
+        _positive(value, what)
+    if backend not in BACKENDS:
+        raise InputError(
+            f"there is no backend {backend!r}",
+            element="backend",
+            remedy=f"This version has {', '.join(BACKENDS)}; the compiled kernel is not built yet",
+        )
+    t_end = float(t_end)
+    method = _checked_method(method, tableau)
+    rtol = _checked_rtol(float(rtol))
+    times = _checked_times(t_eval, t_end)
+    mechanism, state = _initial_state(mechanism, q0, v0)
+    norm = ErrorNorm(_absolute_tolerance(mechanism, atol, rtol), rtol)
+    system = make_system(mechanism, controller)
+    if isinstance(system, ClosedSystem):
+        _check_consistent(mechanism, system, state)
+
+    placement: SingularityPlacement | None = None
+    try:
+        memory = method.start(system, 0.0, state, norm)
+        if memory.sigma < SINGULAR_START:
+            raise EvaluationError(
+                f"the start is a singular configuration (sigma = {memory.sigma:.1e}), from where "
+                "this version cannot tell the branches apart; start a little beside it"
+            )
+
+        def chosen_first_step() -> float:
+            if first_step is not None:
+                return first_step
+            order = method.scheme.controller_order or 1
+            return initial_step(system, state, memory, norm, t_end, order)
+
+        control, placement = _control(system, method, step, chosen_first_step, t_end)
+        with _progress(progress, system, t_end) as tick:
+            record = integrate(
+                system,
+                method,
+                control,
+                norm,
+                memory,
+                state,
+                0.0,
+                t_end,
+                max_step=np.inf if max_step is None else max_step,
+                tick=tick,
+            )
+    except (EvaluationError, ControllerError) as error:
+        record = RunRecord(0.0, state.copy(), np.inf)
+        record.status, record.message = "failed", f"Stopped at t = 0 s: {error}."
+    settings = Settings(
+        type(method).__name__,
+        method.scheme.name,
+        rtol,
+        tuple(norm.atol.tolist()),
+        step,
+        controller is not None,
+    )
+    solution = _collect(mechanism, system, method, record, placement, times, settings)
+    if raise_on_failure and not solution.success:
+        raise SimulationError(solution.message, solution)
+    return solution
+
+
+def _progress(
+    progress: bool | Tick, system: OpenSystem | ClosedSystem, t_end: float
+) -> AbstractContextManager[Tick | None]:
+    if callable(progress):
+        return nullcontext(progress)
+    if progress:
+        return progress_bar(system, t_end)
+    return nullcontext(None)
+
+
+def _collect(
+    mechanism: Mechanism,
+    system: OpenSystem | ClosedSystem,
+    method: Method,
+    record: RunRecord,
+    placement: SingularityPlacement | None,
+    t_eval: FloatArray | None,
+    settings: Settings,
+) -> Solution:
+    """Arrays and statistics from a run record."""
+    steps, scheme = record.steps, method.scheme
+    stages, m = scheme.n_stages + 1, system.tangent_size
+    n = len(steps)
+    data = StepData(
+        times=np.array([record.t0, *record.times]),
+        states=np.array([record.x0, *(s.state for s in steps)]),
+        rates=np.array([s.rates for s in steps]).reshape(n, stages, m),
+        corrections=np.array([s.correction for s in steps]).reshape(n, -1 if n else 0),
+        sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
+        ranks=np.array([s.rank for s in steps], dtype=float),
+        error_ratios=np.array([s.error_ratio for s in steps]),
+        zones={
+            i: (s.zone.threshold, s.history)
+            for i, s in enumerate(steps)
+            if s.zone is not None and s.history is not None
+        },
+    )
+    rejected = [a for a in record.attempts if a.verdict is Verdict.REJECTED]
+    stats = Statistics(
+        steps=n,
+        rejected=len(rejected),
+        placements=0 if placement is None else placement.placed,
+        replaced=0 if placement is None else placement.replaced,
+        zone_steps=len(data.zones),
+        evaluations=system.evaluations,
+        factorisations=system.factorisations,
+        wall_time=record.wall_time,
+    )
+    return Solution(
+        mechanism,
+        system,
+        scheme,
+        data,
+        t_eval=t_eval,
+        rejected=np.array([[a.t, a.h] for a in record.attempts]).reshape(-1, 2),
+        status=record.status,
+        message=record.message + _limits_left(mechanism, data.states),
+        stats=stats,
+        settings=settings,
+    )
+
+
+def _limits_left(mechanism: Mechanism, states: FloatArray) -> str:
+    """A sentence naming the one-degree joints that left their limits, which do not act."""
+    model = mechanism.model
+    left = []
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        if joint.nq != 1:
+            continue
+        low = model.lowerPositionLimit[joint.idx_q]
+        high = model.upperPositionLimit[joint.idx_q]
+        q = states[:, joint.idx_q]
+        if low < high and (q.min() < low or q.max() > high):
+            left.append(name)
+    return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""

@@ -1,0 +1,270 @@
+"""What a run returns: states, statistics, and quantities computed when they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.stepping.crossings import Crossing, find_crossings
+from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+from srm_mbs.systems.reactions import reactions_at
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Work done by a run.
+
+    Attributes
+    ----------
+    steps, rejected
+        Accepted steps, and steps rejected for their error.
+    placements, replaced
+        Steps shortened in advance, and redone, so that no stage lies on a singular point.
+    zone_steps
+        Accepted steps with a stage so close to a singular configuration that rows were dropped.
+    evaluations
+        Evaluations of the equations of motion, the initial step's included.
+    factorisations
+        Factorisations of the constraint algebra; 0 for an open chain.
+    wall_time
+        Seconds.
+    """
+
+    steps: int
+    rejected: int
+    placements: int
+    replaced: int
+    zone_steps: int
+    evaluations: int
+    factorisations: int
+    wall_time: float
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a run was made; kept for saving and for reports."""
+
+    method: str
+    tableau: str
+    rtol: float
+    atol: tuple[float, ...]
+    step: float | None
+    controlled: bool
+
+
+class Solution:
+    """Result of :func:`srm_mbs.simulate`.
+
+    Attributes
+    ----------
+    mechanism
+        What was simulated.
+    t : (n,) s
+        ``t_eval``, or the ends of the accepted steps, the start first.
+    q : (n, nq), v : (n, nv)
+        Configurations and velocities there.
+    status, message, success
+        ``finished``, ``failed`` or ``interrupted``; when and why; whether the end was reached.
+    stats
+        :class:`Statistics`.
+    settings
+        :class:`Settings`.
+    rejected : (k, 2)
+        Start time and length of the steps that did not stand.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        system: OpenSystem | ClosedSystem,
+        scheme: ButcherTableau,
+        steps: StepData,
+        *,
+        t_eval: FloatArray | None,
+        rejected: FloatArray,
+        status: str,
+        message: str,
+        stats: Statistics,
+        settings: Settings,
+    ) -> None:
+        self.mechanism = mechanism
+        self.steps = steps
+        self.scheme = scheme
+        self.rejected = rejected
+        self.status = status
+        self.message = message
+        self.success = status == "finished"
+        self.stats = stats
+        self.settings = settings
+        self._system = system
+        self._dense = DenseOutput(system, scheme, steps)
+        self.t_eval = t_eval
+        if t_eval is None:
+            self.t = steps.times
+            states = steps.states
+        else:
+            self.t = t_eval[t_eval <= steps.times[-1]]
+            states = self._dense(self.t)
+        nq = mechanism.model.nq
+        self.q, self.v = states[:, :nq], states[:, nq:]
+
+    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
+        """Dense output: q and v at time ``t`` (s), a scalar or an array of any order.
+
+        Returns shapes (nq,), (nv,) for a scalar, (k, nq), (k, nv) for an array.
+
+        Raises
+        ------
+        ValueError
+            If a time lies outside the run.
+        """
+        times = np.asarray(t, dtype=float)
+        states = self._dense(np.atleast_1d(times))
+        nq = self.mechanism.model.nq
+        q, v = states[:, :nq], states[:, nq:]
+        return (q[0], v[0]) if times.ndim == 0 else (q, v)
+
+    def joint(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Position and rate (n,), (n,) of a one-degree joint at ``t``; angles are unwrapped.
+
+        Raises
+        ------
+        InputError
+            If there is no such joint, or it has more than one degree of freedom.
+        """
+        joint = self.mechanism.joint(name)
+        if joint.nv != 1:
+            raise InputError(
+                f"joint {name!r} has {joint.nv} degrees of freedom",
+                remedy=f"Use solution.v[:, {joint.idx_v}:{joint.idx_v + joint.nv}]",
+            )
+        rate = self.v[:, joint.idx_v]
+        if joint.nq == 1:
+            return self.q[:, joint.idx_q], rate
+        angles = self._wound_angles(joint)
+        return angles, rate
+
+    def _wound_angles(self, joint: Any) -> FloatArray:
+        """Angle of a (cos, sin) joint at ``t``, followed through every step of the run."""
+        nq = self.mechanism.model.nq
+        nodes = self.steps.states
+        principal = np.arctan2(nodes[:, joint.idx_q + 1], nodes[:, joint.idx_q])
+        # A long step may turn the joint by more than pi: its chart coordinate knows by how much.
+        h = np.diff(self.steps.times)
+        weights = np.append(self.scheme.b, 0.0)
+        turned = h * (self.steps.rates[:, :, joint.idx_v] @ weights)
+        wound = np.concatenate([[principal[0]], principal[0] + np.cumsum(turned)])
+        wound = principal + 2.0 * np.pi * np.round((wound - principal) / (2.0 * np.pi))
+        # Between nodes: the step's start plus the principal difference nearest to v dt.
+        index = np.clip(
+            np.searchsorted(self.steps.times, self.t, side="right") - 1, 0, len(nodes) - 1
+        )
+        here = np.arctan2(self.q[:, joint.idx_q + 1], self.q[:, joint.idx_q])
+        mean = 0.5 * (nodes[index, nq + joint.idx_v] + self.v[:, joint.idx_v])
+        guess = wound[index] + mean * (self.t - self.steps.times[index])
+        return here + 2.0 * np.pi * np.round((guess - here) / (2.0 * np.pi))  # type: ignore[no-any-return]
+
+    @cached_property
+    def crossings(self) -> tuple[Crossing, ...]:
+        """Passages through singular configurations, in order of time."""
+        return find_crossings(self.scheme, self.steps)
+
+    @cached_property
+    def drift(self) -> FloatArray:
+        """Closure errors (n, 2): ||g|| (m, rad) and ||G v|| (m/s, rad/s), all rows, unscaled."""
+        model = self.mechanism.model
+        out = np.zeros((len(self.t), 2))
+        if not self.mechanism.loops:
+            return out
+        rows = LoopKinematics(model, self.mechanism.loops)
+        data = model.createData()
+        for i, (q, v) in enumerate(zip(self.q, self.v)):
+            pin.crba(model, data, q, pin.Convention.WORLD)
+            rows.update(data, with_bias=False)
+            out[i] = np.linalg.norm(rows.g), np.linalg.norm(rows.G @ v)
+        return out
+
+    @cached_property
+    def energy(self) -> FloatArray:
+        """Kinetic plus potential energy (n,) J."""
+        return np.array([self._system.energy(np.concatenate(x)) for x in zip(self.q, self.v)])
+
+    @cached_property
+    def _reactions(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        if self.settings.controlled and not self._system.controlled:
+            raise InputError(
+                "the reactions of a loaded run with a controller cannot be computed: "
+                "controllers are not saved",
+                remedy="Read solution.reactions before saving, or simulate again",
+            )
+        return reactions_at(self._system, self.t, self.q, self.v)
+
+    @property
+    def reactions(self) -> Mapping[str, FloatArray]:
+        """Per loop (n, 6): force (N) then moment (N m) that a exerts on b, at b's origin, world
+        axes.  Where redundancy makes them non-unique: the values of least norm."""
+        return self._reactions[0]
+
+    @property
+    def reaction_multipliers(self) -> Mapping[str, FloatArray]:
+        """Per loop (n, rows): the multipliers lam of M v' = f - G^T lam, rows unscaled."""
+        return self._reactions[1]
+
+    def save(self, path: str | Path) -> None:
+        """Write everything needed to replay and interpolate the run, description included.
+
+        Parameters
+        ----------
+        path
+            File name; ``.npz`` is usual and is not added.
+        """
+        from srm_mbs.storage import save_solution
+
+        save_solution(self, Path(path))
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Drift, energy, sigma and step sizes with rejected steps and singular passages marked.
+
+        Parameters
+        ----------
+        path
+            Where to save the figure (the suffix decides the format); not saved if omitted.
+        """
+        from srm_mbs.plots import plot_run
+
+        return plot_run(self, None if path is None else Path(path))
+
+    def play(self, **options: Any) -> None:
+        """Play the run in the browser; see :func:`srm_mbs.playback.play`."""
+        from srm_mbs.playback import play
+
+        play(self, **options)
+
+    def export_html(self, path: str | Path, **options: Any) -> None:
+        """Write a self-contained page with the animation; see
+        :func:`srm_mbs.playback.export_html`."""
+        from srm_mbs.playback import export_html
+
+        export_html(self, Path(path), **options)
+
+    def __repr__(self) -> str:
+        return (
+            f"Solution({self.mechanism.name!r}, t={self.t[0] if len(self.t) else 0:.6g}.."
+            f"{self.t[-1] if len(self.t) else 0:.6g} s, {len(self.t)} points, "
+            f"{self.stats.steps} steps, {self.status})"
+        )

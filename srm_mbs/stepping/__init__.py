@@ -1,0 +1,1 @@
+"""The one driver, step-size control, placement around singular configurations, dense output."""

@@ -1,0 +1,149 @@
+r"""Dense output: the state at any time of a run.
+
+The Runge-Kutta extension of a step ends at the uncorrected point x^-; the correction (dq, dv) at
+the step end is added as a smooth ramp,
+
+    s = 3 theta^2 - 2 theta^3,  r = theta^3 - theta^2:   q += s dq + h r dv,   v += s dv,
+
+so that the interpolant joins the corrected states with matching slopes and stays within
+tolerance of the closures.  The extra stages of dop853 are evaluated only when a step is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.systems.base import System, Zone
+
+
+@dataclass(frozen=True, eq=False)
+class StepData:
+    """The accepted steps of a run as arrays, n steps of a tableau with s stages.
+
+    Attributes
+    ----------
+    times : (n + 1,) s
+        Ends of the steps, the start first.
+    states : (n + 1, nx)
+        States there.
+    rates : (n, s + 1, m)
+        Chart rates of the stages and the end point.
+    corrections : (n, m)
+        What was subtracted at each step end; (n, 0) without closures.
+    sigmas : (n, s + 1)
+        sigma at the stages and the end point.
+    ranks : (n,)
+        Smallest number of rows in use in the step.
+    error_ratios : (n,)
+        Error estimate over tolerance.
+    zones
+        Step index -> (threshold, history) of the steps with a stage in the zone.
+    """
+
+    times: FloatArray
+    states: FloatArray
+    rates: FloatArray
+    corrections: FloatArray
+    sigmas: FloatArray
+    ranks: FloatArray
+    error_ratios: FloatArray
+    zones: dict[int, tuple[float, MultiplierHistory]]
+
+    @property
+    def count(self) -> int:
+        """Number of steps."""
+        return len(self.times) - 1
+
+
+class DenseOutput:
+    """Evaluates the continuous extension of a run.
+
+    Parameters
+    ----------
+    system
+        Used for retraction, and for the extra stages of tableaus that have them.
+    scheme
+        The tableau of the run.
+    steps
+        The accepted steps.
+    """
+
+    def __init__(self, system: System, scheme: ButcherTableau, steps: StepData) -> None:
+        self._system = system
+        self._extension = scheme.dense
+        self._steps = steps
+        self._extra: dict[int, FloatArray] = {}
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        """States (k, nx) at the times ``t`` (k,), in any order.
+
+        Raises
+        ------
+        ValueError
+            If a time lies outside the run.
+        """
+        times = self._steps.times
+        slack = 1e-12 * max(abs(times[0]), abs(times[-1]))
+        if len(t) and not (np.min(t) >= times[0] - slack and np.max(t) <= times[-1] + slack):
+            raise ValueError(
+                f"dense output covers t = {times[0]:.9g} to {times[-1]:.9g} s, "
+                f"asked for {np.min(t):.9g} to {np.max(t):.9g} s"
+            )
+        out = np.empty((len(t), self._steps.states.shape[1]))
+        if self._steps.count == 0:
+            out[:] = self._steps.states[0]
+            return out
+        index = np.clip(np.searchsorted(times, t, side="right") - 1, 0, self._steps.count - 1)
+        for step in np.unique(index):
+            here = index == step
+            h = times[step + 1] - times[step]
+            out[here] = self._in_step(int(step), (t[here] - times[step]) / h)
+        return out
+
+    def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
+        data, system = self._steps, self._system
+        h = data.times[step + 1] - data.times[step]
+        start = data.states[step]
+        delta = (h * self._extension.weights(theta)) @ self._all_rates(step, h)
+        ramps = self._ramps(step, theta, h)
+        states = []
+        for k in range(len(theta)):
+            x = system.retract(start, delta[k])
+            states.append(x if ramps is None else system.retract(x, ramps[k]))
+        return np.array(states)
+
+    def _ramps(self, step: int, theta: FloatArray, h: float) -> FloatArray | None:
+        correction = self._steps.corrections[step]
+        if not correction.size:
+            return None
+        half = correction.size // 2
+        dq, dv = -correction[:half], -correction[half:]
+        s = theta**2 * (3.0 - 2.0 * theta)
+        r = theta**2 * (theta - 1.0)
+        return np.hstack([np.outer(s, dq) + h * np.outer(r, dv), np.outer(s, dv)])
+
+    def _all_rates(self, step: int, h: float) -> FloatArray:
+        rates: FloatArray = self._steps.rates[step]
+        A, c = self._extension.extra_A, self._extension.extra_c
+        if not len(c):
+            return rates
+        if step not in self._extra:
+            start, t = self._steps.states[step], self._steps.times[step]
+            zone = None
+            if step in self._steps.zones:
+                threshold, history = self._steps.zones[step]
+                zone = Zone(threshold, history.predict)
+            full = np.vstack([rates, np.zeros((len(c), rates.shape[1]))])
+            for i, ci in enumerate(c):
+                delta = (h * A[i]) @ full
+                terms = self._system.evaluate(
+                    t + ci * h, self._system.retract(start, delta), zone
+                )
+                full[len(rates) + i] = self._system.chart_rate(delta, terms.rate())
+            self._extra[step] = full[len(rates) :]
+        return np.vstack([rates, self._extra[step]])

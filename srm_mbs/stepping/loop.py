@@ -1,0 +1,164 @@
+"""The one driver: propose a step, make it, judge it, record it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
+from srm_mbs.stepping.stepsize import StepSizeControl, Verdict
+from srm_mbs.systems.base import System
+
+log = logging.getLogger(__name__)
+
+SMALLEST_STEP = 1e-14
+"""Steps shorter than this fraction of the run, or than round-off of t, end it."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A step that did not stand: where it started, its length, its error ratio, and why."""
+
+    t: float
+    h: float
+    error_ratio: float
+    verdict: Verdict
+
+
+@dataclass
+class RunRecord:
+    """Everything a run produced, complete at any moment it is stopped.
+
+    Attributes
+    ----------
+    steps
+        Accepted steps in order.
+    times
+        Their end times (s), exact where a step was made to end on a given time.
+    attempts
+        Steps that were rejected or redone.
+    status
+        ``running``, ``finished``, ``interrupted`` or ``failed``.
+    message
+        When, why, and what to try.
+    """
+
+    t0: float
+    x0: FloatArray
+    sigma0: float
+    steps: list[StepResult] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    attempts: list[Attempt] = field(default_factory=list)
+    status: str = "running"
+    message: str = ""
+    wall_time: float = 0.0
+
+
+Tick = Callable[[float, float, FloatArray], None]
+"""(t, h, state), called after every accepted step."""
+
+
+def integrate(
+    system: System,
+    method: Method,
+    control: StepSizeControl,
+    norm: ErrorNorm,
+    memory: Memory,
+    state: FloatArray,
+    t0: float,
+    t_end: float,
+    *,
+    max_step: float = np.inf,
+    tick: Tick | None = None,
+) -> RunRecord:
+    """Integrate from ``t0`` to ``t_end``; never raises for what happens on the way.
+
+    Parameters
+    ----------
+    system, method, control, norm
+        What is integrated, how, with which step-size control and error norm.
+    memory
+        From ``method.start`` at ``state``.
+    state
+        Initial state.
+    max_step
+        Longest step (s).
+    tick
+        Called after every accepted step.
+
+    Returns
+    -------
+    RunRecord
+        With status ``finished``; or ``failed`` or ``interrupted`` (Ctrl-C), with everything
+        computed so far.
+    """
+    record = RunRecord(t0, state.copy(), memory.sigma)
+    smallest = SMALLEST_STEP * abs(t_end - t0)
+    started = time.perf_counter()
+    t, x = t0, state
+    trouble = ""
+    try:
+        while t < t_end:
+            limit = min(max_step, system.step_limit(x))
+            proposal = control.propose(t, limit, memory)
+            h = proposal.h
+            if not h > max(smallest, 4.0 * np.spacing(abs(t))):
+                _fail(record, t, h, memory, trouble)
+                break
+            result: StepResult | None
+            try:
+                result = method.step(system, t, h, x, memory, norm)
+            except EvaluationError as error:
+                result = None
+                trouble = str(error)
+            verdict = control.judge(proposal, result)
+            if verdict is not Verdict.ACCEPTED or result is None:
+                ratio = np.inf if result is None else result.error_ratio
+                record.attempts.append(Attempt(t, h, ratio, verdict))
+                if not control.adaptive and verdict is Verdict.REJECTED:
+                    _fail(record, t, h, memory, trouble or "the state is no longer finite")
+                    break
+                continue
+            trouble = ""
+            method.accept(memory, result)
+            t, x = proposal.t_new, result.state
+            record.times.append(t)
+            record.steps.append(result)
+            if tick is not None:
+                tick(t, h, x)
+        else:
+            record.status = "finished"
+            record.message = f"The run reached t = {t_end:.6g} s."
+    except KeyboardInterrupt:
+        record.status = "interrupted"
+        record.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
+    except ControllerError as error:
+        record.status = "failed"
+        record.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
+    # An interrupt between the two appends would leave one list longer.
+    del record.times[min(len(record.times), len(record.steps)) :]
+    del record.steps[len(record.times) :]
+    record.wall_time = time.perf_counter() - started
+    log.info("%s", record.message)
+    return record
+
+
+def _fail(record: RunRecord, t: float, h: float, memory: Memory, trouble: str) -> None:
+    record.status = "failed"
+    reason = trouble or "the error estimate stays above the tolerance however small the step"
+    near = (
+        f" The closures are close to a singular configuration (sigma = {memory.sigma:.1e})."
+        if memory.sigma < 0.05
+        else ""
+    )
+    record.message = (
+        f"Stopped at t = {t:.6g} s with step {h:.1e} s: {reason}.{near} "
+        "Everything up to there is kept. Try a smaller rtol, another tableau, or check that the "
+        "mechanism can move on from there (solution.q[-1])."
+    )

@@ -1,0 +1,181 @@
+"""Step-size control: how long the next step is, and whether the last one stands.
+
+Judging a step is separate from making it, and one control may wrap another
+(:class:`~srm_mbs.stepping.placement.SingularityPlacement` does).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.systems.base import System
+
+SAFETY = 0.9
+MIN_FACTOR, MAX_FACTOR = 0.2, 5.0
+PROPORTIONAL, INTEGRAL = 0.4, 0.7
+"""h_new = h 0.9 xi^(-0.7/k) xi_old^(0.4/k): the PI control of Gustafsson as in METHODS 4."""
+XI_OLD_FLOOR = 1e-4
+XI_FLOOR = 1e-10
+FAILED_EVALUATION = 1e6
+"""Error ratio of a step whose stages could not be evaluated or are not finite."""
+
+
+class Verdict(Enum):
+    """What becomes of a proposed step."""
+
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+    REPLACED = "replaced"
+    """The step is redone with another length so that no stage lies on a singular point."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A step of length ``h`` that ends at ``t_new`` (exactly, where that is a given time)."""
+
+    h: float
+    t_new: float
+
+
+class StepSizeControl(Protocol):
+    """Decides on step lengths."""
+
+    adaptive: bool
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """The next step from ``t``, at most ``limit`` long where the control is adaptive."""
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Judge a step; ``result`` is None if a stage could not be evaluated."""
+
+
+def _until(t: float, h: float, end: float) -> Proposal:
+    """A step of at most ``h`` that neither passes ``end`` nor leaves a sliver before it."""
+    remaining = end - t
+    if h >= remaining * (1.0 - 1e-12):
+        return Proposal(remaining, end)
+    if 2.0 * h > remaining:
+        h = 0.5 * remaining
+    return Proposal(h, t + h)
+
+
+class PIControl:
+    """Proportional-integral control of the error of an embedded pair.
+
+    Parameters
+    ----------
+    t_end
+        Time at which the run ends (s).
+    first_step
+        Length of the first step (s).
+    order
+        k: 3 for tvd32, 5 for dopr54, 8 for dop853.
+    """
+
+    adaptive = True
+
+    def __init__(self, t_end: float, first_step: float, order: int) -> None:
+        self._t_end = t_end
+        self._h = first_step
+        self._order = order
+        self._xi_old = 1.0
+        self._just_rejected = False
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """The step that the error allows."""
+        return _until(t, min(self._h, limit), self._t_end)
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Accept if the error ratio xi <= 1; no growth right after a rejection."""
+        xi = FAILED_EVALUATION if result is None else result.error_ratio
+        if not xi < FAILED_EVALUATION:
+            xi = FAILED_EVALUATION
+        k = self._order
+        if xi > 1.0:
+            self._h = proposal.h * max(MIN_FACTOR, SAFETY * xi ** (-1.0 / k))
+            self._just_rejected = True
+            return Verdict.REJECTED
+        factor = SAFETY * max(xi, XI_FLOOR) ** (-INTEGRAL / k) * self._xi_old ** (PROPORTIONAL / k)
+        factor = min(MAX_FACTOR, max(MIN_FACTOR, factor))
+        if self._just_rejected:
+            factor = min(factor, 1.0)
+        self._h = proposal.h * factor
+        self._xi_old = max(xi, XI_OLD_FLOOR)
+        self._just_rejected = False
+        return Verdict.ACCEPTED
+
+
+class FixedStep:
+    """Steps on a grid t0 + i step; a shortened step returns to the grid.
+
+    Parameters
+    ----------
+    t0, t_end
+        Range of the run (s); the last step is shortened to end there.
+    step
+        Grid spacing (s).
+    """
+
+    adaptive = False
+
+    def __init__(self, t0: float, t_end: float, step: float) -> None:
+        self._t0, self._t_end, self._step = t0, t_end, step
+        self._index = 1
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """To the next grid point, or ``limit`` towards it."""
+        target = self._t0 + self._index * self._step
+        if target > self._t_end - 1e-9 * self._step:
+            target = self._t_end
+        if limit < target - t:
+            return Proposal(limit, t + limit)
+        return Proposal(target - t, target)
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Accept every step that could be evaluated."""
+        if result is None or not np.isfinite(result.state).all():
+            return Verdict.REJECTED
+        if proposal.t_new >= self._t0 + self._index * self._step * (1.0 - 1e-14):
+            self._index += 1
+        return Verdict.ACCEPTED
+
+
+def initial_step(
+    system: System,
+    state: FloatArray,
+    memory: Memory,
+    norm: ErrorNorm,
+    span: float,
+    order: int,
+    t: float = 0.0,
+) -> float:
+    """Length of the first step (s): the thesis' appendix B.2 made independent of the time unit.
+
+    With d0 = ||unit of x||, d1 = ||x'|| and d2 = ||x''|| (an Euler step of 0.01 d0/d1), and the
+    time tau = d1/d2: h = min(d0/d1, tau (0.01 / (tau d1))^(1/k)).
+    """
+    half = system.tangent_size // 2
+    weights = norm.weights(memory.magnitude)
+    # |x| itself may vanish; atol over rtol is the size that the tolerances call "one".
+    d0 = norm(np.maximum(memory.magnitude, norm.atol / norm.rtol), weights)
+    d1 = norm(memory.rate, weights)
+    if not d1 > 0.0:
+        return 0.01 * span
+    h0 = min(0.01 * d0 / d1, span)
+    probe = system.retract(state, h0 * memory.rate)
+    rate = system.chart_rate(h0 * memory.rate, system.evaluate(t + h0, probe).rate())
+    change = np.empty_like(rate)
+    change[:half] = h0 * memory.rate[half:]
+    change[half:] = (rate - memory.rate)[half:]
+    d2 = norm(change, weights) / h0
+    longest = 100.0 * h0
+    if not d2 > 0.0:
+        return min(longest, span)
+    tau = d1 / d2
+    return float(min(longest, tau * (0.01 / (tau * d1)) ** (1.0 / order), span))

@@ -1,0 +1,1 @@
+"""What is integrated: the contract (``base``), mechanisms on Pinocchio, and their algebra."""

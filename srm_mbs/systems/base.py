@@ -1,0 +1,91 @@
+"""The contract between a system and the time stepping.
+
+A *state* is one flat array; a mechanism uses x = (q, v) of length nq + nv.  A *tangent* is an
+array of the size of the system's tangent space; a mechanism uses (dq, dv) of length 2 nv with
+dq in the Lie algebra of the configuration manifold.  Stepping is written once against this
+contract and never looks inside a state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from srm_mbs.closures import FloatArray
+
+
+@dataclass(frozen=True)
+class Zone:
+    """What a stage needs to know when it falls next to a singular configuration.
+
+    Attributes
+    ----------
+    threshold
+        sigma_z: pivots below ``threshold`` (relative to the structural reference) are dropped.
+    predict
+        t -> (nv,), the multiplier yhat extrapolated from nodes outside the zone.
+    """
+
+    threshold: float
+    predict: Callable[[float], FloatArray]
+
+
+class Terms(Protocol):
+    """Answers about one evaluated stage, each at its own cost.
+
+    Arrays are valid until the system's next ``evaluate``.
+    """
+
+    @property
+    def sigma(self) -> float:
+        """Distance to a singular configuration; about 1 in a regular one, ``inf`` if open."""
+
+    @property
+    def rank(self) -> int:
+        """Number of independent closure rows in use at this stage."""
+
+    @property
+    def weak(self) -> bool:
+        """Whether rows were dropped here and the predicted multiplier took their place."""
+
+    def rate(self) -> FloatArray:
+        """Tangent rate (2 nv,): (v, M^-1 f - yhat)."""
+
+    def multiplier(self) -> FloatArray:
+        """The multiplier yhat = M^-1 G^T lam = E gamma (nv,)."""
+
+    def project(self, w: FloatArray) -> FloatArray:
+        """P w (nv,): the M-orthogonal projection of w on the constraint normals."""
+
+    def correction(self) -> FloatArray:
+        """(E g, E c) (2 nv,): what to subtract from the state to satisfy g = 0 and c = 0."""
+
+
+class System(Protocol):
+    """What both a mechanism and a DAE offer to the stepping."""
+
+    has_constraints: bool
+    tangent_size: int
+    evaluations: int
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+        """Factorise at one stage.
+
+        Raises
+        ------
+        EvaluationError
+            If the state is not finite or the mass matrix is not positive definite.
+        """
+
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """Move along the tangent ``delta`` from ``state``; a new state."""
+
+    def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
+        """Rate of the chart coordinate ``delta`` for the tangent rate at retract(state, delta)."""
+
+    def magnitudes(self, state: FloatArray) -> FloatArray:
+        """|x_i| of the error weights, per tangent component."""
+
+    def step_limit(self, state: FloatArray) -> float:
+        """Largest step for which the chart stays well inside its domain (s)."""

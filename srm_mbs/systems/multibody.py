@@ -1,0 +1,285 @@
+r"""A mechanism as a system: Pinocchio terms, closures, and the answers of a stage.
+
+    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0,   f = tau - nle(q, v) - damping v.
+
+Only this module, ``loops`` and the load-time analysis call Pinocchio algorithms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.base import Terms, Zone
+from srm_mbs.systems.charts import ROTATION_PER_STEP, dexp_inverse, group_joints
+from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.projection import Projection
+
+Controller = Callable[[float, FloatArray, FloatArray], Any]
+"""(t, q, v) -> generalised forces tau (nv,), N and N m."""
+
+_WORLD = pin.Convention.WORLD
+
+
+class _Mechanics:
+    """What open and closed mechanisms share: state, manifold, forces."""
+
+    def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
+        self.mechanism = mechanism
+        self.model = mechanism.model
+        self.data = self.model.createData()
+        self.nq, self.nv = self.model.nq, self.model.nv
+        self.tangent_size = 2 * self.nv
+        self.evaluations = 0
+        self._controller = controller
+        self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
+        self._groups = group_joints(self.model)
+        self._flat = self.nq == self.nv
+        self._unit = mechanism.structure.units.coordinate
+        self._position_of = self._vector_coordinates()
+
+    def _vector_coordinates(self) -> FloatArray:
+        """Index into q of each velocity component, -1 where q is not a vector space there."""
+        index = np.full(self.nv, -1)
+        for joint in list(self.model.joints)[1:]:
+            if joint.nq == joint.nv:
+                index[joint.idx_v : joint.idx_v + joint.nv] = range(
+                    joint.idx_q, joint.idx_q + joint.nq
+                )
+        return index
+
+    @property
+    def controlled(self) -> bool:
+        """Whether a controller acts."""
+        return self._controller is not None
+
+    def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Views (q, v) of a state."""
+        return state[: self.nq], state[self.nq :]
+
+    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
+        """Controller and joint damping (nv,); None if there is neither."""
+        force = None if self._damping is None else -self._damping * v
+        if self._controller is None:
+            return force
+        try:
+            tau = np.asarray(self._controller(t, q.copy(), v.copy()), dtype=float)
+        except Exception as error:
+            raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
+        if tau.shape != (self.nv,) or not np.isfinite(tau).all():
+            raise ControllerError(
+                f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
+                f"it must return {self.nv} finite generalised forces"
+            )
+        return tau if force is None else tau + force
+
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """(q (+) dq, v + dv)."""
+        if self._flat:
+            return state + delta
+        out = np.empty_like(state)
+        out[: self.nq] = pin.integrate(self.model, state[: self.nq], delta[: self.nv])
+        out[self.nq :] = state[self.nq :] + delta[self.nv :]
+        return out
+
+    def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
+        """dexp^-1 on the joints that need it; ``rate`` itself otherwise."""
+        if not self._groups:
+            return rate
+        out = rate.copy()
+        for joint in self._groups:
+            own = slice(joint.start, joint.start + joint.size)
+            out[own] = dexp_inverse(joint, delta[own], rate[own])
+        return out
+
+    def magnitudes(self, state: FloatArray) -> FloatArray:
+        """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
+
+        Angles are capped at 1 rad so that the accuracy does not decay with winding.
+        """
+        q, v = self.split(state)
+        position = self._unit.copy()
+        vector = self._position_of >= 0
+        position[vector] = np.minimum(np.abs(q[self._position_of[vector]]), self._unit[vector])
+        return np.concatenate([position, np.abs(v)])
+
+    def step_limit(self, state: FloatArray) -> float:
+        """Step over which no group joint turns by more than ``ROTATION_PER_STEP``."""
+        v = state[self.nq :]
+        speed = max((joint.rotation_speed(v) for joint in self._groups), default=0.0)
+        return ROTATION_PER_STEP / speed if speed > 0.0 else np.inf
+
+    def energy(self, state: FloatArray) -> float:
+        """Kinetic plus potential energy (J)."""
+        q, v = self.split(state)
+        return float(pin.computeMechanicalEnergy(self.model, self.data, q, v))
+
+
+class _OpenTerms:
+    """Terms of a mechanism without closures: the acceleration, and no algebra."""
+
+    sigma = np.inf
+    rank = 0
+    weak = False
+
+    def __init__(self, nv: int) -> None:
+        self._rate = np.zeros(2 * nv)
+        self._nv = nv
+
+    def rate(self) -> FloatArray:
+        return self._rate
+
+    def multiplier(self) -> FloatArray:
+        return np.zeros(self._nv)
+
+    def project(self, w: FloatArray) -> FloatArray:
+        return np.zeros(self._nv)
+
+    def correction(self) -> FloatArray:
+        return np.zeros(2 * self._nv)
+
+
+class OpenSystem(_Mechanics):
+    """A mechanism without effective closures: plain ``aba``."""
+
+    has_constraints = False
+    factorisations = 0
+
+    def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
+        super().__init__(mechanism, controller)
+        self._zero = np.zeros(self.nv)
+        self._terms = _OpenTerms(self.nv)
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+        """v' = aba(q, v, tau); see :class:`~srm_mbs.systems.base.System`."""
+        self.evaluations += 1
+        q, v = state[: self.nq], state[self.nq :]
+        force = self.applied_force(t, q, v)
+        rate = self._terms._rate
+        rate[: self.nv] = v
+        rate[self.nv :] = pin.aba(
+            self.model, self.data, q, v, self._zero if force is None else force
+        )
+        if not np.isfinite(rate).all():
+            raise EvaluationError("the acceleration is not finite")
+        return self._terms
+
+
+class _ClosedTerms:
+    """Terms of one stage of a closed-loop mechanism."""
+
+    def __init__(self, projection: Projection, loops: LoopKinematics) -> None:
+        self._p = projection
+        self._loops = loops
+        self.v = np.zeros(0)
+        self.predicted: FloatArray | None = None
+
+    @property
+    def sigma(self) -> float:
+        return self._p.sigma
+
+    @property
+    def rank(self) -> int:
+        return self._p.rank
+
+    @property
+    def weak(self) -> bool:
+        return self._p.weak
+
+    def _white_multiplier(self) -> FloatArray:
+        p = self._p
+        white = p.white_multiplier
+        if self.predicted is not None:
+            # yhat = E_s gamma_s + (1 - P_s) yhat_pred, in L^T coordinates
+            prediction = p.U @ self.predicted
+            white = white + prediction - p.Q @ (p.Q.T @ prediction)
+        return white
+
+    def rate(self) -> FloatArray:
+        p = self._p
+        nv = self.v.size
+        out = np.empty(2 * nv)
+        out[:nv] = self.v
+        out[nv:] = p.unwhiten(p.white_force - self._white_multiplier())
+        return out
+
+    def multiplier(self) -> FloatArray:
+        return self._p.unwhiten(self._white_multiplier())
+
+    def project(self, w: FloatArray) -> FloatArray:
+        return self._p.project(w)
+
+    def correction(self) -> FloatArray:
+        p = self._p
+        nv = self.v.size
+        right = np.empty((nv, 2), order="F")
+        right[:, 0] = p.normal(self._loops.g[p.order])
+        right[:, 1] = p.white_project(self.v)
+        return p.unwhiten(right).ravel(order="F")
+
+
+class ClosedSystem(_Mechanics):
+    """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
+
+    has_constraints = True
+
+    def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
+        super().__init__(mechanism, controller)
+        structure = mechanism.structure
+        self.loops = LoopKinematics(
+            self.model, mechanism.loops, structure.row_scale, structure.kept
+        )
+        self.projection = Projection(structure.rank, structure.sigma_ref)
+        self._terms = _ClosedTerms(self.projection, self.loops)
+
+    @property
+    def factorisations(self) -> int:
+        """How often the constraint algebra was factorised."""
+        return self.projection.factorisations
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+        """Factorise M and G at ``state``; see :class:`~srm_mbs.systems.base.System`.
+
+        crba in the WORLD convention leaves placements and the world Jacobian in ``data``,
+        nonLinearEffects the velocities and bias accelerations: the closures need no further call.
+        """
+        self.evaluations += 1
+        model, data, nq = self.model, self.data, self.nq
+        q, v = state[:nq], state[nq:]
+        pin.crba(model, data, q, _WORLD)
+        f = -pin.nonLinearEffects(model, data, q, v)
+        force = self.applied_force(t, q, v)
+        if force is not None:
+            f += force
+        loops = self.loops
+        loops.update(data)
+        projection = self.projection
+        projection.factor(
+            data.M, loops.G, f, loops.bias, None if zone is None else zone.threshold
+        )
+        terms = self._terms
+        terms.v = v
+        terms.predicted = zone.predict(t) if projection.weak and zone is not None else None
+        return terms
+
+    def residuals(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scaled closure errors g (m,) and closure rates G v (m,) of the kept rows."""
+        q, v = self.split(state)
+        pin.crba(self.model, self.data, q, _WORLD)
+        self.loops.update(self.data, with_bias=False)
+        return self.loops.g.copy(), self.loops.G @ v
+
+
+def make_system(
+    mechanism: Mechanism, controller: Controller | None = None
+) -> OpenSystem | ClosedSystem:
+    """The cheapest system that is right for ``mechanism``."""
+    if mechanism.structure.rank == 0:
+        return OpenSystem(mechanism, controller)
+    return ClosedSystem(mechanism, controller)

@@ -1,0 +1,138 @@
+r"""The constraint algebra of one stage: E, P, rank and sigma from one pivoted factorisation.
+
+With M = L L^T and W = L^{-1} G^T a column-pivoted QR, W Pi = Q R, gives (METHODS section 4)
+
+    E g = L^{-T} Q R^{-T} Pi^T g,        P v = L^{-T} Q Q^T L^T v,
+    yhat = E gamma,                      gamma = W^T (L^{-1} f) + Gdot v.
+
+Householder reflections (LAPACK geqp3) keep Q orthogonal to round-off, so that no
+reorthogonalisation is needed.  Truncating or damping small pivots would delete the weak
+direction next to a singular configuration; pivots are dropped for redundancy only, or in the
+zone, where a prediction takes their place.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import lapack
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.errors import EvaluationError
+
+PIVOT_ZERO = 1e-13
+"""Pivots (of scaled rows) below this are zero."""
+
+
+def cholesky(M: FloatArray) -> FloatArray:
+    """U (nv, nv), upper, with M = U^T U; reads the upper triangle of M only.
+
+    Raises
+    ------
+    EvaluationError
+        If M is not positive definite or not finite.
+    """
+    U, info = lapack.dpotrf(M, lower=0)
+    if info != 0:
+        raise EvaluationError(
+            "the mass matrix is not positive definite or not finite "
+            f"(leading minor {info}): a joint that moves no inertia, or a state that is not finite"
+        )
+    return U  # type: ignore[no-any-return]
+
+
+def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
+    """L^-1 right = U^-T right."""
+    return lapack.dtrtrs(U, right, lower=0, trans=1)[0]  # type: ignore[no-any-return]
+
+
+def unwhiten(U: FloatArray, right: FloatArray) -> FloatArray:
+    """L^-T right = U^-1 right."""
+    return lapack.dtrtrs(U, right, lower=0, trans=0)[0]  # type: ignore[no-any-return]
+
+
+def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
+    """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (min(nv, m),)."""
+    packed, permutation, tau, _, _ = lapack.dgeqp3(W)
+    return packed, permutation - 1, tau, np.abs(packed.diagonal())
+
+
+class Projection:
+    """Factorisation of M and G at one stage; reused from stage to stage.
+
+    Parameters
+    ----------
+    rank
+        Structural rank: the number of pivots that are used in a regular configuration.
+    sigma_ref
+        Median of the last structural pivot over the closed samples of the load-time walk.
+
+    Attributes
+    ----------
+    factorisations
+        How many factorisations were done; 0 for a mechanism without closures.
+    """
+
+    def __init__(self, rank: int, sigma_ref: float) -> None:
+        self.structural_rank = rank
+        self.sigma_ref = sigma_ref
+        self.factorisations = 0
+        self.sigma = np.inf
+        self.rank = rank
+        self.weak = False
+
+    def factor(
+        self,
+        M: FloatArray,
+        G: FloatArray,
+        f: FloatArray,
+        bias: FloatArray,
+        threshold: float | None,
+    ) -> None:
+        """Factorise M (nv, nv), G (m, nv) and solve for the multiplier with f (nv,), bias (m,).
+
+        ``threshold`` drops every pivot below threshold * sigma_ref (the zone); ``None`` uses all
+        structural pivots.
+        """
+        self.factorisations += 1
+        m = G.shape[0]
+        U = self.U = cholesky(M)
+        right = np.empty((f.size, m + 1), order="F")
+        right[:, :m] = G.T
+        right[:, m] = f
+        white = whiten(U, right)
+        self.white_force = white[:, m]
+        W = white[:, :m]
+        packed, permutation, tau, pivots = pivoted_qr(W)
+        structural = self.structural_rank
+        self.sigma = float(pivots[structural - 1]) / self.sigma_ref
+        floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
+        rank = structural
+        while rank > 0 and not pivots[rank - 1] >= floor:
+            rank -= 1
+        self.rank = rank
+        self.weak = rank < structural
+        self.order = permutation[:rank]
+        self.R = packed[:rank, :rank]
+        self.Q = lapack.dorgqr(packed[:, :rank], tau[:rank])[0] if rank else packed[:, :0]
+        self.white_multiplier = self.normal((W.T @ self.white_force + bias)[self.order])
+
+    def normal(self, right: FloatArray) -> FloatArray:
+        """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
+        if self.rank == 0:
+            return np.zeros(self.U.shape[0])
+        z = lapack.dtrtrs(self.R, right, lower=0, trans=1)[0]
+        return self.Q @ z  # type: ignore[no-any-return]
+
+    def unwhiten(self, right: FloatArray) -> FloatArray:
+        """L^-T right."""
+        return unwhiten(self.U, right)
+
+    def white_project(self, w: FloatArray) -> FloatArray:
+        """Q Q^T L^T w (nv,)."""
+        return self.Q @ (self.Q.T @ (self.U @ w))  # type: ignore[no-any-return]
+
+    def project(self, w: FloatArray) -> FloatArray:
+        """P w (nv,)."""
+        return self.unwhiten(self.white_project(w))

@@ -1,0 +1,51 @@
+r"""Reaction forces and multipliers of the closures.
+
+From yhat = M^{-1} G^T lam the multipliers follow as the least-norm solution of
+(L^{-1} G^T) lam = L^T yhat over all rows, unscaled; the wrench that a exerts on b is
+C^T lam with the rows C of the closure taken at b's origin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.systems.loops import LoopKinematics, row_wrenches
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, whiten
+
+
+def reactions_at(
+    system: OpenSystem | ClosedSystem, t: FloatArray, q: FloatArray, v: FloatArray
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Wrenches {loop: (n, 6)} and multipliers {loop: (n, rows)} at n states.
+
+    Wrenches are force (N) then moment (N m) that a exerts on b, at b's origin, in world axes.
+    Next to a singular configuration the multipliers grow without bound, as they do in the
+    mechanism.
+    """
+    mechanism = system.mechanism
+    model = mechanism.model
+    wrenches = {loop.name: np.zeros((len(t), 6)) for loop in mechanism.loops}
+    multipliers = {loop.name: np.zeros((len(t), loop.rows.count)) for loop in mechanism.loops}
+    if not isinstance(system, ClosedSystem):
+        return wrenches, multipliers
+    rows = LoopKinematics(model, mechanism.loops)
+    scale = mechanism.structure.row_scale
+    data = model.createData()
+    for i in range(len(t)):
+        yhat = system.evaluate(t[i], np.concatenate([q[i], v[i]])).multiplier().copy()
+        pin.crba(model, data, q[i], pin.Convention.WORLD)
+        rows.update(data, with_bias=False)
+        U = cholesky(data.M)
+        # Scaled rows make the rank decision independent of units.
+        W = whiten(U, np.asfortranarray((rows.G / scale[:, None]).T))
+        lam = np.linalg.lstsq(W, U @ yhat, rcond=PIVOT_ZERO)[0] / scale
+        at = 0
+        for loop in mechanism.loops:
+            own = lam[at : at + loop.rows.count]
+            at += loop.rows.count
+            multipliers[loop.name][i] = own
+            wrenches[loop.name][i] = row_wrenches(loop, model, data).T @ own
+    return wrenches, multipliers

@@ -1,0 +1,227 @@
+"""Load-time analysis of the closures: row scales, structural rank, redundant rows.
+
+A walk on the closure manifold (METHODS section 4b; the notation is in docs/notation.md) visits
+closed configurations from several restarts, because the start may itself be singular, and open
+random configurations alone give the wrong rank for over-constrained loops.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
+from srm_mbs.systems.units import Units, coordinate_units
+
+log = logging.getLogger(__name__)
+
+OPEN_SAMPLES = 24
+RESTARTS = 10
+WALK_STEPS = 12
+WALK_AMPLITUDE = 0.5
+STRUCTURAL_PIVOT = 1e-6
+"""A pivot (of scaled rows) above this counts as independent."""
+ZERO_ROW = 1e-9
+"""A scaled row that stays below this in every closed sample is zero."""
+RANK_GAP = 1e3
+"""Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Constant facts about the closures of a mechanism.
+
+    Attributes
+    ----------
+    row_names
+        Names of all rows, ``loop.row``.
+    row_scale : (rows,)
+        Every row is divided by its scale: the rms of ||L^-1 G^T row|| over open configurations,
+        averaged over the rows of one kind in a closure.
+    kept : (rows,) bool
+        False for rows that are zero on every closed sample; the solve leaves them out.
+    rank
+        Structural rank: the largest number of pivots above 1e-6 over the closed samples.
+    sigma_ref
+        Median of the last structural pivot over the samples of that rank.
+    units
+        Units of the coordinates at q0.
+    samples
+        Number of closed configurations visited.
+    notes
+        Sentences for the user, such as a weak gap between structural and redundant pivots.
+    """
+
+    row_names: tuple[str, ...]
+    row_scale: FloatArray
+    kept: FloatArray
+    rank: int
+    sigma_ref: float
+    units: Units
+    samples: int
+    notes: tuple[str, ...]
+
+    @property
+    def redundant_rows(self) -> tuple[str, ...]:
+        """Names of the rows that the solve leaves out."""
+        return tuple(name for name, keep in zip(self.row_names, self.kept) if not keep)
+
+    @property
+    def pivoted_redundancy(self) -> int:
+        """Number of further redundant rows, chosen by pivoting at every evaluation."""
+        return int(np.sum(self.kept)) - self.rank
+
+
+class _Walker:
+    """Closes loops and measures pivots for the analysis."""
+
+    def __init__(self, mechanism: Mechanism, units: Units) -> None:
+        self.model = mechanism.model
+        self.data = self.model.createData()
+        self.units = units
+        self.rows = LoopKinematics(self.model, mechanism.loops)
+        self.scale = np.ones(len(self.rows.g))
+
+    def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scaled g (m,) and G (m, nv) at q, and M in ``data``."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        self.rows.update(self.data, with_bias=False)
+        return self.rows.g / self.scale, self.rows.G / self.scale[:, None]
+
+    def white(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """W = L^-1 G^T (nv, m) and the Cholesky factor U (nv, nv) at q."""
+        _, G = self.closure(q)
+        U = cholesky(self.data.M)
+        return whiten(U, np.asfortranarray(G.T)), U
+
+    def close(self, q: FloatArray, iterations: int = 30) -> tuple[FloatArray, float]:
+        """Gauss-Newton onto the closure manifold; q and the largest remaining scaled error."""
+        tolerance = 1e-14
+        for _ in range(iterations):
+            g, G = self.closure(q)
+            if np.abs(g).max() < tolerance:
+                break
+            by_unit = G * self.units.coordinate
+            step = np.linalg.lstsq(by_unit, g, rcond=1e-9)[0] * self.units.coordinate
+            if not np.isfinite(step).all():
+                break
+            q = pin.integrate(self.model, q, -step)
+        return q, float(np.abs(self.closure(q)[0]).max())
+
+    def set_scale(self, mechanism: Mechanism, rng: np.random.Generator) -> None:
+        """Row scales from open random configurations, isotropic per closure and kind of row."""
+        squares = np.zeros_like(self.scale)
+        for _ in range(OPEN_SAMPLES):
+            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
+            W, _ = self.white(pin.integrate(self.model, mechanism.q0, spread))
+            squares += (W**2).sum(axis=0)
+        squares /= OPEN_SAMPLES
+        at = 0
+        for loop in mechanism.loops:
+            k = len(loop.rows.directions)
+            for block in (slice(at, at + k), slice(at + k, at + loop.rows.count)):
+                mean = squares[block].mean() if block.stop > block.start else 0.0
+                self.scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
+            at += loop.rows.count
+
+    def step(self, q: FloatArray, direction: FloatArray, reach: float) -> FloatArray | None:
+        """A closed configuration about ``reach`` units from q along ``direction``; None if none."""
+        size = np.abs(direction / self.units.coordinate).max()
+        if not size > 0.0:
+            return None
+        move = direction * (reach / size)
+        for _ in range(8):
+            closed, error = self.close(pin.integrate(self.model, q, move))
+            if error < 1e-11:
+                return closed
+            move = 0.5 * move
+        return None
+
+
+def _closed_samples(
+    mechanism: Mechanism, walker: _Walker, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Pivots (n, k) and largest row norms (m,) over closed configurations."""
+    rows = len(walker.scale)
+    pivots: list[FloatArray] = []
+    largest = np.zeros(rows)
+
+    def record(q: FloatArray) -> None:
+        W, _ = walker.white(q)
+        pivots.append(pivoted_qr(W)[3])
+        np.maximum(largest, np.linalg.norm(W, axis=0), out=largest)
+
+    start, error = walker.close(mechanism.q0, iterations=100)
+    if error < 1e-11:
+        record(start)
+    else:
+        start = np.array(mechanism.q0)
+    moving = bool(np.abs(mechanism.v0).max() > 0.0)
+    for restart in range(RESTARTS):
+        q = start
+        for k in range(WALK_STEPS):
+            W, U = walker.white(q)
+            left, singular, _ = np.linalg.svd(W, full_matrices=True)
+            rank = int(np.sum(singular > 1e-7 * max(singular[0], 1e-300)))
+            null = left[:, rank:]
+            if null.shape[1] == 0:
+                break
+            direction = unwhiten(U, null @ rng.standard_normal(null.shape[1]))
+            if k == 0 and restart < 2 and moving:
+                direction = mechanism.v0 if restart == 0 else -mechanism.v0
+            closed = walker.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
+            if closed is not None:
+                q = closed
+                record(q)
+    width = min(rows, mechanism.model.nv)
+    return (np.array(pivots) if pivots else np.zeros((0, width))), largest
+
+
+def analyse(mechanism: Mechanism) -> Structure:
+    """Row scales, structural rank, reference pivot and zero rows of ``mechanism``.
+
+    Deterministic: the walk uses a fixed seed.  Source: METHODS section 4b, steps 1 to 4.
+
+    Raises
+    ------
+    EvaluationError
+        If the mass matrix is not positive definite.
+    """
+    units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
+    names = tuple(name for loop in mechanism.loops for name in loop.row_names)
+    if not names:
+        return Structure((), np.ones(0), np.ones(0, bool), 0, 1.0, units, 0, ())
+    rng = np.random.default_rng(0)
+    walker = _Walker(mechanism, units)
+    walker.set_scale(mechanism, rng)
+    pivots, largest = _closed_samples(mechanism, walker, rng)
+    notes: list[str] = []
+    if not len(pivots):
+        notes.append(
+            "no closed configuration was found: the loops do not close near the initial guess"
+        )
+        kept = np.ones(len(names), dtype=bool)
+        rank = min(len(names), mechanism.model.nv)
+        return Structure(names, walker.scale, kept, rank, 1.0, units, 0, tuple(notes))
+    kept = largest > ZERO_ROW
+    ranks = (pivots > STRUCTURAL_PIVOT).sum(axis=1)
+    rank = int(ranks.max())
+    sigma_ref = float(np.median(pivots[ranks == rank, rank - 1])) if rank else 1.0
+    if 0 < rank < pivots.shape[1]:
+        weakest = float(pivots[ranks == rank, rank - 1].min())
+        redundant = max(float(pivots[:, rank:].max()), PIVOT_ZERO)
+        if weakest < RANK_GAP * redundant:
+            notes.append(
+                f"the rank {rank} of the closures is uncertain: smallest independent pivot "
+                f"{weakest:.1e}, largest redundant pivot {redundant:.1e}"
+            )
+            log.warning("%s: %s", mechanism.name, notes[-1])
+    return Structure(
+        names, walker.scale, kept, rank, sigma_ref, units, len(pivots), tuple(notes)
+    )

@@ -1,0 +1,60 @@
+"""Units of the coordinates: what "one" means for an angle, a length and a rate.
+
+Tolerances and step rules use them, so that the same mechanism in millimetres, with other masses
+or on another time scale, takes the same steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.closures import FloatArray
+from srm_mbs.mechanism import Mechanism
+
+
+@dataclass(frozen=True)
+class Units:
+    """Characteristic sizes of a mechanism.
+
+    Attributes
+    ----------
+    length
+        Scene diagonal (m): bounding box of joints, centres of mass and anchors at q0.
+    coordinate : (nv,)
+        1 rad for angles, ``length`` for translations.
+    rate
+        Characteristic rate (1/s): the larger of sqrt(g / length) and the initial rates over their
+        units; 1 where both vanish.
+    """
+
+    length: float
+    coordinate: FloatArray
+    rate: float
+
+
+def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
+    """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
+    model = mechanism.model
+    data = model.createData()
+    pin.computeJointJacobians(model, data, q)
+    points = []
+    for joint in range(1, model.njoints):
+        points.append(data.oMi[joint].translation.copy())
+        if model.inertias[joint].mass > 0.0:
+            points.append(data.oMi[joint].act(model.inertias[joint].lever))
+    for loop in mechanism.loops:
+        for anchor in (loop.a, loop.b):
+            joint, placement = anchor.resolve(model)
+            points.append(data.oMi[joint].act(placement.translation))
+    corners = np.array(points) if points else np.zeros((1, 3))
+    diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
+    length = diagonal if diagonal > 0.0 else 1.0
+    angular = np.abs(data.J[3:]).max(axis=0) > 1e-9 if model.nv else np.zeros(0, dtype=bool)
+    coordinate = np.where(angular, 1.0, length)
+    rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
+    if model.nv:
+        rate = max(rate, float(np.max(np.abs(v) / coordinate)))
+    return Units(length, coordinate, rate if rate > 0.0 else 1.0)

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     )
     from srm_mbs.loading import bundled_models, load, n_four_bar
     from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
+    from srm_mbs.methods.butcher import ButcherTableau
     from srm_mbs.methods.psrm import PSRM
-    from srm_mbs.methods.tableaus import TABLEAUS, ButcherTableau
+    from srm_mbs.methods.tableaus import TABLEAUS
     from srm_mbs.simulation import simulate
     from srm_mbs.solution import Solution
     from srm_mbs.storage import load_solution
@@ -32,7 +33,7 @@ _HOME = {
     "Anchor": "mechanism",
     "Assembly": "assembly",
     "AssemblyError": "errors",
-    "ButcherTableau": "methods.tableaus",
+    "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
     "InputError": "errors",
     "LoopClosure": "mechanism",
@@ -53,8 +54,8 @@ _HOME = {
 
 __all__ = [
     "CLOSURE_TYPES",
-    "TABLEAUS",
     "PSRM",
+    "TABLEAUS",
     "Anchor",
     "Assembly",
     "AssemblyError",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, InputError
 from srm_mbs.mechanism import LoopClosure, Mechanism
@@ -89,8 +89,9 @@ class _Problem:
         for loop in self.mechanism.loops:
             Ta, Tb = self._anchors(loop)
             parts.append(loop.rows.directions @ Tb.actInv(Ta.translation) / self.length)
-            for axis in loop.rows.matched:
-                parts.append(Tb.rotation.T @ (Ta.rotation @ axis) - axis)
+            if len(loop.rows.matched):
+                R = Tb.rotation.T @ Ta.rotation
+                parts.append((loop.rows.matched @ R.T - loop.rows.matched).ravel())
         return np.concatenate(parts)
 
     def gaps(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
@@ -115,7 +116,7 @@ class _Problem:
         joint_b, in_b = loop.b.resolve(self.model)
         return self.data.oMi[joint_a] * in_a, self.data.oMi[joint_b] * in_b
 
-    def move(self, q: FloatArray, free: FloatArray, delta: FloatArray) -> FloatArray:
+    def move(self, q: FloatArray, free: IndexArray, delta: Any) -> FloatArray:
         """q (+) delta, delta (k,) in units over the free coordinates (indices)."""
         full = np.zeros(self.model.nv)
         full[free] = delta * self.unit[free]
@@ -127,7 +128,7 @@ class _Problem:
         return float(np.abs(g).max()) <= CLOSED and float(np.abs(self.mismatch(q)).max()) < 1e-6
 
 
-def _search(problem: _Problem, q: FloatArray, free: FloatArray) -> FloatArray:
+def _search(problem: _Problem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Least-squares solve of the closing residual over the free coordinates, from q."""
     from scipy.optimize import least_squares
 
@@ -143,14 +144,13 @@ def _search(problem: _Problem, q: FloatArray, free: FloatArray) -> FloatArray:
     return problem.move(q, free, found.x)
 
 
-def _polish(problem: _Problem, q: FloatArray, free: FloatArray) -> tuple[FloatArray, int]:
+def _polish(problem: _Problem, q: FloatArray, free: IndexArray) -> tuple[FloatArray, int]:
     """Gauss-Newton on the closure rows until they stop improving; q and the iterations used."""
     g, G = problem.closure(q)
     best, error = q, float(np.abs(g).max())
     iterations = 0
-    for iterations in range(60):
-        if error == 0.0:
-            break
+    while error > 0.0 and iterations < 60:
+        iterations += 1
         step = np.linalg.lstsq(G[:, free], g, rcond=RANK)[0]
         q = problem.move(q, free, -step)
         g, G = problem.closure(q)
@@ -161,7 +161,7 @@ def _polish(problem: _Problem, q: FloatArray, free: FloatArray) -> tuple[FloatAr
     return best, iterations
 
 
-def _onto_singular_point(problem: _Problem, q: FloatArray, free: FloatArray) -> FloatArray:
+def _onto_singular_point(problem: _Problem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Sharpen a double root: Newton on [g; u^T G] with u the left null vectors of G.
 
     At a singular configuration g has a double root in the free coordinates, which Gauss-Newton
@@ -199,7 +199,7 @@ def _onto_singular_point(problem: _Problem, q: FloatArray, free: FloatArray) -> 
     return q
 
 
-def _close(problem: _Problem, start: FloatArray, free: FloatArray) -> FloatArray:
+def _close(problem: _Problem, start: FloatArray, free: IndexArray) -> FloatArray:
     """The closed configuration that the guess ``start`` leads to, or the closest one found."""
     if not len(free):
         return start
@@ -229,7 +229,7 @@ def _describe(gaps: Mapping[str, tuple[float | None, float | None]]) -> str:
     return "; ".join(parts)
 
 
-def _free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> FloatArray:
+def _free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:
     """Velocity indices of the joints that are not held."""
     free = np.ones(mechanism.model.nv, dtype=bool)
     for name in held:
@@ -254,9 +254,7 @@ def _positions(
         name
         for name in held
         if problem.closed(
-            _close(
-                problem, start, _free_coordinates(mechanism, [h for h in held if h != name])
-            )
+            _close(problem, start, _free_coordinates(mechanism, [h for h in held if h != name]))
         )
     ]
     if not guilty and len(held) > 1:

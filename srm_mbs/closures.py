@@ -19,9 +19,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from srm_mbs.arrays import FloatArray
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 
@@ -24,9 +24,7 @@ def _numbers(value: Any, name: str, accepted: dict[int, str]) -> FloatArray:
         array = np.full(1, np.nan)
     if array.ndim != 1 or not np.isfinite(array).all() or array.size not in accepted:
         wanted = " or ".join(accepted.values())
-        raise InputError(
-            f"joint {name!r} cannot take the value {value!r}", remedy=f"Give {wanted}"
-        )
+        raise InputError(f"joint {name!r} cannot take the value {value!r}", remedy=f"Give {wanted}")
     return array
 
 

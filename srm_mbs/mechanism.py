@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import CLOSURE_TYPES, FloatArray, RowSet
+from srm_mbs.arrays import FloatArray
+from srm_mbs.closures import CLOSURE_TYPES, RowSet
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.stepping.loop import Tick
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 

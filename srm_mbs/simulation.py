@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import (
     ControllerError,
     EvaluationError,
@@ -21,8 +21,8 @@ from srm_mbs.errors import (
 )
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import ErrorNorm, Method
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.psrm import PSRM
-from srm_mbs.methods.tableaus import ButcherTableau
 from srm_mbs.progress import progress_bar
 from srm_mbs.solution import Settings, Solution, Statistics
 from srm_mbs.stepping.dense import StepData
@@ -121,9 +121,7 @@ def _checked_times(t_eval: Any, t_end: float) -> FloatArray | None:
     return times
 
 
-def _initial_state(
-    mechanism: Mechanism, q0: Any, v0: Any
-) -> tuple[Mechanism, FloatArray]:
+def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, FloatArray]:
     """The mechanism with the requested start, and the state (q, v)."""
     if q0 is not None or v0 is not None:
         mechanism = mechanism.with_state(

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
 from srm_mbs.systems.loops import LoopKinematics

@@ -138,14 +138,15 @@ def _key_path(location: tuple[int | str, ...]) -> str:
 
 
 def _known_keys(location: tuple[int | str, ...]) -> str:
-    entry: Any = Description
+    table: type[_Strict] = Description
     for part in location[:-1]:
-        if isinstance(part, int) or not (isinstance(entry, type) and part in entry.model_fields):
+        if isinstance(part, int) or part not in table.model_fields:
             continue
-        annotation = entry.model_fields[part].annotation
-        choices = [annotation, *get_args(annotation)]
-        entry = next((c for c in choices if isinstance(c, type) and issubclass(c, _Strict)), entry)
-    return ", ".join(entry.model_fields)
+        annotation = table.model_fields[part].annotation
+        for choice in (annotation, *get_args(annotation)):
+            if isinstance(choice, type) and issubclass(choice, _Strict):
+                table = choice
+    return ", ".join(table.model_fields)
 
 
 def _explain(error: ValidationError) -> tuple[str, str, str | None]:

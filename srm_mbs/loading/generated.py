@@ -10,7 +10,7 @@ horizontal.  The common crank angle obeys
 .. math:: I \ddot\theta = -g W \cos\theta, \quad I = (N + 1)/3 + N, \quad W = (N + 1)/2 + N,
 
 with :math:`\theta(0) = \pi/2`, :math:`\dot\theta(0) = -1`; at t = 10 s the first crank tip is at
-(0.3284581115, 0.9445185382) for N = 2 and at (0.1805122267, 0.9835727406) for N = 40.
+x = 0.3284581115, z = 0.9445185382 (N = 2) and x = 0.1805122267, z = 0.9835727406 (N = 40).
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ import math
 LENGTH = 1.0  # m, every rod
 MASS = 1.0  # kg, every rod
 TRANSVERSE_INERTIA = MASS * LENGTH**2 / 12.0  # kg m^2, about the centre
-AXIAL_INERTIA = 1e-3 * TRANSVERSE_INERTIA  # small and positive: the motion is planar
-UPRIGHT = math.pi / 2.0  # rad, angle of the cranks from +x towards +z at the start
+AXIAL_INERTIA = 1e-3 * TRANSVERSE_INERTIA  # small and positive; no effect on a planar motion
+UPRIGHT = math.pi / 2.0  # rad, crank angle at the start, from +x towards +z
 CRANK_RATE = -1.0  # rad/s: the tip of an upright crank moves at 1 m/s in +x
 
-WIDTH, DEPTH, EYE_RADIUS, PIN_RADIUS = 0.08, 0.06, 0.065, 0.03  # m, how the rods look
-GROUND_LAYER, CRANK_LAYER, COUPLER_LAYERS = 0.12, 0.04, (-0.04, -0.12)  # m, y of the drawn parts
+WIDTH, DEPTH, EYE_RADIUS, PIN_RADIUS = 0.08, 0.04, 0.065, 0.03  # m, how the rods look
+GROUND_LAYER, CRANK_LAYER, COUPLER_LAYERS = 0.075, 0.025, (-0.025, -0.075)  # m, y of drawn parts
 ALONG_Y = "1.5707963267948966 0 0"  # rpy that lays a URDF cylinder along y
 
 MATERIALS = (  # after Okabe and Ito: told apart by colour-blind readers too
-    ("ground", "0.55 0.57 0.60 1"),
-    ("pin", "0.15 0.16 0.18 1"),
-    ("crank", "0 0.447 0.698 1"),
-    ("coupler", "0.902 0.624 0 1"),
+    ("grey", "0.55 0.57 0.60 1"),
+    ("dark", "0.15 0.16 0.18 1"),
+    ("blue", "0 0.447 0.698 1"),
+    ("orange", "0.902 0.624 0 1"),
 )
 
 
@@ -42,12 +42,12 @@ def n_four_bar(n: int) -> tuple[str, str]:
     Parameters
     ----------
     n
-        Number of couplers, which is the number of four-bar loops.
+        Number of four-bar loops, which is the number of couplers.
 
     Returns
     -------
     toml_text, urdf_text
-        The description, which names the URDF ``../urdf/n_four_bar_<n>.urdf``, and that URDF.
+        The description, which names ``../urdf/n_four_bar_<n>.urdf``, and that URDF.
 
     Raises
     ------
@@ -60,14 +60,13 @@ def n_four_bar(n: int) -> tuple[str, str]:
 
 
 def _description(n: int) -> str:
-    """The TOML text: one closure per coupler, the first crank held at the start."""
-    first_coupler = f"{-UPRIGHT!r}"
+    """Write the TOML text: one closure per coupler; the first crank is held at the start."""
+    couplers = "1 coupler" if n == 1 else f"{n} couplers"
     lines = [
-        f"# N-four-bar with N = {n}: benchmark A02 of the IFToMM library of computational benchmark",
-        f"# problems. {n + 1} cranks and {n} coupler{'s' if n > 1 else ''}, all uniform rods of"
-        " 1 m and 1 kg.",
-        "# It starts with upright cranks, the first tip at 1 m/s in +x.",
-        f"# Singular whenever the cranks are horizontal: the degrees of freedom jump from 1 to {n + 1}.",
+        f"# N-four-bar with N = {n}: {n + 1} cranks and {couplers}, uniform rods of 1 m and 1 kg.",
+        "# Benchmark A02 of the IFToMM Library of Computational Benchmark Problems. It starts with",
+        "# upright cranks, the first crank tip at 1 m/s in +x.",
+        f"# Singular when the cranks are horizontal: the degrees of freedom jump from 1 to {n + 1}.",
         "# Written by srm_mbs.loading.generated.n_four_bar.",
         "format = 1",
         f'name = "n_four_bar_{n}"',
@@ -81,93 +80,112 @@ def _description(n: int) -> str:
             "[[loop]]",
             f'name = "pin_{i}"',
             'type = "point"',
-            f'a = {{ link = "coupler_{i}", xyz = [{LENGTH!r}, 0.0, 0.0] }}',
-            f'b = {{ link = "crank_{i + 1}", xyz = [{LENGTH!r}, 0.0, 0.0] }}',
+            f'a = {{ link = "coupler_{i}", xyz = [{LENGTH}, 0.0, 0.0] }}',
+            f'b = {{ link = "crank_{i + 1}", xyz = [{LENGTH}, 0.0, 0.0] }}',
         ]
     lines += [
         "",
         "[initial]",
-        f"q = {{ crank_0 = {UPRIGHT!r} }}",
-        f"v = {{ crank_0 = {CRANK_RATE!r} }}",
+        f"q = {{ crank_0 = {UPRIGHT} }}",
+        f"v = {{ crank_0 = {CRANK_RATE} }}",
         "",
         "[initial.guess]",
     ]
     for i in range(n):
-        lines += [f"coupler_{i} = {first_coupler}", f"crank_{i + 1} = {UPRIGHT!r}"]
+        lines += [f"coupler_{i} = {-UPRIGHT}", f"crank_{i + 1} = {UPRIGHT}"]
     lines += ["", "[simulation]", "t_end = 10.0", "rtol = 1e-8"]
     return "\n".join(lines) + "\n"
 
 
 def _urdf(n: int) -> str:
-    """The URDF text: a tree of N + 1 cranks, the first N of which carry a coupler."""
+    """Write the URDF text: a tree of N + 1 cranks, all but the last carrying a coupler."""
     lines = [
         '<?xml version="1.0"?>',
-        f"<!-- N-four-bar, N = {n} (IFToMM A02): loop closures are in models/n_four_bar_{n}.toml.",
+        f"<!-- N-four-bar, N = {n} (IFToMM A02); models/n_four_bar_{n}.toml closes its loops.",
         "     Written by srm_mbs.loading.generated.n_four_bar. -->",
         f'<robot name="n_four_bar_{n}">',
     ]
-    lines += [
-        f'  <material name="{name}"><color rgba="{rgba}"/></material>' for name, rgba in MATERIALS
-    ]
+    for material, rgba in MATERIALS:
+        lines.append(f'  <material name="{material}"><color rgba="{rgba}"/></material>')
     lines += ["", '  <link name="world">', *_ground(n), "  </link>"]
     for i in range(n + 1):
-        lines += _rod(f"crank_{i}", "world", float(i), "crank", CRANK_LAYER, GROUND_LAYER)
+        front = min(COUPLER_LAYERS[j % 2] for j in (i - 1, i) if 0 <= j < n)
+        pins = [*_pin(0.0, GROUND_LAYER, CRANK_LAYER), *_pin(LENGTH, CRANK_LAYER, front)]
+        lines += _rod(f"crank_{i}", "blue", CRANK_LAYER, pins)
+        lines += _joint(f"crank_{i}", "world", float(i))
         if i < n:
-            layer = COUPLER_LAYERS[i % 2]
-            lines += _rod(f"coupler_{i}", f"crank_{i}", LENGTH, "coupler", layer, CRANK_LAYER)
-    lines += ["</robot>"]
+            lines += _rod(f"coupler_{i}", "orange", COUPLER_LAYERS[i % 2], [])
+            lines += _joint(f"coupler_{i}", f"crank_{i}", LENGTH)
+    lines.append("</robot>")
     return "\n".join(lines) + "\n"
 
 
 def _ground(n: int) -> list[str]:
-    """Visuals of the ground: a beam behind the rods and a block at every pivot."""
-    beam = f'<box size="{n + 0.4:.10g} 0.06 0.05"/>'
-    lines = _visual(f"{n / 2.0:.10g} {GROUND_LAYER:.10g} -0.105", beam, "ground")
+    """Draw the ground: a beam behind the rods and a block at every pivot."""
+    beam = f'<box size="{_number(n + 0.4)} {DEPTH} 0.05"/>'
+    lines = _visual((n / 2.0, GROUND_LAYER, -0.125), beam, "grey")
     for i in range(n + 1):
-        block = '<box size="0.16 0.06 0.16"/>'
-        lines += _visual(f"{i} {GROUND_LAYER:.10g} -0.02", block, "ground")
+        block = f'<box size="0.16 {DEPTH} 0.18"/>'
+        lines += _visual((float(i), GROUND_LAYER, -0.02), block, "grey")
     return lines
 
 
-def _rod(
-    name: str, parent: str, x: float, material: str, layer: float, parent_layer: float
-) -> list[str]:
-    """A link with its revolute joint at (x, 0, 0) of the parent, the rod lying along its +x."""
-    box = f'<box size="{LENGTH:.10g} {DEPTH:.10g} {WIDTH:.10g}"/>'
-    eye = f'<cylinder radius="{EYE_RADIUS:.10g}" length="{DEPTH:.10g}"/>'
-    pin_length = abs(parent_layer - layer) + DEPTH + 0.02
-    pin = f'<cylinder radius="{PIN_RADIUS:.10g}" length="{pin_length:.10g}"/>'
+def _rod(name: str, material: str, layer: float, pins: list[str]) -> list[str]:
+    """Write a link: a uniform rod from its origin along +x, drawn at y = ``layer``."""
+    bar = f'<box size="{LENGTH} {DEPTH} {WIDTH}"/>'
+    eye = f'<cylinder radius="{EYE_RADIUS}" length="{DEPTH}"/>'
+    transverse = f'iyy="{TRANSVERSE_INERTIA}" izz="{TRANSVERSE_INERTIA}"'
     return [
         "",
         f'  <link name="{name}">',
         "    <inertial>",
-        f'      <origin xyz="{LENGTH / 2.0:.10g} 0 0"/>',
-        f'      <mass value="{MASS:.10g}"/>',
-        f'      <inertia ixx="{AXIAL_INERTIA!r}" iyy="{TRANSVERSE_INERTIA!r}"'
-        f' izz="{TRANSVERSE_INERTIA!r}" ixy="0" ixz="0" iyz="0"/>',
+        f'      <origin xyz="{_number(LENGTH / 2.0)} 0 0"/>',
+        f'      <mass value="{_number(MASS)}"/>',
+        f'      <inertia ixx="{AXIAL_INERTIA}" {transverse} ixy="0" ixz="0" iyz="0"/>',
         "    </inertial>",
-        *_visual(f"{LENGTH / 2.0:.10g} {layer:.10g} 0", box, material),
-        *_visual(f"0 {layer:.10g} 0", eye, material, ALONG_Y),
-        *_visual(f"{LENGTH:.10g} {layer:.10g} 0", eye, material, ALONG_Y),
-        *_visual(f"0 {(layer + parent_layer) / 2.0:.10g} 0", pin, "pin", ALONG_Y),
+        *_visual((LENGTH / 2.0, layer, 0.0), bar, material),
+        *_visual((0.0, layer, 0.0), eye, material, ALONG_Y),
+        *_visual((LENGTH, layer, 0.0), eye, material, ALONG_Y),
+        *pins,
         "  </link>",
+    ]
+
+
+def _pin(x: float, back: float, front: float) -> list[str]:
+    """Draw a pin along y through the layers from ``back`` to ``front``."""
+    length = back - front + DEPTH + 0.02
+    cylinder = f'<cylinder radius="{PIN_RADIUS}" length="{_number(length)}"/>'
+    return _visual((x, (back + front) / 2.0, 0.0), cylinder, "dark", ALONG_Y)
+
+
+def _joint(name: str, parent: str, x: float) -> list[str]:
+    """Write the revolute joint that moves the link of the same name, at (x, 0, 0) of ``parent``."""
+    return [
         f'  <joint name="{name}" type="revolute">',
         f'    <parent link="{parent}"/>',
         f'    <child link="{name}"/>',
-        f'    <origin xyz="{x:.10g} 0 0"/>',
+        f'    <origin xyz="{_number(x)} 0 0"/>',
         '    <axis xyz="0 -1 0"/>',
         '    <limit lower="-1e6" upper="1e6" effort="1e6" velocity="1e6"/>',
         "  </joint>",
     ]
 
 
-def _visual(xyz: str, geometry: str, material: str, rpy: str | None = None) -> list[str]:
-    """One URDF visual."""
+def _visual(
+    xyz: tuple[float, float, float], geometry: str, material: str, rpy: str | None = None
+) -> list[str]:
+    """Write one visual; ``geometry`` is its XML element."""
+    place = f'xyz="{" ".join(map(_number, xyz))}"'
     turn = "" if rpy is None else f' rpy="{rpy}"'
     return [
         "    <visual>",
-        f'      <origin xyz="{xyz}"{turn}/>',
+        f"      <origin {place}{turn}/>",
         f"      <geometry>{geometry}</geometry>",
         f'      <material name="{material}"/>',
         "    </visual>",
     ]
+
+
+def _number(value: float) -> str:
+    """Write a drawing or placement length without rounding noise."""
+    return f"{value:.10g}"

@@ -272,7 +272,7 @@ class _Checker:
                         f"link {link!r}", "it is its own ancestor", "Close loops by [[loop]]"
                     )
                 seen.add(at)
-        if WORLD in links and (WORLD != roots[0] or base != "fixed"):
+        if WORLD in links and (roots[0] != WORLD or base != "fixed"):
             raise self.fault(
                 f"link {WORLD!r}",
                 f"{WORLD!r} is reserved for the ground, but here it moves",
@@ -295,9 +295,9 @@ class _Checker:
                 "Remove it, or lock the joint",
             )
         axis = joint.find("axis")
-        if axis is not None and kind in WITH_AXIS:
-            if not any(self.numbers(axis, "xyz", 3, where)):
-                raise self.fault(where, "its axis is zero", "Give a direction")
+        turns = axis is not None and kind in WITH_AXIS
+        if axis is not None and turns and not any(self.numbers(axis, "xyz", 3, where)):
+            raise self.fault(where, "its axis is zero", "Give a direction")
         limit = joint.find("limit")
         if kind in ("revolute", "prismatic"):
             if limit is None:

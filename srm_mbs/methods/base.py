@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.tableaus import ButcherTableau
 from srm_mbs.systems.base import System, Zone
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 
 POINTS = 5
 """Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
@@ -50,11 +50,11 @@ class MultiplierHistory:
 
     def predict(self, t: float) -> FloatArray:
         """yhat (nv,) extrapolated to ``t``."""
-        return lagrange_weights(self.times, t) @ self.values  # type: ignore[no-any-return]
+        return lagrange_weights(self.times, t) @ self.values
 
     def uncertainty(self, t: float) -> FloatArray:
         """|yhat_pred - the prediction without the oldest node| (nv,); 0 with a single node."""
         if len(self.times) < 2:
             return np.zeros(self.values.shape[1])
         lower = lagrange_weights(self.times[1:], t) @ self.values[1:]
-        return np.abs(self.predict(t) - lower)  # type: ignore[no-any-return]
+        return np.abs(self.predict(t) - lower)

@@ -20,11 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.tableaus import ButcherTableau, get_tableau
+from srm_mbs.methods.tableaus import get_tableau
 from srm_mbs.systems.base import System, Zone
 
 ZONE_FLOOR = 1e-3
@@ -166,4 +167,3 @@ class PSRM:
         memory.magnitude = result.magnitude
         if result.multiplier is not None and memory.history is not None:
             memory.history = memory.history.extended(result.t + result.h, result.multiplier)
-

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
-from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.arrays import FloatArray
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.dense import StepData
 
 CLEARLY_BETTER = 0.2
@@ -51,7 +51,8 @@ def _zero_in_step(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
 
     def residual(values: FloatArray) -> tuple[float, FloatArray]:
         coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
-        return float(np.linalg.norm(basis @ coefficients - values)), coefficients
+        misfit = np.linalg.norm(basis @ coefficients - values)
+        return float(misfit), np.asarray(coefficients, dtype=np.float64)
 
     plain, _ = residual(sigma)
     best: tuple[float, float] | None = None

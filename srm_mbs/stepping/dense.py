@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.tableaus import ButcherTableau
 from srm_mbs.systems.base import System, Zone
 
 
@@ -141,9 +141,7 @@ class DenseOutput:
             full = np.vstack([rates, np.zeros((len(c), rates.shape[1]))])
             for i, ci in enumerate(c):
                 delta = (h * A[i]) @ full
-                terms = self._system.evaluate(
-                    t + ci * h, self._system.retract(start, delta), zone
-                )
+                terms = self._system.evaluate(t + ci * h, self._system.retract(start, delta), zone)
                 full[len(rates) + i] = self._system.chart_rate(delta, terms.rate())
             self._extra[step] = full[len(rates) :]
         return np.vstack([rates, self._extra[step]])

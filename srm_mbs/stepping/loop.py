@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
 from srm_mbs.stepping.stepsize import StepSizeControl, Verdict

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import Memory, StepResult
-from srm_mbs.methods.tableaus import ButcherTableau
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
 
 SIGMA_CHANGE = 0.5

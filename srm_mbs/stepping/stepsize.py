@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
 from srm_mbs.systems.base import System
 

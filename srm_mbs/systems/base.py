@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 
 
 @dataclass(frozen=True)

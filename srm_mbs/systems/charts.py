@@ -14,7 +14,7 @@ from math import comb, factorial
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 
 ROTATION_PER_STEP = 1.5

@@ -21,11 +21,11 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.mechanism import LoopClosure
 
 
-def cross(a: Sequence[float], b: Sequence[float]) -> FloatArray:
+def cross(a: Sequence[float] | FloatArray, b: Sequence[float] | FloatArray) -> FloatArray:
     """a x b; ``numpy.cross`` costs ten times as much on three numbers."""
     ax, ay, az = a
     bx, by, bz = b
@@ -46,7 +46,7 @@ class _LoopRows:
     """The kept, scaled rows of one closure, resolved against a model."""
 
     def __init__(
-        self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: FloatArray, start: int
+        self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
     ) -> None:
         self.joint_a, self.in_a = loop.a.resolve(model)
         self.joint_b, self.in_b = loop.b.resolve(model)
@@ -88,7 +88,7 @@ class LoopKinematics:
         model: pin.Model,
         loops: Sequence[LoopClosure],
         scale: FloatArray | None = None,
-        keep: FloatArray | None = None,
+        keep: BoolArray | None = None,
     ) -> None:
         total = sum(loop.rows.count for loop in loops)
         scale = np.ones(total) if scale is None else scale

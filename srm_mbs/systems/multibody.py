@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.base import Terms, Zone
@@ -260,9 +260,7 @@ class ClosedSystem(_Mechanics):
         loops = self.loops
         loops.update(data)
         projection = self.projection
-        projection.factor(
-            data.M, loops.G, f, loops.bias, None if zone is None else zone.threshold
-        )
+        projection.factor(data.M, loops.G, f, loops.bias, None if zone is None else zone.threshold)
         terms = self._terms
         terms.v = v
         terms.predicted = zone.predict(t) if projection.weak and zone is not None else None

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import lapack
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 
 PIVOT_ZERO = 1e-13
@@ -53,7 +53,7 @@ def unwhiten(U: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
-    """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (min(nv, m),)."""
+    """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (k,)."""
     packed, permutation, tau, _, _ = lapack.dgeqp3(W)
     return packed, permutation - 1, tau, np.abs(packed.diagonal())
 
@@ -123,7 +123,7 @@ class Projection:
         if self.rank == 0:
             return np.zeros(self.U.shape[0])
         z = lapack.dtrtrs(self.R, right, lower=0, trans=1)[0]
-        return self.Q @ z  # type: ignore[no-any-return]
+        return self.Q @ z
 
     def unwhiten(self, right: FloatArray) -> FloatArray:
         """L^-T right."""
@@ -131,7 +131,7 @@ class Projection:
 
     def white_project(self, w: FloatArray) -> FloatArray:
         """Q Q^T L^T w (nv,)."""
-        return self.Q @ (self.Q.T @ (self.U @ w))  # type: ignore[no-any-return]
+        return self.Q @ (self.Q.T @ (self.U @ w))
 
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nv,)."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.systems.loops import LoopKinematics, row_wrenches
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, whiten

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
@@ -60,7 +60,7 @@ class Structure:
 
     row_names: tuple[str, ...]
     row_scale: FloatArray
-    kept: FloatArray
+    kept: BoolArray
     rank: int
     sigma_ref: float
     units: Units
@@ -222,6 +222,4 @@ def analyse(mechanism: Mechanism) -> Structure:
                 f"{weakest:.1e}, largest redundant pivot {redundant:.1e}"
             )
             log.warning("%s: %s", mechanism.name, notes[-1])
-    return Structure(
-        names, walker.scale, kept, rank, sigma_ref, units, len(pivots), tuple(notes)
-    )
+    return Structure(names, walker.scale, kept, rank, sigma_ref, units, len(pivots), tuple(notes))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.closures import FloatArray
+from srm_mbs.arrays import FloatArray
 from srm_mbs.mechanism import Mechanism
 
 

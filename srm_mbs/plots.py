@@ -1,0 +1,255 @@
+"""The run plot: drift, energy, sigma and step sizes over time.
+
+Matplotlib's object interface only: no pyplot, so no display and no global state.  Imported when a
+plot is asked for, because matplotlib is slow to import.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from srm_mbs.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from srm_mbs.arrays import FloatArray
+    from srm_mbs.solution import Solution
+
+FORMATS = (".png", ".pdf", ".svg")
+"""Suffixes under which a figure can be saved."""
+SMALLEST_DRIFT = 1e-17
+"""Drift that is exactly zero is drawn here, since a logarithmic axis has no zero."""
+FULL_LINES = 80
+"""More singular passages than this are marked by ticks: full lines would fill the panels."""
+DOTS = 400
+"""Up to this many steps, every step end has its dot."""
+
+# Okabe and Ito's palette: distinct for the colour-blind, and of different lightness in print.
+BLACK, BLUE, VERMILION, GREY = "#000000", "#0072B2", "#D55E00", "#8C8C8C"
+
+WIDTH = 7.0
+"""Width of the figure (inch), within the text of an A4 or letter page."""
+STYLE_POINTS = 8.5
+RESOLUTION = 200
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file name whose suffix is no format of figures.
+
+    Raises
+    ------
+    InputError
+        Naming the suffixes that are.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(
+            f"figures cannot be saved as {path.suffix!r}",
+            file=str(path),
+            remedy=f"Use one of {', '.join(FORMATS)}",
+        )
+
+
+def plot_run(solution: Solution, path: Path | None = None) -> Figure:
+    """Drift, energy, sigma and step sizes of a run over time, in panels with one time axis.
+
+    Drift and energy are drawn at ``solution.t``, sigma and step sizes at the steps.  Without
+    loops there is neither drift nor sigma, and their panels are left out.
+
+    Parameters
+    ----------
+    solution
+        A run, finished or not.
+    path
+        Where to save the figure; the suffix decides the format: png, pdf or svg.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one; nothing is drawn then.
+    OSError
+        If the file cannot be written.
+    """
+    if path is not None:
+        check_suffix(path)
+    panels = [_energy, _step_sizes]
+    if solution.mechanism.loops:
+        panels = [_drift, _energy, _sigma, _step_sizes]
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * len(panels)), layout="constrained")
+    all_axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
+    # A state that ran away overflows in its own drift and energy; the plot just ends there.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for letter, draw, axes in zip("abcd", panels, all_axes):
+            _prepare(axes)
+            draw(axes, solution)
+            axes.set_title(f"({letter}) {axes.get_title(loc='left')}", loc="left", **_text(0.5))
+            _legend(axes)
+    last = all_axes[-1]
+    last.set_xlabel("time (s)", fontsize=STYLE_POINTS)
+    start, end = solution.steps.times[0], solution.steps.times[-1]
+    last.set_xlim(start, end if end > start else start + 1.0)
+    figure.align_ylabels(all_axes)
+    # Names are the user's: a "$" in them is no formula.
+    figure.suptitle(_title(solution), fontsize=STYLE_POINTS + 1.5, parse_math=False)
+    if path is not None:
+        figure.savefig(path, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    return figure
+
+
+def _text(larger: float = 0.0) -> dict[str, float]:
+    return {"fontsize": STYLE_POINTS + larger}
+
+
+def _title(solution: Solution) -> str:
+    settings = solution.settings
+    control = f"rtol = {settings.rtol:.3g}"
+    if settings.step is not None:
+        control = f"fixed step {settings.step:.6g} s"
+    parts = [solution.mechanism.name, settings.method, settings.tableau, control]
+    title = ", ".join(part for part in parts if part)
+    if not solution.success:
+        title += f"\n{solution.status} at t = {solution.steps.times[-1]:.6g} s"
+    return title
+
+
+def _prepare(axes: Axes) -> None:
+    axes.tick_params(labelsize=STYLE_POINTS - 0.5, which="both", direction="in")
+    axes.grid(axis="y", color="#E4E4E4", linewidth=0.5)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _legend(axes: Axes) -> None:
+    """A legend above the panel, on the line of its title, where there are no data."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(
+            handles,
+            labels,
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=len(handles),
+            frameon=False,
+            borderaxespad=0.0,
+            borderpad=0.2,
+            handlelength=1.6,
+            fontsize=STYLE_POINTS - 0.5,
+        )
+
+
+def _log_axis(axes: Axes) -> None:
+    """A logarithmic axis with a tick at every decade, thinned out where there are many."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(numticks=6))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _drift(axes: Axes, solution: Solution) -> None:
+    rotations = any(len(loop.rows.alignments) for loop in solution.mechanism.loops)
+    units = ("m, rad", "m/s, rad/s") if rotations else ("m", "m/s")
+    drift = np.maximum(_finite(solution.drift), SMALLEST_DRIFT)
+    symbols = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
+    # The rate first: it is the larger one, and the position stays visible on top of it.
+    for column, colour in ((1, VERMILION), (0, BLUE)):
+        axes.plot(
+            solution.t,
+            drift[:, column],
+            color=colour,
+            label=f"{symbols[column]} ({units[column]})",
+            **_curve(solution.t),
+        )
+    _log_axis(axes)
+    axes.set_title("closure errors", loc="left")
+    axes.set_ylabel("drift", fontsize=STYLE_POINTS)
+
+
+def _energy(axes: Axes, solution: Solution) -> None:
+    change = _finite(solution.energy - solution.energy[0])
+    largest = float(np.nanmax(np.abs(change), initial=0.0))
+    # The power of ten goes into the label: matplotlib's own offset text would sit on the title.
+    power = int(np.floor(np.log10(largest))) if largest > 0.0 else 0
+    power = 0 if -2 <= power <= 3 else power
+    unit = "J" if power == 0 else rf"$10^{{{power}}}$ J"
+    axes.plot(solution.t, change / 10.0**power, color=BLACK, **_curve(solution.t))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.set_title("total energy relative to the start", loc="left")
+    axes.set_ylabel(f"energy change\n({unit})", fontsize=STYLE_POINTS)
+
+
+def _sigma(axes: Axes, solution: Solution) -> None:
+    steps = solution.steps
+    _passages(axes, solution)
+    # Every stage, not the step ends alone: a step leaps over a passage, its stages do not.
+    abscissae = np.append(solution.scheme.c, 1.0)
+    times = steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]
+    order = np.argsort(times, axis=None, kind="stable")
+    axes.plot(times.ravel()[order], _finite(steps.sigmas.ravel()[order]), color=GREY, linewidth=0.8)
+    ends = _finite(steps.sigmas[:, -1])
+    axes.plot(steps.times[1:], ends, color=BLUE, linestyle="none", **_dots(steps.count))
+    axes.set_ylim(bottom=0.0)
+    axes.set_title("distance from singular configurations", loc="left")
+    axes.set_ylabel(r"$\sigma$ (relative)", fontsize=STYLE_POINTS)
+
+
+def _step_sizes(axes: Axes, solution: Solution) -> None:
+    steps = solution.steps
+    _passages(axes, solution)
+    axes.plot(
+        steps.times[:-1],
+        np.diff(steps.times),
+        color=BLUE,
+        linestyle="none",
+        label="accepted",
+        **_dots(steps.count),
+    )
+    if len(solution.rejected):
+        axes.plot(
+            solution.rejected[:, 0],
+            solution.rejected[:, 1],
+            color=VERMILION,
+            marker="x",
+            markersize=4.0,
+            markeredgewidth=0.9,
+            linestyle="none",
+            label="rejected or redone",
+        )
+    _log_axis(axes)
+    axes.set_title("steps", loc="left")
+    axes.set_ylabel("step size (s)", fontsize=STYLE_POINTS)
+
+
+def _passages(axes: Axes, solution: Solution) -> None:
+    """Mark the singular passages by thin vertical lines, or by ticks where they are many."""
+    times = [crossing.time for crossing in solution.crossings]
+    if times:
+        axes.vlines(
+            times,
+            0.0,
+            1.0 if len(times) <= FULL_LINES else 0.06,
+            transform=axes.get_xaxis_transform(),
+            color=BLACK,
+            linewidth=0.5,
+            linestyle=(0, (4, 3)),
+            label="singular passage",
+        )
+
+
+def _finite(values: FloatArray) -> FloatArray:
+    """Values with gaps where they are not finite: nothing is drawn there."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _curve(t: FloatArray) -> dict[str, float | str]:
+    """Line properties; few points get dots, without which a single one would be invisible."""
+    return {"linewidth": 0.9, "marker": "." if len(t) < 50 else "", "markersize": 3.0}
+
+
+def _dots(count: int) -> dict[str, float | str]:
+    """Marker properties for one mark per step: smaller where there are many."""
+    return {"marker": ".", "markersize": 3.5 if count <= DOTS else 2.0}

@@ -1,0 +1,188 @@
+"""Saved runs: one ``.npz`` with everything needed to interpolate, replay and plot a run.
+
+Arrays are stored as they are; the rest (description, URDF, closures, settings) as one JSON text.
+Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.loading import rebuild
+from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism, SimulationDefaults, Source
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.tableaus import get_tableau
+from srm_mbs.solution import Settings, Solution, Statistics
+from srm_mbs.stepping.dense import StepData
+from srm_mbs.systems.multibody import make_system
+from srm_mbs.systems.structure import Structure
+from srm_mbs.systems.units import Units
+
+FORMAT = 1
+_STEP_ARRAYS = (
+    "times",
+    "states",
+    "rates",
+    "corrections",
+    "sigmas",
+    "ranks",
+    "error_ratios",
+)
+
+
+def save_solution(solution: Solution, path: Path) -> None:
+    """Write ``solution`` to ``path``; see :meth:`srm_mbs.solution.Solution.save`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    mechanism = solution.mechanism
+    structure = mechanism.structure
+    zones = solution.steps.zones
+    meta = {
+        "format": FORMAT,
+        "pin": pin.__version__,
+        "mechanism": {
+            "name": mechanism.name,
+            "source": None if mechanism.source is None else asdict(mechanism.source),
+            "model": mechanism.model.saveToString() if mechanism.source is None else None,
+            "loops": [asdict(loop) for loop in mechanism.loops],
+            "defaults": asdict(mechanism.defaults),
+            "notes": mechanism.notes,
+        },
+        "structure": {
+            "rank": structure.rank,
+            "sigma_ref": structure.sigma_ref,
+            "samples": structure.samples,
+            "notes": structure.notes,
+            "length": structure.units.length,
+            "rate": structure.units.rate,
+        },
+        "settings": asdict(solution.settings),
+        "stats": asdict(solution.stats),
+        "status": solution.status,
+        "message": solution.message,
+        "zones": [[index, threshold] for index, (threshold, _) in zones.items()],
+    }
+    arrays: dict[str, Any] = {name: getattr(solution.steps, name) for name in _STEP_ARRAYS}
+    for k, (_, history) in enumerate(zones.values()):
+        arrays[f"zone_{k}_times"] = history.times
+        arrays[f"zone_{k}_values"] = history.values
+    if solution.t_eval is not None:
+        arrays["t_eval"] = solution.t_eval
+    arrays |= {
+        "rejected": solution.rejected,
+        "q0": mechanism.q0,
+        "v0": mechanism.v0,
+        "row_scale": structure.row_scale,
+        "kept": structure.kept,
+        "coordinate_unit": structure.units.coordinate,
+    }
+    with path.open("wb") as file:  # given a name, numpy would append ".npz" to it
+        np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
+
+
+def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:
+    if entry["source"] is not None:
+        source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
+        base = rebuild(source)
+        model = base.model
+    else:
+        source, model = None, pin.Model()
+        model.loadFromString(entry["model"])
+    loops = [
+        LoopClosure(
+            loop["type"],
+            Anchor(**loop["a"]),
+            Anchor(**loop["b"]),
+            loop["axis"],
+            loop["name"],
+        )
+        for loop in entry["loops"]
+    ]
+    return Mechanism(
+        model,
+        tuple(loops),
+        q0=arrays["q0"],
+        v0=arrays["v0"],
+        name=entry["name"],
+        source=source,
+        defaults=SimulationDefaults(**entry["defaults"]),
+        notes=tuple(entry["notes"]),
+    )
+
+
+def load_solution(path: str | Path) -> Solution:
+    """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
+
+    A controller is not saved: reactions of a controlled run cannot be computed afterwards.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is no saved run, or is of another format.
+    """
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        meta = json.loads(str(arrays.pop("meta")))
+        if meta["format"] != FORMAT:
+            raise InputError(
+                f"it has format {meta['format']}, this version reads {FORMAT}", file=str(path)
+            )
+        mechanism = _mechanism(meta["mechanism"], arrays)
+        structure = meta["structure"]
+        # The analysis of the run itself, so that the dense output is the same to the last bit.
+        mechanism.__dict__["structure"] = Structure(
+            tuple(name for loop in mechanism.loops for name in loop.row_names),
+            arrays["row_scale"],
+            arrays["kept"],
+            structure["rank"],
+            structure["sigma_ref"],
+            Units(structure["length"], arrays["coordinate_unit"], structure["rate"]),
+            structure["samples"],
+            tuple(structure["notes"]),
+        )
+        zones = {
+            int(index): (
+                float(threshold),
+                MultiplierHistory(arrays[f"zone_{k}_times"], arrays[f"zone_{k}_values"]),
+            )
+            for k, (index, threshold) in enumerate(meta["zones"])
+        }
+        steps = StepData(**{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones)
+        settings = Settings(**meta["settings"] | {"atol": tuple(meta["settings"]["atol"])})
+        return Solution(
+            mechanism,
+            make_system(mechanism),
+            get_tableau(settings.tableau),
+            steps,
+            t_eval=arrays.get("t_eval"),
+            rejected=arrays["rejected"],
+            status=meta["status"],
+            message=meta["message"],
+            stats=Statistics(**meta["stats"]),
+            settings=settings,
+        )
+    except FileNotFoundError as error:
+        raise InputError("there is no such file", file=str(path)) from error
+    except InputError as error:
+        raise error.located(str(path)) from error
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"it is no saved run: {error}",
+            file=str(path),
+            remedy="Give a file written by solution.save or srm-mbs simulate --out",
+        ) from error

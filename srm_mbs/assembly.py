@@ -19,7 +19,7 @@ from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, InputError
 from srm_mbs.mechanism import LoopClosure, Mechanism
 from srm_mbs.systems.loops import LoopKinematics
-from srm_mbs.systems.units import coordinate_units
+from srm_mbs.systems.units import coordinate_units, row_units
 
 CLOSED = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
@@ -68,13 +68,7 @@ class _Problem:
         units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
         self.unit = units.coordinate
         self.length = units.length
-        self.row_unit = np.concatenate(
-            [
-                np.repeat([units.length, 1.0], [len(r.directions), len(r.alignments)])
-                for r in (loop.rows for loop in mechanism.loops)
-            ]
-            or [np.zeros(0)]
-        )
+        self.row_unit = row_units(mechanism.loops, units.length)
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
@@ -178,7 +172,7 @@ def _onto_singular_point(problem: _Problem, q: FloatArray, free: IndexArray) -> 
     for _ in range(8):
         _, G = problem.closure(x)
         left, singular, _ = np.linalg.svd(G[:, free])
-        rank = int(np.sum(singular > 1e-4 * max(float(singular[0]), 1e-300)))
+        rank = int(np.sum(singular > 1e-4))
         null = left[:, rank:].T
         value = equations(x, null)
         new_error = float(np.abs(value).max())
@@ -385,7 +379,7 @@ def assemble(
     residuals, rate_residuals = problem.rows.g.copy(), problem.rows.G @ consistent
     _, singular, right = np.linalg.svd(G)
     # sqrt of round-off: a singular closing is known no better where it could not be sharpened
-    rank = int(np.sum(singular > 1e-7 * max(float(singular[0]), 1e-300)))
+    rank = int(np.sum(singular > 1e-7))
     return Assembly(
         closed,
         consistent,

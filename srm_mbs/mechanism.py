@@ -256,6 +256,12 @@ class Mechanism:
     def __post_init__(self) -> None:
         model = self.model
         set_ = object.__setattr__
+        if model.nv == 0:
+            raise InputError(
+                "nothing in this mechanism can move",
+                element="model",
+                remedy="Give it at least one joint that is neither fixed nor locked",
+            )
         set_(self, "loops", tuple(self.loops))
         set_(self, "name", self.name or model.name)
         q0 = pin.neutral(model) if self.q0 is None else self.q0

@@ -7,11 +7,11 @@ plot is asked for, because matplotlib is slow to import.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from srm_mbs.errors import InputError
 
@@ -27,16 +27,21 @@ SMALLEST_DRIFT = 1e-17
 """Drift that is exactly zero is drawn here, since a logarithmic axis has no zero."""
 FULL_LINES = 80
 """More singular passages than this are marked by ticks: full lines would fill the panels."""
-DOTS = 400
-"""Up to this many steps, every step end has its dot."""
+LARGE_DOTS = 400
+"""Up to this many steps their dots are large."""
+FEW_DECADES = 50.0
+"""Below this ratio of its limits a logarithmic axis has ticks at 1, 2, 5, not just at decades."""
+NARROWEST = 8.0
+"""Smallest ratio of the limits of such an axis, so that there are always ticks on it."""
 
 # Okabe and Ito's palette: distinct for the colour-blind, and of different lightness in print.
 BLACK, BLUE, VERMILION, GREY = "#000000", "#0072B2", "#D55E00", "#8C8C8C"
 
 WIDTH = 7.0
 """Width of the figure (inch), within the text of an A4 or letter page."""
-STYLE_POINTS = 8.5
+FONT_SIZE = 8.5
 RESOLUTION = 200
+"""Dots per inch of a png."""
 
 
 def check_suffix(path: Path) -> None:
@@ -77,32 +82,28 @@ def plot_run(solution: Solution, path: Path | None = None) -> Figure:
     """
     if path is not None:
         check_suffix(path)
-    panels = [_energy, _step_sizes]
+    draws = [_energy, _step_sizes]
     if solution.mechanism.loops:
-        panels = [_drift, _energy, _sigma, _step_sizes]
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * len(panels)), layout="constrained")
-    all_axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
-    # A state that ran away overflows in its own drift and energy; the plot just ends there.
+        draws = [_drift, _energy, _sigma, _step_sizes]
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * len(draws)), layout="constrained")
+    panels = figure.subplots(len(draws), sharex=True, squeeze=False)[:, 0]
+    # A state that runs away overflows in its drift and energy: the curves just end there.
     with np.errstate(over="ignore", invalid="ignore"):
-        for letter, draw, axes in zip("abcd", panels, all_axes):
+        for letter, draw, axes in zip("abcd", draws, panels):
             _prepare(axes)
-            draw(axes, solution)
-            axes.set_title(f"({letter}) {axes.get_title(loc='left')}", loc="left", **_text(0.5))
+            title = draw(axes, solution)
+            axes.set_title(f"({letter}) {title}", loc="left", fontsize=FONT_SIZE + 0.5)
             _legend(axes)
-    last = all_axes[-1]
-    last.set_xlabel("time (s)", fontsize=STYLE_POINTS)
     start, end = solution.steps.times[0], solution.steps.times[-1]
-    last.set_xlim(start, end if end > start else start + 1.0)
-    figure.align_ylabels(all_axes)
+    margin = 0.01 * (end - start) or 1.0
+    panels[-1].set_xlim(start - margin, end + margin)
+    panels[-1].set_xlabel("time (s)", fontsize=FONT_SIZE)
+    figure.align_ylabels(panels)
     # Names are the user's: a "$" in them is no formula.
-    figure.suptitle(_title(solution), fontsize=STYLE_POINTS + 1.5, parse_math=False)
+    figure.suptitle(_title(solution), fontsize=FONT_SIZE + 1.5, parse_math=False)
     if path is not None:
         figure.savefig(path, format=path.suffix.lower()[1:], dpi=RESOLUTION)
     return figure
-
-
-def _text(larger: float = 0.0) -> dict[str, float]:
-    return {"fontsize": STYLE_POINTS + larger}
 
 
 def _title(solution: Solution) -> str:
@@ -118,7 +119,7 @@ def _title(solution: Solution) -> str:
 
 
 def _prepare(axes: Axes) -> None:
-    axes.tick_params(labelsize=STYLE_POINTS - 0.5, which="both", direction="in")
+    axes.tick_params(labelsize=FONT_SIZE - 0.5, which="both", direction="in")
     axes.grid(axis="y", color="#E4E4E4", linewidth=0.5)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -138,66 +139,92 @@ def _legend(axes: Axes) -> None:
             frameon=False,
             borderaxespad=0.0,
             borderpad=0.2,
-            handlelength=1.6,
-            fontsize=STYLE_POINTS - 0.5,
+            handlelength=1.4,
+            fontsize=FONT_SIZE - 0.5,
         )
 
 
 def _log_axis(axes: Axes) -> None:
-    """A logarithmic axis with a tick at every decade, thinned out where there are many."""
+    """A logarithmic axis with labelled ticks, whatever the range of its data."""
     axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(numticks=6))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    low, high = axes.get_ylim()
+    if high / low < FEW_DECADES:
+        if high / low < NARROWEST:
+            middle = np.sqrt(low * high)
+            axes.set_ylim(middle / np.sqrt(NARROWEST), middle * np.sqrt(NARROWEST))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+        axes.yaxis.set_minor_locator(NullLocator())
+    else:
+        axes.yaxis.set_major_locator(LogLocator(numticks=6))
+        axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _drift(axes: Axes, solution: Solution) -> None:
+def _drift(axes: Axes, solution: Solution) -> str:
     rotations = any(len(loop.rows.alignments) for loop in solution.mechanism.loops)
     units = ("m, rad", "m/s, rad/s") if rotations else ("m", "m/s")
-    drift = np.maximum(_finite(solution.drift), SMALLEST_DRIFT)
-    symbols = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
-    # The rate first: it is the larger one, and the position stays visible on top of it.
-    for column, colour in ((1, VERMILION), (0, BLUE)):
+    names = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
+    drift = _finite(solution.drift)
+    # The positions as dots: at round-off a line would jump to and fro between a few values.
+    rate = {"color": VERMILION, **_curve(solution.t)}
+    position = {"color": BLACK, "linestyle": "none", "marker": ".", "markersize": 2.0}
+    for column, style in ((1, rate), (0, position)):
         axes.plot(
             solution.t,
-            drift[:, column],
-            color=colour,
-            label=f"{symbols[column]} ({units[column]})",
-            **_curve(solution.t),
+            np.maximum(drift[:, column], SMALLEST_DRIFT),
+            label=f"{names[column]} ({units[column]})",
+            **style,
         )
     _log_axis(axes)
-    axes.set_title("closure errors", loc="left")
-    axes.set_ylabel("drift", fontsize=STYLE_POINTS)
+    axes.set_ylabel("drift", fontsize=FONT_SIZE)
+    floor = drift < SMALLEST_DRIFT
+    return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
 
 
-def _energy(axes: Axes, solution: Solution) -> None:
-    change = _finite(solution.energy - solution.energy[0])
+def _energy(axes: Axes, solution: Solution) -> str:
+    change = _finite(solution.energy - solution.energy[:1])
     largest = float(np.nanmax(np.abs(change), initial=0.0))
-    # The power of ten goes into the label: matplotlib's own offset text would sit on the title.
+    # The power of ten goes into the label: matplotlib's own would lie on the panel's title.
     power = int(np.floor(np.log10(largest))) if largest > 0.0 else 0
-    power = 0 if -2 <= power <= 3 else power
+    if -2 <= power <= 3:
+        power = 0
     unit = "J" if power == 0 else rf"$10^{{{power}}}$ J"
     axes.plot(solution.t, change / 10.0**power, color=BLACK, **_curve(solution.t))
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.set_title("total energy relative to the start", loc="left")
-    axes.set_ylabel(f"energy change\n({unit})", fontsize=STYLE_POINTS)
+    axes.set_ylabel(f"energy change\n({unit})", fontsize=FONT_SIZE)
+    from_start = not len(solution.t) or solution.t[0] == solution.steps.times[0]
+    since = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
+    return f"total energy relative to {since}"
 
 
-def _sigma(axes: Axes, solution: Solution) -> None:
+def _sigma(axes: Axes, solution: Solution) -> str:
     steps = solution.steps
     _passages(axes, solution)
-    # Every stage, not the step ends alone: a step leaps over a passage, its stages do not.
+    # A line through every stage: a step leaps over a singular passage, its stages show the dip.
     abscissae = np.append(solution.scheme.c, 1.0)
     times = steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]
     order = np.argsort(times, axis=None, kind="stable")
-    axes.plot(times.ravel()[order], _finite(steps.sigmas.ravel()[order]), color=GREY, linewidth=0.8)
-    ends = _finite(steps.sigmas[:, -1])
-    axes.plot(steps.times[1:], ends, color=BLUE, linestyle="none", **_dots(steps.count))
-    axes.set_ylim(bottom=0.0)
-    axes.set_title("distance from singular configurations", loc="left")
-    axes.set_ylabel(r"$\sigma$ (relative)", fontsize=STYLE_POINTS)
+    axes.plot(
+        times.ravel()[order],
+        _finite(steps.sigmas.ravel()[order]),
+        color=GREY,
+        linewidth=0.8,
+        label="stages",
+    )
+    axes.plot(
+        steps.times[1:],
+        _finite(steps.sigmas[:, -1]),
+        color=BLUE,
+        linestyle="none",
+        label="step ends",
+        **_dots(steps.count),
+    )
+    axes.set_ylim(bottom=0.0, top=None if steps.count else 1.0)
+    axes.set_ylabel(r"$\sigma$ (relative)", fontsize=FONT_SIZE)
+    return "distance from singular configurations"
 
 
-def _step_sizes(axes: Axes, solution: Solution) -> None:
+def _step_sizes(axes: Axes, solution: Solution) -> str:
     steps = solution.steps
     _passages(axes, solution)
     axes.plot(
@@ -220,8 +247,8 @@ def _step_sizes(axes: Axes, solution: Solution) -> None:
             label="rejected or redone",
         )
     _log_axis(axes)
-    axes.set_title("steps", loc="left")
-    axes.set_ylabel("step size (s)", fontsize=STYLE_POINTS)
+    axes.set_ylabel("step size (s)", fontsize=FONT_SIZE)
+    return "steps"
 
 
 def _passages(axes: Axes, solution: Solution) -> None:
@@ -245,11 +272,11 @@ def _finite(values: FloatArray) -> FloatArray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _curve(t: FloatArray) -> dict[str, float | str]:
+def _curve(t: FloatArray) -> dict[str, Any]:
     """Line properties; few points get dots, without which a single one would be invisible."""
     return {"linewidth": 0.9, "marker": "." if len(t) < 50 else "", "markersize": 3.0}
 
 
-def _dots(count: int) -> dict[str, float | str]:
+def _dots(count: int) -> dict[str, Any]:
     """Marker properties for one mark per step: smaller where there are many."""
-    return {"marker": ".", "markersize": 3.5 if count <= DOTS else 2.0}
+    return {"marker": ".", "markersize": 3.5 if count <= LARGE_DOTS else 2.0}

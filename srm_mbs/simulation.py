@@ -35,7 +35,9 @@ from srm_mbs.stepping.stepsize import (
     Verdict,
     initial_step,
 )
+from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, make_system
+from srm_mbs.systems.units import row_units
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +45,7 @@ LOOSEST_RTOL = 1e-4
 """Looser tolerances let a step jump to another branch at a change point (METHODS section 4)."""
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 CONSISTENT = 1e-8
-"""Largest scaled closure error and rate (per unit) of an initial state that is accepted."""
+"""Largest closure error of an accepted start, in row units, and of its rates in those per time."""
 SINGULAR_START = 1e-7
 """sigma below which a start counts as singular."""
 BACKENDS = ("auto", "python")
@@ -130,17 +132,20 @@ def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, F
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def _check_consistent(mechanism: Mechanism, system: ClosedSystem, state: FloatArray) -> None:
+def _check_consistent(mechanism: Mechanism) -> None:
     """Refuse a start that violates the closures or their rates."""
-    g, c = system.residuals(state)
-    speed = max(1.0, float(np.max(np.abs(state[system.nq :]), initial=0.0)))
+    q0, v0 = mechanism.q0, mechanism.v0
+    g, c = closure_errors(mechanism.model, mechanism.loops, q0[None], v0[None])
+    units = mechanism.structure.units
+    unit = row_units(mechanism.loops, units.length)
+    speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
-        if np.max(np.abs(values)) > limit:
-            kept = [n for n, k in zip(mechanism.structure.row_names, mechanism.structure.kept) if k]
-            worst = kept[int(np.argmax(np.abs(values)))]
+        errors = np.abs(values[0]) / unit
+        worst = int(np.argmax(errors))
+        if errors[worst] > limit:
             raise InputError(
-                f"the initial state violates the closures: row {worst} by "
-                f"{np.max(np.abs(values)):.1e} (scaled)",
+                f"the initial state violates the closures: row "
+                f"{mechanism.structure.row_names[worst]} by {values[0, worst]:.1e}",
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
             )
@@ -259,8 +264,8 @@ def simulate(
     mechanism, state = _initial_state(mechanism, q0, v0)
     norm = ErrorNorm(_absolute_tolerance(mechanism, atol, rtol), rtol)
     system = make_system(mechanism, controller)
-    if isinstance(system, ClosedSystem):
-        _check_consistent(mechanism, system, state)
+    if mechanism.loops:
+        _check_consistent(mechanism)
 
     placement: SingularityPlacement | None = None
     try:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
@@ -17,7 +16,7 @@ from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
-from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 from srm_mbs.systems.reactions import reactions_at
 
@@ -187,17 +186,8 @@ class Solution:
     @cached_property
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g|| (m, rad) and ||G v|| (m/s, rad/s), all rows, unscaled."""
-        model = self.mechanism.model
-        out = np.zeros((len(self.t), 2))
-        if not self.mechanism.loops:
-            return out
-        rows = LoopKinematics(model, self.mechanism.loops)
-        data = model.createData()
-        for i, (q, v) in enumerate(zip(self.q, self.v)):
-            pin.crba(model, data, q, pin.Convention.WORLD)
-            rows.update(data, with_bias=False)
-            out[i] = np.linalg.norm(rows.g), np.linalg.norm(rows.G @ v)
-        return out
+        g, c = closure_errors(self.mechanism.model, self.mechanism.loops, self.q, self.v)
+        return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
 
     @cached_property
     def energy(self) -> FloatArray:

@@ -66,7 +66,7 @@ def _description(n: int) -> str:
         f"# N-four-bar with N = {n}: {n + 1} cranks and {couplers}, uniform rods of 1 m and 1 kg.",
         "# Benchmark A02 of the IFToMM Library of Computational Benchmark Problems. It starts with",
         "# upright cranks, the first crank tip at 1 m/s in +x.",
-        f"# Singular when the cranks are horizontal: the degrees of freedom jump from 1 to {n + 1}.",
+        f"# Singular when the cranks are horizontal: then {n + 1} degrees of freedom, not 1.",
         "# Written by srm_mbs.loading.generated.n_four_bar.",
         "format = 1",
         f'name = "n_four_bar_{n}"',

@@ -32,6 +32,12 @@ def cross(a: Sequence[float] | FloatArray, b: Sequence[float] | FloatArray) -> F
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
+def world_jacobian(data: pin.Data) -> FloatArray:
+    """The joint Jacobian (6, nv) in world axes; Pinocchio hands out (6,) where nv = 1."""
+    J: FloatArray = data.J
+    return J if J.ndim == 2 else J[:, None]
+
+
 def support(model: pin.Model, joint: int) -> FloatArray:
     """1.0 at the velocity components (nv,) that move ``joint``, else 0.0."""
     mask = np.zeros(model.nv)
@@ -112,7 +118,7 @@ class LoopKinematics:
         ``data`` must hold crba in the WORLD convention (placements, world Jacobian) and, for the
         bias, nonLinearEffects (velocities, bias accelerations) at the current state.
         """
-        J = data.J
+        J = world_jacobian(data)
         oMi, v, a = data.oMi, data.v, data.a_gf
         for loop in self._loops:
             ja, jb = loop.joint_a, loop.joint_b
@@ -142,6 +148,22 @@ class LoopKinematics:
                     self.G[k] = cross(m, n) @ XJ[3:]
                     if with_bias:
                         self.bias[k] = n @ (cross(B.angular, m) + cross(w, cross(w, m)))
+
+
+def closure_errors(
+    model: pin.Model, loops: Sequence[LoopClosure], q: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv)."""
+    rows = LoopKinematics(model, loops)
+    data = model.createData()
+    g = np.empty((len(q), len(rows.g)))
+    c = np.empty_like(g)
+    for i in range(len(q)):
+        pin.crba(model, data, q[i], pin.Convention.WORLD)
+        rows.update(data, with_bias=False)
+        g[i] = rows.g
+        c[i] = rows.G @ v[i]
+    return g, c
 
 
 def row_wrenches(loop: LoopClosure, model: pin.Model, data: pin.Data) -> FloatArray:

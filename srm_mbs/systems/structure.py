@@ -17,7 +17,7 @@ from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
-from srm_mbs.systems.units import Units, coordinate_units
+from srm_mbs.systems.units import Units, coordinate_units, row_units
 
 log = logging.getLogger(__name__)
 
@@ -86,33 +86,35 @@ class _Walker:
         self.data = self.model.createData()
         self.units = units
         self.rows = LoopKinematics(self.model, mechanism.loops)
+        self.row_unit = row_units(mechanism.loops, units.length)
         self.scale = np.ones(len(self.rows.g))
 
-    def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Scaled g (m,) and G (m, nv) at q, and M in ``data``."""
+    def evaluate(self, q: FloatArray) -> None:
+        """g and G of ``rows``, and M in ``data``, at q."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
         self.rows.update(self.data, with_bias=False)
-        return self.rows.g / self.scale, self.rows.G / self.scale[:, None]
 
     def white(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """W = L^-1 G^T (nv, m) and the Cholesky factor U (nv, nv) at q."""
-        _, G = self.closure(q)
+        """W = L^-1 G^T (nv, m) of the scaled rows, and the Cholesky factor U (nv, nv), at q."""
+        self.evaluate(q)
         U = cholesky(self.data.M)
-        return whiten(U, np.asfortranarray(G.T)), U
+        return whiten(U, np.asfortranarray((self.rows.G / self.scale[:, None]).T)), U
 
     def close(self, q: FloatArray, iterations: int = 30) -> tuple[FloatArray, float]:
-        """Gauss-Newton onto the closure manifold; q and the largest remaining scaled error."""
-        tolerance = 1e-14
+        """Gauss-Newton onto the closure manifold; q and the largest error left, in row units."""
+        unit = self.units.coordinate
         for _ in range(iterations):
-            g, G = self.closure(q)
-            if np.abs(g).max() < tolerance:
+            self.evaluate(q)
+            g = self.rows.g / self.row_unit
+            if np.abs(g).max() < 1e-14:
                 break
-            by_unit = G * self.units.coordinate
-            step = np.linalg.lstsq(by_unit, g, rcond=1e-9)[0] * self.units.coordinate
+            by_unit = self.rows.G / self.row_unit[:, None] * unit
+            step = np.linalg.lstsq(by_unit, g, rcond=1e-9)[0] * unit
             if not np.isfinite(step).all():
                 break
             q = pin.integrate(self.model, q, -step)
-        return q, float(np.abs(self.closure(q)[0]).max())
+        self.evaluate(q)
+        return q, float(np.abs(self.rows.g / self.row_unit).max())
 
     def set_scale(self, mechanism: Mechanism, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""
@@ -168,7 +170,7 @@ def _closed_samples(
         for k in range(WALK_STEPS):
             W, U = walker.white(q)
             left, singular, _ = np.linalg.svd(W, full_matrices=True)
-            rank = int(np.sum(singular > 1e-7 * max(singular[0], 1e-300)))
+            rank = int(np.sum(singular > 1e-7))
             null = left[:, rank:]
             if null.shape[1] == 0:
                 break

@@ -6,13 +6,15 @@ or on another time scale, takes the same steps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
-from srm_mbs.mechanism import Mechanism
+from srm_mbs.mechanism import LoopClosure, Mechanism
+from srm_mbs.systems.loops import world_jacobian
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,18 @@ class Units:
     rate: float
 
 
+def row_units(loops: Sequence[LoopClosure], length: float) -> FloatArray:
+    """Units of the closure rows (rows,): ``length`` (m) for position rows, 1 rad for the others.
+
+    Closure errors over these are pure numbers, whatever the unit of length.
+    """
+    units = [
+        np.repeat([length, 1.0], [len(loop.rows.directions), len(loop.rows.alignments)])
+        for loop in loops
+    ]
+    return np.concatenate(units) if units else np.zeros(0)
+
+
 def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
     """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
     model = mechanism.model
@@ -52,9 +66,8 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
     corners = np.array(points) if points else np.zeros((1, 3))
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     length = diagonal if diagonal > 0.0 else 1.0
-    angular = np.abs(data.J[3:]).max(axis=0) > 1e-9 if model.nv else np.zeros(0, dtype=bool)
+    angular = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
     coordinate = np.where(angular, 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
-    if model.nv:
-        rate = max(rate, float(np.max(np.abs(v) / coordinate)))
+    rate = max(rate, float(np.max(np.abs(v) / coordinate)))
     return Units(length, coordinate, rate if rate > 0.0 else 1.0)

@@ -1,0 +1,471 @@
+"""The command line ``srm-mbs``: thin, every command calls the package and prints.
+
+Everything slow is imported inside the commands, so that ``srm-mbs --help`` answers at once.
+Exit status: 0; 1 when a run did not reach its end; 2 for bad input.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import srm_mbs
+from srm_mbs.errors import InputError, SrmError, SrmWarning
+
+if TYPE_CHECKING:
+    from srm_mbs.mechanism import Anchor, Mechanism
+    from srm_mbs.solution import Solution
+
+RUN_FAILED, BAD_INPUT = 1, 2
+T_END, RTOL = 10.0, 1e-6
+"""End time (s) and tolerance where neither the command nor the description gives one."""
+
+app = typer.Typer(
+    name="srm-mbs",
+    help="Simulate closed-loop mechanisms without drift and through singular configurations.",
+    epilog="Exit status: 0; 1 if a run did not reach its end; 2 for bad input.",
+    no_args_is_help=True,
+    add_completion=False,
+    # Plain help and usage errors: rich would draw boxes into pipes, and eat "[simulation]".
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Model = Annotated[
+    str,
+    typer.Argument(
+        metavar="MODEL",
+        help="A bundled mechanism (see 'srm-mbs models'), a .toml description, or a .urdf "
+        "without loops.",
+    ),
+]
+Run = Annotated[
+    Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
+]
+
+
+# -- what is printed, and where ---------------------------------------------------------------
+
+
+def _say(kind: str, text: object) -> None:
+    """One unwrapped line on standard error."""
+    typer.echo(f"{kind}: {' '.join(str(text).split())}", err=True)
+
+
+class _Lines(logging.Handler):
+    """Log records as lines like those of errors and warnings."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        _say(record.levelname.lower(), record.getMessage())
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Warnings and expected errors of a command as single lines, the latter with status 2."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        _say("warning", message)
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", SrmWarning)
+            warnings.showwarning = show
+            yield
+    except BrokenPipeError:
+        raise  # the reader of a pipe has gone: typer ends quietly
+    except SrmError as error:
+        _say("error", error)
+        raise typer.Exit(BAD_INPUT) from error
+    except OSError as error:
+        _say("error", _os_problem(error))
+        raise typer.Exit(BAD_INPUT) from error
+
+
+def _os_problem(error: OSError) -> str:
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"
+
+
+def _table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
+    """Aligned columns on standard output; wrapped on a terminal, never in a pipe."""
+    from rich.console import Console
+    from rich.table import Table
+
+    names = tuple(header)
+    table = Table(*names, box=None, show_header=bool(names), pad_edge=False, padding=(0, 2, 0, 0))
+    for row in rows:
+        table.add_row(*row)
+    # No markup: "[0]" in a name is text.
+    width = None if sys.stdout.isatty() else 10_000
+    console = Console(width=width, markup=False, emoji=False, highlight=False)
+    with console.capture() as captured:
+        console.print(table)
+    # rich fills the last column with spaces
+    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+# -- output files -----------------------------------------------------------------------------
+
+
+def _check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
+    """Refuse, before a long run, a file that could not be written after it."""
+    problem = remedy = None
+    folder = path.parent
+    if path.suffix.lower() not in suffixes:
+        problem = f"the suffix {path.suffix!r} is not known here"
+        remedy = f"Use {' or '.join(suffixes)}"
+    elif not folder.is_dir():
+        problem, remedy = f"there is no folder {str(folder)!r}", "Make it first"
+    elif path.is_dir():
+        problem, remedy = "it is a folder", "Give a file name"
+    elif not os.access(path if path.exists() else folder, os.W_OK):
+        problem, remedy = "it cannot be written", "Check its permissions"
+    if problem:
+        raise InputError(problem, file=str(path), element=option, remedy=remedy)
+
+
+def _write(
+    files: Iterable[tuple[Path | None, Callable[[Path], object]]],
+) -> tuple[list[Path], bool]:
+    """Write each file that is asked for; one that fails does not keep the others from it."""
+    written, failed = [], False
+    for path, write in files:
+        if path is None:
+            continue
+        try:
+            write(path)
+        except (OSError, SrmError) as error:
+            text = _os_problem(error) if isinstance(error, OSError) else str(error)
+            _say("error", f"{path}: {text.removeprefix(f'{path}: ')}")
+            failed = True
+        else:
+            written.append(path)
+    return written, failed
+
+
+# -- commands ---------------------------------------------------------------------------------
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"srm-mbs {srm_mbs.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    context: typer.Context,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log what is done on standard error.")
+    ] = False,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    logger = logging.getLogger("srm_mbs")
+    level, handler = logger.level, _Lines()
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
+
+    def restore() -> None:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+    context.call_on_close(restore)
+
+
+@app.command()
+@_reported()
+def simulate(
+    model: Model,
+    t_end: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            help=f"End of the run (s). Default: the description's, else {T_END:g}.",
+        ),
+    ] = None,
+    method: Annotated[str, typer.Option(metavar="NAME", help="Integration method.")] = "psrm",
+    tableau: Annotated[
+        str, typer.Option(metavar="NAME", help="Runge-Kutta scheme of the method.")
+    ] = "dop853",
+    rtol: Annotated[
+        float | None,
+        typer.Option(
+            metavar="R",
+            help=f"Relative tolerance, at most 1e-4. Default: the description's, else {RTOL:g}.",
+        ),
+    ] = None,
+    atol: Annotated[
+        float | None,
+        typer.Option(
+            metavar="A",
+            help="Absolute tolerance of every coordinate. Default: the description's, else rtol "
+            "times the unit of each coordinate.",
+        ),
+    ] = None,
+    step: Annotated[
+        float | None,
+        typer.Option(metavar="H", help="Fixed step (s) instead of step-size control."),
+    ] = None,
+    backend: Annotated[
+        str,
+        typer.Option(metavar="auto|python|kernel", help="What computes the run."),
+    ] = "auto",
+    out: Annotated[
+        Path | None, typer.Option(metavar="RUN.npz", help="Save the run, for plot and play.")
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Plot the run; the suffix is .png, .pdf or .svg."),
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write the animation as one page."),
+    ] = None,
+    play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
+) -> None:
+    """Simulate a mechanism and print a summary of the run.
+
+    A run that fails, or is interrupted with Ctrl-C, keeps everything computed so far: the files
+    are written and the exit status is 1.
+    """
+    if out is not None:
+        _check_output(out, "--out", (".npz",))
+    if plot is not None:
+        from srm_mbs.plots import FORMATS
+
+        _check_output(plot, "--plot", FORMATS)
+    if html is not None:
+        _check_output(html, "--html", (".html", ".htm"))
+
+    mechanism = srm_mbs.load(model)
+    defaults = mechanism.defaults
+    solution = srm_mbs.simulate(
+        mechanism,
+        _first(t_end, defaults.t_end, T_END),
+        method=method,
+        tableau=tableau,
+        rtol=_first(rtol, defaults.rtol, RTOL),
+        atol=defaults.atol if atol is None else atol,
+        step=step,
+        progress=True,
+        backend=backend,
+    )
+    written, failed = _write(
+        [(out, solution.save), (plot, solution.plot), (html, solution.export_html)]
+    )
+    _print_summary(solution, written)
+    typer.echo(solution.message, err=not solution.success)
+    if play:
+        _play(solution)
+    if failed:
+        raise typer.Exit(BAD_INPUT)
+    if not solution.success:
+        raise typer.Exit(RUN_FAILED)
+
+
+def _first(*values: float | None) -> float:
+    """The first value that is given."""
+    return next(value for value in values if value is not None)
+
+
+def _print_summary(solution: Solution, written: list[Path]) -> None:
+    stats = solution.stats
+    energy = solution.energy - solution.energy[0]
+    rows = [
+        ("mechanism", solution.mechanism.name),
+        ("status", solution.status),
+        ("end time", f"{solution.t[-1]:.6g} s"),
+        ("steps", f"{stats.steps}"),
+        ("rejected steps", f"{stats.rejected}"),
+        ("evaluations", f"{stats.evaluations}"),
+    ]
+    if solution.mechanism.loops:
+        position, rate = solution.drift.max(axis=0)
+        rows += [
+            ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
+            ("zone steps", f"{stats.zone_steps}"),
+            ("singular passages", f"{len(solution.crossings)}"),
+            ("largest ||g||", f"{position:.2e} (m, rad)"),
+            ("largest ||G v||", f"{rate:.2e} (m/s, rad/s)"),
+        ]
+    rows += [
+        ("energy change", f"{energy[-1]:.2e} J at the end, at most {abs(energy).max():.2e} J"),
+        ("wall time", f"{stats.wall_time:.3g} s"),
+        *(("written", str(path)) for path in written),
+    ]
+    _table(rows)
+
+
+@app.command()
+@_reported()
+def info(model: Model) -> None:
+    """Print degrees of freedom, joints and loops of a mechanism.
+
+    With the rank of its closure rows, the rows that are redundant, and the start.
+    """
+    mechanism = srm_mbs.load(model)
+    structure = mechanism.structure
+    _table(
+        [
+            ("mechanism", mechanism.name),
+            ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
+            ("closure rows", f"{len(structure.row_names)}"),
+            ("rank", f"{structure.rank}"),
+            ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
+            ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
+        ]
+    )
+    typer.echo()
+    _table(_joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
+    if mechanism.loops:
+        typer.echo()
+        _table(_loop_rows(mechanism), ("loop", "type", "anchor a", "anchor b", "gap at the start"))
+    notes = (*mechanism.notes, *structure.notes)
+    if notes:
+        typer.echo()
+    for note in notes:
+        typer.echo(f"note: {note}")
+
+
+_JOINT_TYPES = {
+    **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
+    **{f"RUB{axis}": f"continuous about {axis.lower()}" for axis in "XYZ"},
+    **{f"P{axis}": f"prismatic along {axis.lower()}" for axis in "XYZ"},
+    "RevoluteUnaligned": "revolute",
+    "RevoluteUnboundedUnaligned": "continuous",
+    "PrismaticUnaligned": "prismatic",
+    "FreeFlyer": "floating",
+    "Planar": "planar",
+    "Spherical": "ball",
+}
+"""Pinocchio's joint types as URDF calls them."""
+
+
+def _joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    import numpy as np
+
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        short = joint.shortname().removeprefix("JointModel")
+        kind = _JOINT_TYPES.get(short, short)
+        q = mechanism.q0[joint.idx_q : joint.idx_q + joint.nq]
+        v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
+        if joint.nv > 1:
+            yield name, kind, _vector(q), _vector(v)
+            continue
+        unit = "m" if kind.startswith("prismatic") else "rad"
+        position = q[0] if joint.nq == 1 else np.arctan2(q[1], q[0])
+        yield name, kind, f"{position:.6g} {unit}", f"{v[0]:.6g} {unit}/s"
+
+
+def _loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
+    import numpy as np
+    import pinocchio as pin
+
+    from srm_mbs.systems.loops import LoopKinematics
+
+    rows = LoopKinematics(mechanism.model, mechanism.loops)
+    data = mechanism.model.createData()
+    pin.crba(mechanism.model, data, np.array(mechanism.q0), pin.Convention.WORLD)
+    rows.update(data, with_bias=False)
+    at = 0
+    for loop in mechanism.loops:
+        g = rows.g[at : at + loop.rows.count]
+        at += loop.rows.count
+        positions = len(loop.rows.directions)
+        gaps = [(g[:positions], "m"), (g[positions:], "rad")]
+        gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
+        yield loop.name, loop.type, _anchor(loop.a), _anchor(loop.b), gap
+
+
+def _anchor(anchor: Anchor) -> str:
+    text = anchor.where
+    if any(anchor.xyz):
+        text += f" xyz {_vector(anchor.xyz)} m"
+    if any(anchor.rpy):
+        text += f" rpy {_vector(anchor.rpy)} rad"
+    return text
+
+
+def _vector(values: Iterable[float]) -> str:
+    return f"[{', '.join(f'{value:.6g}' for value in values)}]"
+
+
+@app.command()
+@_reported()
+def models() -> None:
+    """List the mechanisms that come with the package."""
+    from srm_mbs.loading.bundled import models_folder
+
+    folder = models_folder()
+    _table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
+    typer.echo("n_four_bar_<N> is made for any N.")
+
+
+def _first_sentence(path: Path) -> str:
+    """The first sentence of the comment at the top of a description."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comment = takewhile(lambda line: line.startswith("#"), lines)
+    text = " ".join(line.removeprefix("#").strip() for line in comment)
+    # An initial ("C. B. Macdonald") ends no sentence.
+    return re.split(r"(?<!\b[A-Z])\.(?:\s|$)", text, maxsplit=1)[0]
+
+
+@app.command()
+@_reported()
+def play(run: Run) -> None:
+    """Play a saved run in the browser."""
+    _play(srm_mbs.load_solution(run))
+
+
+def _play(solution: Solution) -> None:
+    # Its messages are few, and one of them is the address of the page.
+    logging.getLogger("srm_mbs.playback").setLevel(logging.INFO)
+    typer.echo("Ctrl-C ends the playback.", err=True)
+    with suppress(KeyboardInterrupt):  # while the page is being made; later, play() takes it
+        solution.play()
+
+
+@app.command()
+@_reported()
+def plot(
+    run: Run,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Where to save it; the suffix is .png, .pdf or .svg. Default: RUN with .png.",
+        ),
+    ] = None,
+) -> None:
+    """Plot drift, energy, sigma and step sizes of a saved run."""
+    from srm_mbs.plots import FORMATS
+
+    path = run.with_suffix(".png") if out is None else out
+    _check_output(path, "--out", FORMATS)
+    srm_mbs.load_solution(run).plot(path)
+    typer.echo(f"written: {path}")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app(prog_name="srm-mbs")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""Mechanisms that only tests need."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+import srm_mbs as srm
+
+
+def rod(mass: float = 1.0, length: float = 1.0, thickness: float = 0.24) -> pin.Inertia:
+    """Uniform rod along x from the origin; ``thickness``: ratio of axial to transverse inertia."""
+    transverse = mass * length**2 / 12.0
+    inertia = np.diag([thickness * transverse, transverse, transverse])
+    return pin.Inertia(mass, np.array([length / 2.0, 0.0, 0.0]), inertia)
+
+
+def along_x(distance: float) -> pin.SE3:
+    return pin.SE3(np.eye(3), np.array([distance, 0.0, 0.0]))
+
+
+def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
+    """Four rods in a ring of ball joints, free in space without gravity: nq != nv throughout."""
+    rng = np.random.default_rng(seed)
+    model = pin.Model()
+    model.name = "floating_ring"
+    model.gravity.linear = np.zeros(3)
+    parent = 0
+    for i, name in enumerate("abcd"):
+        joint = pin.JointModelSpherical() if i else (root or pin.JointModelFreeFlyer())
+        parent = model.addJoint(parent, joint, along_x(1.0 if i else 0.0), name)
+        model.appendBodyToJoint(parent, rod(), pin.SE3.Identity())
+        model.addBodyFrame(name, parent, pin.SE3.Identity(), 0)
+    q = pin.neutral(model)
+    turn = np.array([0.1, 0.15, 1.0])
+    quaternion = pin.Quaternion(pin.exp3(1.4 * turn / np.linalg.norm(turn))).coeffs()
+    for name in "bcd":
+        start = model.joints[model.getJointId(name)].idx_q
+        q[start : start + 4] = quaternion
+    loop = srm.LoopClosure(
+        "point", srm.Anchor("d", xyz=(1.0, 0.0, 0.0)), srm.Anchor("a"), name="ring"
+    )
+    mechanism = srm.Mechanism(model, (loop,), q0=q)
+    state = srm.assemble(mechanism, v=1.5 * rng.standard_normal(model.nv))
+    return mechanism.with_state(state.q, state.v)
+
+
+def rescaled(
+    mechanism: srm.Mechanism, length: float = 1.0, mass: float = 1.0, time: float = 1.0
+) -> srm.Mechanism:
+    """The same mechanism in other units: lengths, masses and times multiplied."""
+    model = mechanism.model.copy()
+    for j in range(model.njoints):
+        placement, inertia = model.jointPlacements[j], model.inertias[j]
+        model.jointPlacements[j] = pin.SE3(placement.rotation, placement.translation * length)
+        model.inertias[j] = pin.Inertia(
+            inertia.mass * mass, inertia.lever * length, inertia.inertia * (mass * length**2)
+        )
+    for frame in model.frames:
+        frame.placement = pin.SE3(frame.placement.rotation, frame.placement.translation * length)
+    model.gravity.linear = model.gravity.linear * (length / time**2)
+
+    def moved(anchor: srm.Anchor) -> srm.Anchor:
+        x, y, z = anchor.xyz
+        return replace(anchor, xyz=(x * length, y * length, z * length))
+
+    loops = tuple(replace(loop, a=moved(loop.a), b=moved(loop.b)) for loop in mechanism.loops)
+    translation = mechanism.structure.units.coordinate != 1.0
+    unit = np.where(translation, length, 1.0)
+    return srm.Mechanism(
+        model, loops, q0=mechanism.q0 * unit, v0=mechanism.v0 * unit / time, name=mechanism.name
+    )
+
+
+def distance(mechanism: srm.Mechanism, a: srm.Solution, b: srm.Solution) -> float:
+    """Largest difference of the last states, in tangent coordinates."""
+    dq = pin.difference(mechanism.model, a.q[-1], b.q[-1])
+    return max(float(np.abs(dq).max()), float(np.abs(a.v[-1] - b.v[-1]).max()))

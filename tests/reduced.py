@@ -1,0 +1,100 @@
+"""References that share nothing with the package's stepping: reduced models, SciPy on index 1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import solve_ivp
+
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.loops import LoopKinematics
+
+G = 9.81
+Field = Callable[[float, Any], Any]
+
+
+def integrate(field: Field, start: list[float], t_end: float) -> np.ndarray:
+    """State at ``t_end`` by DOP853 at 1e-13."""
+    run = solve_ivp(field, (0.0, t_end), start, method="DOP853", rtol=1e-13, atol=1e-13)
+    assert run.success
+    return run.y[:, -1]
+
+
+def slider_crank(slider_mass: float = 0.0) -> Field:
+    """Equal bars of 2 m and 1 kg (thesis 1.4.1): (theta, omega) of the crank.
+
+    (4/3 + 4 (1 + 2 m_s) sin^2) theta'' = -4 (1 + 2 m_s) sin cos theta'^2 - g cos theta.
+    """
+    k = 4.0 * (1.0 + 2.0 * slider_mass)
+
+    def field(t: float, y: Any) -> list[float]:
+        s, c = np.sin(y[0]), np.cos(y[0])
+        return [y[1], (-k * s * c * y[1] ** 2 - G * c) / (4.0 / 3.0 + k * s * s)]
+
+    return field
+
+
+def regular_slider_crank() -> Field:
+    """Crank 1 m 1 kg, rod 3 m 3 kg, uniform, massless slider on the x axis: Lagrange by hand.
+
+    With the rod's angle beta, sin beta = -sin theta / 3, the kinetic energy is I(theta) w^2 / 2.
+    """
+
+    def inertia(theta: float) -> tuple[float, float]:
+        s, c = np.sin(theta), np.cos(theta)
+        cb = np.sqrt(1.0 - s * s / 9.0)
+        db = -c / (3.0 * cb)  # d beta / d theta
+        ddb = s / (3.0 * cb) - c * c * s / (27.0 * cb**3)
+        sb = -s / 3.0
+        # rod centre (cos theta + 1.5 cos beta, sin theta + 1.5 sin beta) and its derivatives
+        x1, z1 = -s - 1.5 * sb * db, c + 1.5 * cb * db
+        x2 = -c - 1.5 * (cb * db**2 + sb * ddb)
+        z2 = -s + 1.5 * (-sb * db**2 + cb * ddb)
+        rod = 3.0 * 9.0 / 12.0
+        value = 1.0 / 3.0 + 3.0 * (x1**2 + z1**2) + rod * db**2
+        slope = 6.0 * (x1 * x2 + z1 * z2) + 2.0 * rod * db * ddb
+        return value, slope
+
+    def field(t: float, y: Any) -> list[float]:
+        theta, w = y
+        value, slope = inertia(theta)
+        c = np.cos(theta)
+        # potential: crank centre sin/2, rod centre sin/2 (the slider stays at z = 0)
+        force = -G * (0.5 * c + 3.0 * 0.5 * c)
+        return [w, (force - 0.5 * slope * w * w) / value]
+
+    return field
+
+
+def n_four_bar(n: int) -> Field:
+    """Common crank angle of the IFToMM N-four-bar."""
+    inertia, weight = (n + 1) / 3.0 + n, (n + 1) / 2.0 + n
+    return lambda t, y: [y[1], -G * weight / inertia * np.cos(y[0])]
+
+
+def index_one(mechanism: Mechanism) -> Field:
+    """q' = v, M v' + G^T lam = f, G v' = -Gdot v: the unstabilised index-1 equations, flat q.
+
+    Pinocchio's terms, a dense KKT solve; redundant rows left out.  What a user would integrate
+    with SciPy.
+    """
+    model = mechanism.model
+    assert model.nq == model.nv
+    data = model.createData()
+    structure = mechanism.structure
+    rows = LoopKinematics(model, mechanism.loops, structure.row_scale, structure.kept)
+    nv, m = model.nv, len(rows.g)
+
+    def field(t: float, x: Any) -> np.ndarray:
+        q, v = x[:nv], x[nv:]
+        pin.crba(model, data, q, pin.Convention.WORLD)
+        pin.nonLinearEffects(model, data, q, v)
+        rows.update(data)
+        kkt = np.block([[data.M, rows.G.T], [rows.G, np.zeros((m, m))]])
+        right = np.concatenate([-data.nle - model.damping * v, -rows.bias])
+        return np.concatenate([v, np.linalg.solve(kkt, right)[:nv]])
+
+    return field

@@ -1,0 +1,535 @@
+"""Closure rows: g against placements, G and Gdot v against finite differences of g.
+
+The configurations are open (the loops do not close there), because a row and its derivatives must
+be right off the closure manifold too: stages and corrections live there.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.closures import CLOSURE_TYPES, perpendicular_basis
+from srm_mbs.mechanism import WORLD, Anchor, LoopClosure
+from srm_mbs.systems.loops import LoopKinematics, row_wrenches
+
+TYPES = tuple(CLOSURE_TYPES)
+GRAVITY = np.array([3.0, -5.0, -9.81])
+
+# Anchors of a closure: both branches of the tree, one branch and the ground, one chain.
+PLACES = {
+    "two branches": ("leg_3", "arm_3"),
+    "body and ground": ("arm_4", WORLD),
+    "ground and body": (WORLD, "leg_2"),
+    "descendant and ancestor": ("leg_4", "leg_1"),
+    "ancestor and descendant": ("arm_1", "arm_4"),
+}
+SEEDS = (0, 1, 2)
+
+
+def random_placement(rng: np.random.Generator) -> pin.SE3:
+    return pin.SE3(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
+
+
+@cache
+def tree(seed: int) -> pin.Model:
+    """Two branches of joints of every kind, in an order that depends on ``seed``."""
+    rng = np.random.default_rng(seed)
+    axis = rng.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    leg = [
+        pin.JointModelFreeFlyer(),
+        pin.JointModelRevoluteUnaligned(axis),
+        pin.JointModelSpherical(),
+        pin.JointModelPrismaticUnaligned(axis[::-1].copy()),
+    ]
+    arm = [
+        pin.JointModelPlanar(),
+        pin.JointModelRUBY(),
+        pin.JointModelRZ(),
+        pin.JointModelSphericalZYX(),
+    ]
+    rng.shuffle(leg)  # type: ignore[arg-type]
+    rng.shuffle(arm)  # type: ignore[arg-type]
+    model = pin.Model()
+    for branch, joints in (("leg", leg), ("arm", arm)):
+        parent = 0
+        for number, joint in enumerate(joints, 1):
+            name = f"{branch}_{number}"
+            parent = model.addJoint(parent, joint, random_placement(rng), f"{name}_joint")
+            model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Identity())
+            # The link's frame is not the joint's: anchors must be taken through it.
+            model.addBodyFrame(name, parent, random_placement(rng), 0)
+    # FK, Jacobians and biases only: the inertia does not matter here.
+    model.gravity.linear = GRAVITY
+    return model
+
+
+def random_state(model: pin.Model, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
+    return q, rng.uniform(-1.0, 1.0, model.nv)
+
+
+def random_anchor(link: str, rng: np.random.Generator) -> Anchor:
+    return Anchor(link, xyz=tuple(rng.uniform(-1, 1, 3)), rpy=tuple(rng.uniform(-1.5, 1.5, 3)))
+
+
+def random_loop(kind: str, place: str, rng: np.random.Generator) -> LoopClosure:
+    link_a, link_b = PLACES[place]
+    axis = tuple(rng.standard_normal(3)) if CLOSURE_TYPES[kind].needs_axis else None
+    return LoopClosure(
+        kind, random_anchor(link_a, rng), random_anchor(link_b, rng), axis, name=f"{kind} {place}"
+    )
+
+
+def evaluate(
+    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """g, G and Gdot v at (q, v)."""
+    data = model.createData()
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    pin.nonLinearEffects(model, data, q, v)
+    rows.update(data)
+    return rows.g.copy(), rows.G.copy(), rows.bias.copy()
+
+
+def anchor_placement(model: pin.Model, q: FloatArray, anchor: Anchor) -> tuple[FloatArray, ...]:
+    """Rotation and origin of an anchor in the world, from the URDF reading of xyz and rpy."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    name = anchor.link if anchor.link is not None else anchor.frame
+    rotation, origin = np.eye(3), np.zeros(3)
+    if name != WORLD:
+        frame = data.oMf[model.getFrameId(name)]
+        rotation, origin = frame.rotation, frame.translation
+    own = Rotation.from_euler("xyz", anchor.rpy).as_matrix()
+    return rotation @ own, origin + rotation @ np.array(anchor.xyz)
+
+
+def relative_placement(
+    model: pin.Model, q: FloatArray, loop: LoopClosure
+) -> tuple[FloatArray, FloatArray]:
+    """Rotation R and position p of anchor a in anchor b."""
+    Ra, pa = anchor_placement(model, q, loop.a)
+    Rb, pb = anchor_placement(model, q, loop.b)
+    return Rb.T @ Ra, Rb.T @ (pa - pb)
+
+
+def extrapolated(difference, step: float) -> FloatArray:
+    """Richardson extrapolation of a central difference, error O(step^6)."""
+    coarse, middle, fine = difference(step), difference(step / 2), difference(step / 4)
+    first, second = (4 * middle - coarse) / 3, (4 * fine - middle) / 3
+    return (16 * second - first) / 15
+
+
+every_row = pytest.mark.parametrize("kind", TYPES)
+every_place = pytest.mark.parametrize("place", tuple(PLACES))
+every_seed = pytest.mark.parametrize("seed", SEEDS)
+
+
+@every_row
+@every_place
+@every_seed
+def test_jacobian_is_the_derivative_of_the_rows(kind, place, seed):
+    rng = np.random.default_rng([seed, 1])
+    model = tree(seed)
+    loop = random_loop(kind, place, rng)
+    q, v = random_state(model, rng)
+    rows = LoopKinematics(model, (loop,))
+    _, G, _ = evaluate(model, rows, q, v)
+
+    def moved(delta: FloatArray) -> FloatArray:
+        return evaluate(model, rows, pin.integrate(model, q, delta), v)[0]
+
+    for column, e in enumerate(np.eye(model.nv)):
+        expected = extrapolated(lambda h, e=e: (moved(h * e) - moved(-h * e)) / (2 * h), 4e-3)
+        np.testing.assert_allclose(G[:, column], expected, atol=2e-11)
+    assert np.abs(G).max(axis=1).min() > 1e-2  # the test sees every row move
+
+
+@every_row
+@every_place
+@every_seed
+def test_bias_is_the_derivative_of_the_rates_at_constant_body_velocity(kind, place, seed):
+    rng = np.random.default_rng([seed, 2])
+    model = tree(seed)
+    loop = random_loop(kind, place, rng)
+    q, v = random_state(model, rng)
+    rows = LoopKinematics(model, (loop,))
+    _, _, bias = evaluate(model, rows, q, v)
+
+    def rate(tau: float) -> FloatArray:
+        return evaluate(model, rows, pin.integrate(model, q, tau * v), v)[1] @ v
+
+    expected = extrapolated(lambda h: (rate(h) - rate(-h)) / (2 * h), 4e-3)
+    np.testing.assert_allclose(bias, expected, atol=5e-11 * max(1.0, np.abs(expected).max()))
+    assert np.abs(bias).min() > 1e-3
+
+
+@every_row
+@every_seed
+def test_bias_is_the_second_derivative_of_the_gap_itself(kind, seed):
+    """Independent of G: second differences of rows computed from placements."""
+    rng = np.random.default_rng([seed, 3])
+    model = tree(seed)
+    loop = random_loop(kind, "two branches", rng)
+    q, v = random_state(model, rng)
+    bias = evaluate(model, LoopKinematics(model, (loop,)), q, v)[2]
+
+    def g(tau: float) -> FloatArray:
+        moved = pin.integrate(model, q, tau * v)
+        return rows_from_placements(loop, *relative_placement(model, moved, loop))
+
+    expected = extrapolated(lambda h: (g(h) - 2 * g(0.0) + g(-h)) / h**2, 4e-2)
+    np.testing.assert_allclose(bias, expected, atol=2e-8 * max(1.0, np.abs(expected).max()))
+
+
+def rows_from_placements(loop: LoopClosure, R: FloatArray, p: FloatArray) -> FloatArray:
+    """The rows of every type written out, for a's rotation R and position p in b."""
+    if loop.type == "point":
+        return p
+    if loop.type == "frame":
+        return np.array([*p, R[2, 1], R[0, 2], R[1, 0]])
+    axis = np.array(loop.axis)
+    n1, n2 = perpendicular_basis(axis)
+    if loop.type == "revolute":
+        return np.array([*p, n1 @ R @ axis, n2 @ R @ axis])
+    if loop.type == "point_on_line":
+        return np.array([n1 @ p, n2 @ p])
+    if loop.type == "point_on_plane":
+        return np.array([axis @ p])
+    raise AssertionError(f"this test does not know the rows of {loop.type!r}: write them down here")
+
+
+@every_row
+@every_place
+@every_seed
+def test_rows_are_the_gaps_between_the_placements_of_the_anchors(kind, place, seed):
+    rng = np.random.default_rng([seed, 4])
+    model = tree(seed)
+    loop = random_loop(kind, place, rng)
+    q, v = random_state(model, rng)
+    g = evaluate(model, LoopKinematics(model, (loop,)), q, v)[0]
+    expected = rows_from_placements(loop, *relative_placement(model, q, loop))
+    np.testing.assert_allclose(g, expected, atol=3e-15 * 10)
+    assert len(g) == loop.rows.count == len(loop.row_names) == len(set(loop.row_names))
+
+
+@every_row
+@every_seed
+def test_gravity_does_not_enter_the_bias(kind, seed):
+    rng = np.random.default_rng([seed, 5])
+    model = tree(seed).copy()
+    loops = tuple(random_loop(kind, place, rng) for place in PLACES)
+    q, v = random_state(model, rng)
+    rows = LoopKinematics(model, loops)
+    found = []
+    for gravity in (np.zeros(3), GRAVITY, -1e3 * GRAVITY):
+        model.gravity.linear = gravity
+        found.append(evaluate(model, rows, q, v))
+    for g, G, bias in found[1:]:
+        np.testing.assert_array_equal(g, found[0][0])
+        np.testing.assert_array_equal(G, found[0][1])
+        np.testing.assert_allclose(bias, found[0][2], atol=1e-10)  # 1e4 m/s^2 cancelled
+    np.testing.assert_allclose(found[1][2], found[0][2], atol=1e-13)
+
+
+@every_seed
+def test_bias_vanishes_at_rest_under_gravity(seed):
+    rng = np.random.default_rng([seed, 6])
+    model = tree(seed)
+    loops = tuple(random_loop(kind, place, rng) for kind in TYPES for place in PLACES)
+    q, v = random_state(model, rng)
+    rows = LoopKinematics(model, loops)
+    np.testing.assert_allclose(evaluate(model, rows, q, 0 * v)[2], 0.0, atol=1e-13)
+
+
+@every_seed
+def test_bias_is_quadratic_in_the_rates(seed):
+    rng = np.random.default_rng([seed, 7])
+    model = tree(seed)
+    loops = tuple(random_loop(kind, place, rng) for kind in TYPES for place in PLACES)
+    q, v = random_state(model, rng)
+    rows = LoopKinematics(model, loops)
+    once = evaluate(model, rows, q, v)[2]
+    np.testing.assert_allclose(evaluate(model, rows, q, -3 * v)[2], 9 * once, atol=1e-12)
+
+
+@every_row
+@every_seed
+def test_every_row_moves_only_the_joints_between_its_anchors(kind, seed):
+    rng = np.random.default_rng([seed, 8])
+    model = tree(seed)
+    q, v = random_state(model, rng)
+    between = {
+        "descendant and ancestor": ("leg_2", "leg_3", "leg_4"),
+        "ancestor and descendant": ("arm_2", "arm_3", "arm_4"),
+        "body and ground": ("arm_1", "arm_2", "arm_3", "arm_4"),
+    }
+    for place, links in between.items():
+        loop = random_loop(kind, place, rng)
+        _, G, _ = evaluate(model, LoopKinematics(model, (loop,)), q, v)
+        moving = np.zeros(model.nv, dtype=bool)
+        for link in links:
+            joint = model.joints[model.getJointId(f"{link}_joint")]
+            moving[joint.idx_v : joint.idx_v + joint.nv] = True
+        assert not G[:, ~moving].any(), place
+        assert G[:, moving].any(), place
+
+
+@every_seed
+def test_scales_divide_the_rows_and_only_kept_rows_are_evaluated(seed):
+    rng = np.random.default_rng([seed, 9])
+    model = tree(seed)
+    loops = tuple(
+        random_loop(kind, place, rng) for kind, place in zip(TYPES * 2, [*PLACES, *PLACES])
+    )
+    q, v = random_state(model, rng)
+    g, G, bias = evaluate(model, LoopKinematics(model, loops), q, v)
+    scale = rng.uniform(0.1, 10.0, len(g))
+    for trial in range(6):
+        keep = rng.random(len(g)) < (1.0, 0.5, 0.5, 0.5, 0.2, 0.0)[trial]
+        part = evaluate(model, LoopKinematics(model, loops, scale, keep), q, v)
+        for own, whole in zip(part, (g, G, bias)):
+            by = scale if whole.ndim == 1 else scale[:, None]
+            np.testing.assert_allclose(own, (whole / by)[keep], rtol=1e-13, atol=1e-14)
+
+
+def test_update_without_bias_leaves_the_rows_the_same():
+    rng = np.random.default_rng(10)
+    model = tree(0)
+    loops = tuple(random_loop(kind, place, rng) for kind in TYPES for place in PLACES)
+    q, v = random_state(model, rng)
+    g, G, _ = evaluate(model, LoopKinematics(model, loops), q, v)
+    rows = LoopKinematics(model, loops)
+    data = model.createData()
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    rows.update(data, with_bias=False)
+    np.testing.assert_array_equal(rows.g, g)
+    np.testing.assert_array_equal(rows.G, G)
+
+
+def free_motion(loop: LoopClosure, rng: np.random.Generator) -> pin.SE3:
+    """A relative placement of a in b that the closure allows."""
+    axis = np.zeros(3) if loop.axis is None else np.array(loop.axis)
+    any_rotation = Rotation.random(random_state=rng).as_matrix()
+    if loop.type == "point":
+        return pin.SE3(any_rotation, np.zeros(3))
+    if loop.type == "frame":
+        return pin.SE3.Identity()
+    if loop.type == "revolute":
+        return pin.SE3(Rotation.from_rotvec(rng.uniform(-3, 3) * axis).as_matrix(), np.zeros(3))
+    if loop.type == "point_on_line":
+        return pin.SE3(any_rotation, rng.uniform(-2, 2) * axis)
+    if loop.type == "point_on_plane":
+        offset = rng.uniform(-2, 2, 3)
+        return pin.SE3(any_rotation, offset - axis * (axis @ offset))
+    raise AssertionError(f"this test does not know the free motion of {loop.type!r}")
+
+
+def closed_by_anchor(
+    model: pin.Model, q: FloatArray, loop: LoopClosure, relative: pin.SE3
+) -> LoopClosure:
+    """``loop`` with anchor b moved so that a has the placement ``relative`` in b."""
+    Ra, pa = anchor_placement(model, q, loop.a)
+    wanted = pin.SE3(Ra, pa) * relative.inverse()
+    Rl, pl = anchor_placement(model, q, Anchor(loop.b.link))
+    inside = pin.SE3(Rl, pl).actInv(wanted)
+    anchor = Anchor(
+        loop.b.link,
+        xyz=tuple(inside.translation),
+        rpy=tuple(Rotation.from_matrix(inside.rotation).as_euler("xyz")),
+    )
+    return LoopClosure(loop.type, loop.a, anchor, loop.axis, loop.name)
+
+
+@every_row
+@every_place
+@every_seed
+def test_rows_vanish_wherever_the_closure_is_satisfied(kind, place, seed):
+    rng = np.random.default_rng([seed, 11])
+    model = tree(seed)
+    q, v = random_state(model, rng)
+    loop = random_loop(kind, place, rng)
+    closed = closed_by_anchor(model, q, loop, free_motion(loop, rng))
+    g = evaluate(model, LoopKinematics(model, (closed,)), q, v)[0]
+    np.testing.assert_allclose(g, 0.0, atol=1e-14 * 10)
+
+
+@every_row
+@every_seed
+def test_rows_are_nonzero_where_the_closure_is_violated(kind, seed):
+    """Each of the motions that a closure forbids shows in its rows, to first order."""
+    rng = np.random.default_rng([seed, 12])
+    model = tree(seed)
+    q, v = random_state(model, rng)
+    loop = random_loop(kind, "two branches", rng)
+    free = free_motion(loop, rng)
+    axis = np.zeros(3) if loop.axis is None else np.array(loop.axis)
+    n1, n2 = perpendicular_basis(axis) if axis.any() else (np.zeros(3), np.zeros(3))
+    eye = list(np.eye(3))
+    shifts, turns = {
+        "point": (eye, []),
+        "frame": (eye, eye),
+        "revolute": (eye, [n1, n2]),
+        "point_on_line": ([n1, n2], []),
+        "point_on_plane": ([axis], []),
+    }[kind]
+    size = 1e-4
+    found = []
+    for shift in shifts:
+        moved = pin.SE3(free.rotation, free.translation + size * shift)
+        closed = closed_by_anchor(model, q, loop, moved)
+        found.append(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0])
+    for turn in turns:
+        turned = Rotation.from_rotvec(size * turn).as_matrix() @ free.rotation
+        closed = closed_by_anchor(model, q, loop, pin.SE3(turned, free.translation))
+        found.append(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0])
+    # As many independent rows as forbidden motions, none of them weaker than the others.
+    singular = np.linalg.svd(np.array(found) / size, compute_uv=False)
+    np.testing.assert_allclose(singular, 1.0, atol=1e-3)
+    assert np.array(found).shape == (loop.rows.count, loop.rows.count)
+
+
+def test_rates_of_a_closed_frame_are_the_relative_velocity_in_its_axes():
+    rng = np.random.default_rng(13)
+    model = tree(1)
+    q, v = random_state(model, rng)
+    loop = random_loop("frame", "two branches", rng)
+    loop = closed_by_anchor(model, q, loop, pin.SE3.Identity())
+    G = evaluate(model, LoopKinematics(model, (loop,)), q, v)[1]
+    data = model.createData()
+    pin.computeJointJacobians(model, data, q)
+    pin.framesForwardKinematics(model, data, q)
+    twists = []
+    for anchor in (loop.a, loop.b):
+        joint, placement = anchor.resolve(model)
+        at = data.oMi[joint] * placement
+        twists.append(
+            at.toActionMatrixInverse()
+            @ pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD)
+            @ v
+        )
+    np.testing.assert_allclose(G @ v, twists[0] - twists[1], atol=1e-13)
+
+
+@every_row
+def test_an_anchor_on_a_frame_equals_the_same_anchor_on_its_link(kind):
+    rng = np.random.default_rng(14)
+    model = tree(2).copy()
+    inside = random_placement(rng)
+    link = model.frames[model.getFrameId("leg_3")]
+    model.addFrame(
+        pin.Frame("tip", link.parentJoint, link.placement * inside, pin.FrameType.OP_FRAME)
+    )
+    loop = random_loop(kind, "two branches", rng)
+    offset = anchor_offset(loop.a)
+    whole = inside * offset
+    on_link = LoopClosure(
+        kind,
+        Anchor(
+            "leg_3",
+            xyz=tuple(whole.translation),
+            rpy=tuple(Rotation.from_matrix(whole.rotation).as_euler("xyz")),
+        ),
+        loop.b,
+        loop.axis,
+    )
+    on_frame = LoopClosure(
+        kind, Anchor(frame="tip", xyz=loop.a.xyz, rpy=loop.a.rpy), loop.b, loop.axis
+    )
+    q, v = random_state(model, rng)
+    for x, y in zip(
+        evaluate(model, LoopKinematics(model, (on_link,)), q, v),
+        evaluate(model, LoopKinematics(model, (on_frame,)), q, v),
+    ):
+        np.testing.assert_allclose(x, y, atol=1e-13)
+
+
+def anchor_offset(anchor: Anchor) -> pin.SE3:
+    return pin.SE3(Rotation.from_euler("xyz", anchor.rpy).as_matrix(), np.array(anchor.xyz))
+
+
+@every_row
+@every_place
+def test_wrenches_of_the_rows_do_the_work_that_the_multipliers_do(kind, place):
+    """Power of the row wrenches on the anchors' bodies is -lam . (G v), also in open loops."""
+    rng = np.random.default_rng(15)
+    model = tree(0)
+    loop = random_loop(kind, place, rng)
+    q, v = random_state(model, rng)
+    G = evaluate(model, LoopKinematics(model, (loop,)), q, v)[1]
+    data = model.createData()
+    pin.forwardKinematics(model, data, q, v)
+    wrenches = row_wrenches(loop, model, data)
+    at_b = anchor_placement(model, q, loop.b)[1]
+    powers = []
+    for anchor in (loop.a, loop.b):
+        joint, _ = anchor.resolve(model)
+        twist = data.oMi[joint].act(data.v[joint])
+        velocity = twist.linear + np.cross(twist.angular, at_b)
+        powers.append(wrenches @ np.concatenate([velocity, twist.angular]))
+    # On b the wrench, on a its opposite at the same point: together -G^T lam.
+    np.testing.assert_allclose(powers[1] - powers[0], -(G @ v), atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "axis",
+    [*np.eye(3), *-np.eye(3), [1, 1, 1], [1, -1e-9, 0], [0, 1e-300, 1], [-0.3, 0.5, -0.8]],
+)
+def test_perpendicular_basis_completes_a_right_handed_frame(axis):
+    axis = np.array(axis, dtype=float)
+    axis /= np.linalg.norm(axis)
+    n1, n2 = perpendicular_basis(axis)
+    frame = np.array([axis, n1, n2])
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(frame) == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("k", range(3))
+def test_perpendicular_basis_of_a_coordinate_axis_is_the_other_coordinate_axes(k, sign):
+    for vector in perpendicular_basis(sign * np.eye(3)[k]):
+        assert sorted(np.abs(vector)) == [0.0, 0.0, 1.0]
+
+
+@every_row
+def test_rows_of_a_type_are_unit_and_alignments_perpendicular(kind):
+    rng = np.random.default_rng(16)
+    rows = random_loop(kind, "two branches", rng).rows
+    np.testing.assert_allclose(np.linalg.norm(rows.directions, axis=1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(rows.directions @ rows.directions.T, np.eye(len(rows.directions)), atol=1e-15)
+    for u, n in rows.alignments:
+        assert u @ n == pytest.approx(0.0, abs=1e-15)
+        assert np.linalg.norm(u) == pytest.approx(1.0)
+        assert np.linalg.norm(n) == pytest.approx(1.0)
+    np.testing.assert_allclose(np.linalg.norm(rows.matched, axis=1), 1.0, atol=1e-15)
+
+
+def test_a_reversed_hinge_satisfies_the_rows_but_not_the_matched_axis():
+    rng = np.random.default_rng(17)
+    model = tree(0)
+    q, v = random_state(model, rng)
+    loop = random_loop("revolute", "two branches", rng)
+    across = perpendicular_basis(np.array(loop.axis))[0]
+    reversed_ = pin.SE3(Rotation.from_rotvec(np.pi * across).as_matrix(), np.zeros(3))
+    closed = closed_by_anchor(model, q, loop, reversed_)
+    np.testing.assert_allclose(
+        evaluate(model, LoopKinematics(model, (closed,)), q, v)[0], 0.0, atol=1e-13
+    )
+    R, _ = relative_placement(model, q, closed)
+    assert np.abs(closed.rows.matched @ R.T - closed.rows.matched).max() > 0.5
+
+
+def test_every_type_says_whether_it_takes_an_axis():
+    assert {name: kind.needs_axis for name, kind in CLOSURE_TYPES.items()} == {
+        name: name in ("revolute", "point_on_line", "point_on_plane") for name in TYPES
+    }
+    for name, kind in CLOSURE_TYPES.items():
+        assert kind.name == name
+        assert kind.summary

@@ -1,0 +1,111 @@
+"""Saved runs load as they were."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from tests.mechanisms import floating_ring
+
+
+@pytest.mark.parametrize("name", ["slider_crank", "pendulum_chain", "n_four_bar_3"])
+def test_a_saved_run_interpolates_to_the_last_bit(name: str, tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load(name), 3.0, rtol=1e-10)
+    solution.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    t = np.linspace(0.0, 3.0, 301)
+    for a, b in zip(solution(t), loaded(t)):
+        assert np.array_equal(a, b)
+    assert np.array_equal(solution.q, loaded.q)
+    assert loaded.stats == solution.stats
+    assert loaded.settings == solution.settings
+    assert loaded.message == solution.message
+    assert np.array_equal(loaded.drift, solution.drift)
+    assert np.array_equal(loaded.energy, solution.energy)
+    assert loaded.crossings == solution.crossings
+    assert loaded.mechanism.source == solution.mechanism.source
+
+
+def test_a_run_through_the_zone_interpolates_to_the_last_bit(tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load("slider_crank"), 2.0, rtol=1e-12, atol=1e-12)
+    assert solution.stats.zone_steps > 0
+    solution.save(tmp_path / "run")
+    loaded = srm.load_solution(tmp_path / "run")
+    t = np.linspace(0.0, 2.0, 1001)
+    assert np.array_equal(solution(t)[0], loaded(t)[0])
+
+
+def test_a_mechanism_built_in_python_is_saved_with_its_model(tmp_path: Path) -> None:
+    ring = floating_ring()
+    solution = srm.simulate(ring, 1.0, t_eval=[0.0, 0.5, 1.0])
+    solution.save(tmp_path / "ring.npz")
+    loaded = srm.load_solution(tmp_path / "ring.npz")
+    assert loaded.mechanism.model == ring.model
+    assert loaded.mechanism.loops == ring.loops
+    assert np.array_equal(loaded.t, [0.0, 0.5, 1.0])
+    assert np.array_equal(loaded.q, solution.q)
+    assert np.array_equal(loaded(0.3)[0], solution(0.3)[0])
+
+
+def test_overridden_gravity_and_base_are_saved(tmp_path: Path) -> None:
+    mechanism = srm.load("pendulum_chain", gravity=(0.0, 0.0, -1.62))
+    solution = srm.simulate(mechanism, 1.0)
+    solution.save(tmp_path / "moon.npz")
+    loaded = srm.load_solution(tmp_path / "moon.npz")
+    assert np.array_equal(loaded.mechanism.model.gravity.linear, [0.0, 0.0, -1.62])
+    assert np.array_equal(loaded.energy, solution.energy)
+
+
+def test_a_failed_run_can_be_saved(tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load("four_bar"), 1.0, controller=lambda t, q, v: [np.nan])
+    assert not solution.success
+    solution.save(tmp_path / "failed.npz")
+    loaded = srm.load_solution(tmp_path / "failed.npz")
+    assert loaded.status == "failed"
+    assert len(loaded.t) == 1
+    assert np.array_equal(loaded(0.0)[0], solution.q[0])
+
+
+def test_reactions_of_a_controlled_run_are_refused_after_loading(tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load("four_bar"), 0.1, controller=lambda t, q, v: np.ones(3))
+    assert solution.reactions["pin"].shape == (len(solution.t), 6)
+    solution.save(tmp_path / "run.npz")
+    with pytest.raises(srm.InputError, match="controllers are not saved"):
+        _ = srm.load_solution(tmp_path / "run.npz").reactions
+
+
+def test_the_file_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = srm.load("four_bar").source
+    assert source is not None
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "bar.urdf").write_text(source.urdf)
+    (folder / "bar.toml").write_text(
+        source.description.replace("../urdf/four_bar.urdf", "bar.urdf")
+    )
+    solution = srm.simulate(srm.load(folder / "bar.toml"), 0.5)
+    solution.save(tmp_path / "run.npz")
+    for file in folder.iterdir():
+        file.unlink()
+    assert np.array_equal(srm.load_solution(tmp_path / "run.npz")(0.2)[0], solution(0.2)[0])
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"text", b"PK\x03\x04 broken"], ids=["empty", "text", "broken zip"]
+)
+def test_a_file_that_is_no_run_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "strange.npz"
+    path.write_bytes(content)
+    with pytest.raises(srm.InputError, match="strange.npz: it is no saved run"):
+        srm.load_solution(path)
+
+
+def test_another_npz_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(srm.InputError, match="other.npz: it is no saved run"):
+        srm.load_solution(tmp_path / "other.npz")
+    with pytest.raises(srm.InputError, match="no such file"):
+        srm.load_solution(tmp_path / "missing.npz")

@@ -456,9 +456,10 @@ def plot(
     """Plot drift, energy, sigma and step sizes of a saved run."""
     from srm_mbs.plots import FORMATS
 
+    solution = srm_mbs.load_solution(run)
     path = run.with_suffix(".png") if out is None else out
     _check_output(path, "--out", FORMATS)
-    srm_mbs.load_solution(run).plot(path)
+    solution.plot(path)
     typer.echo(f"written: {path}")
 
 

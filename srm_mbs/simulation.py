@@ -42,7 +42,7 @@ from srm_mbs.systems.units import row_units
 log = logging.getLogger(__name__)
 
 LOOSEST_RTOL = 1e-4
-"""Looser tolerances let a step jump to another branch at a change point (METHODS section 4)."""
+"""Looser tolerances let a step jump to another branch at a change point."""
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""

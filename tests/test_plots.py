@@ -7,48 +7,55 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 import srm_mbs as srm
 from srm_mbs import plots
+from srm_mbs.solution import Solution
 
 
 @pytest.fixture(scope="module")
-def slider_crank() -> srm.Solution:
+def slider_crank() -> Solution:
     return srm.simulate(srm.load("slider_crank"), 5.0, rtol=1e-8)
 
 
 @pytest.fixture(scope="module")
-def four_bar() -> srm.Solution:
+def four_bar() -> Solution:
     return srm.simulate(srm.load("four_bar"), 2.0)
 
 
 @pytest.fixture(scope="module")
-def pendulum_chain() -> srm.Solution:
+def pendulum_chain() -> Solution:
     return srm.simulate(srm.load("pendulum_chain"), 1.0)
 
 
-def line(axes, label):
+def line(axes: Axes, label: str) -> Line2D:
     """The line of ``axes`` whose label starts with ``label``."""
     return next(line for line in axes.lines if str(line.get_label()).startswith(label))
 
 
-def legend(axes):
+def legend(axes: Axes) -> list[str]:
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
-def titles(figure):
+def titles(figure: Figure) -> list[str]:
     return [axes.get_title(loc="left") for axes in figure.axes]
 
 
-def marked_times(axes):
+def marked_times(axes: Axes) -> list[float]:
     """Where the vertical lines of ``axes`` stand."""
     return [segment[0, 0] for lines in axes.collections for segment in lines.get_segments()]
 
 
-def test_drift_energy_sigma_and_steps_share_one_time_axis_with_units(slider_crank):
+def test_drift_energy_sigma_and_steps_share_one_time_axis_with_units(
+    slider_crank: Solution,
+) -> None:
     figure = slider_crank.plot()
     assert len(figure.axes) == 4
     for axes in figure.axes:
@@ -63,16 +70,18 @@ def test_drift_energy_sigma_and_steps_share_one_time_axis_with_units(slider_cran
     assert legend(figure.axes[0]) == [r"$\Vert G\,v\Vert$ (m/s)", r"$\Vert g\Vert$ (m)"]
 
 
-def test_title_names_mechanism_method_tableau_and_tolerance(slider_crank):
+def test_title_names_mechanism_method_tableau_and_tolerance(slider_crank: Solution) -> None:
     assert slider_crank.plot().get_suptitle() == "slider_crank, PSRM, dop853, rtol = 1e-08"
 
 
-def test_title_of_a_run_with_fixed_steps_gives_the_step():
+def test_title_of_a_run_with_fixed_steps_gives_the_step() -> None:
     solution = srm.simulate(srm.load("four_bar"), 0.1, step=0.01)
     assert "fixed step 0.01 s" in solution.plot().get_suptitle()
 
 
-def test_drift_that_is_zero_is_drawn_at_the_floor_of_the_logarithmic_axis(slider_crank):
+def test_drift_that_is_zero_is_drawn_at_the_floor_of_the_logarithmic_axis(
+    slider_crank: Solution,
+) -> None:
     assert (slider_crank.drift[:, 0] == 0.0).any()
     axes = slider_crank.plot().axes[0]
     assert axes.get_yscale() == "log"
@@ -82,7 +91,7 @@ def test_drift_that_is_zero_is_drawn_at_the_floor_of_the_logarithmic_axis(slider
     assert "zeros drawn at 1e-17" in axes.get_title(loc="left")
 
 
-def test_closures_with_alignment_rows_have_drift_in_radians_too():
+def test_closures_with_alignment_rows_have_drift_in_radians_too() -> None:
     base = srm.load("four_bar")
     pin = base.loops[0]
     hinge = srm.LoopClosure("revolute", pin.a, pin.b, (0.0, 1.0, 0.0))
@@ -93,7 +102,7 @@ def test_closures_with_alignment_rows_have_drift_in_radians_too():
     assert "(m, rad)" in labels[1]
 
 
-def test_energy_panel_shows_the_change_in_the_power_of_ten_of_its_label(four_bar):
+def test_energy_panel_shows_the_change_in_the_power_of_ten_of_its_label(four_bar: Solution) -> None:
     axes = four_bar.plot().axes[1]
     change = four_bar.energy - four_bar.energy[0]
     power = int(np.floor(np.log10(np.abs(change).max())))
@@ -101,12 +110,14 @@ def test_energy_panel_shows_the_change_in_the_power_of_ten_of_its_label(four_bar
     np.testing.assert_allclose(axes.lines[0].get_ydata(), change / 10.0**power)
 
 
-def test_energy_panel_says_since_when_if_the_first_time_is_not_the_start():
+def test_energy_panel_says_since_when_if_the_first_time_is_not_the_start() -> None:
     solution = srm.simulate(srm.load("four_bar"), 0.5, t_eval=[0.25, 0.5])
     assert titles(solution.plot())[1] == "(b) total energy relative to t = 0.25 s"
 
 
-def test_singular_passages_are_marked_in_the_panels_of_sigma_and_steps(slider_crank):
+def test_singular_passages_are_marked_in_the_panels_of_sigma_and_steps(
+    slider_crank: Solution,
+) -> None:
     figure = slider_crank.plot()
     passages = [crossing.time for crossing in slider_crank.crossings]
     assert len(passages) == 2
@@ -116,7 +127,9 @@ def test_singular_passages_are_marked_in_the_panels_of_sigma_and_steps(slider_cr
     assert not marked_times(figure.axes[0])
 
 
-def test_many_singular_passages_are_ticks_instead_of_full_lines(slider_crank, monkeypatch):
+def test_many_singular_passages_are_ticks_instead_of_full_lines(
+    slider_crank: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (lines,) = slider_crank.plot().axes[3].collections
     assert lines.get_segments()[0][1, 1] == 1.0
     monkeypatch.setattr(plots, "FULL_LINES", 1)
@@ -124,7 +137,7 @@ def test_many_singular_passages_are_ticks_instead_of_full_lines(slider_crank, mo
     assert ticks.get_segments()[0][1, 1] < 0.1
 
 
-def test_sigma_is_drawn_at_step_ends_and_through_the_stages(slider_crank):
+def test_sigma_is_drawn_at_step_ends_and_through_the_stages(slider_crank: Solution) -> None:
     axes = slider_crank.plot().axes[2]
     ends = line(axes, "step ends")
     np.testing.assert_array_equal(ends.get_xdata(), slider_crank.steps.times[1:])
@@ -134,7 +147,9 @@ def test_sigma_is_drawn_at_step_ends_and_through_the_stages(slider_crank):
     assert stages.get_ydata().min() == slider_crank.steps.sigmas.min()
 
 
-def test_accepted_steps_are_dots_and_those_that_did_not_stand_are_crosses(four_bar):
+def test_accepted_steps_are_dots_and_those_that_did_not_stand_are_crosses(
+    four_bar: Solution,
+) -> None:
     axes = four_bar.plot().axes[3]
     accepted, rejected = line(axes, "accepted"), line(axes, "rejected")
     np.testing.assert_array_equal(accepted.get_ydata(), np.diff(four_bar.steps.times))
@@ -145,7 +160,7 @@ def test_accepted_steps_are_dots_and_those_that_did_not_stand_are_crosses(four_b
 
 
 @pytest.mark.parametrize("step", [None, 0.01])
-def test_step_sizes_have_labelled_ticks_also_within_one_decade(step):
+def test_step_sizes_have_labelled_ticks_also_within_one_decade(step: float | None) -> None:
     solution = srm.simulate(srm.load("pendulum_chain"), 1.0, step=step)
     axes = solution.plot().axes[-1]
     axes.figure.draw_without_rendering()
@@ -154,7 +169,7 @@ def test_step_sizes_have_labelled_ticks_also_within_one_decade(step):
     assert len(labels) >= 2
 
 
-def test_legends_lie_above_their_panels(four_bar):
+def test_legends_lie_above_their_panels(four_bar: Solution) -> None:
     figure = four_bar.plot()
     figure.draw_without_rendering()
     for axes in figure.axes:
@@ -162,7 +177,7 @@ def test_legends_lie_above_their_panels(four_bar):
             assert axes.get_legend().get_window_extent().y0 >= axes.bbox.y1
 
 
-def test_open_chain_has_no_panels_for_drift_and_sigma(pendulum_chain):
+def test_open_chain_has_no_panels_for_drift_and_sigma(pendulum_chain: Solution) -> None:
     figure = pendulum_chain.plot()
     assert titles(figure) == ["(a) total energy relative to the start", "(b) steps"]
 
@@ -171,7 +186,9 @@ def test_open_chain_has_no_panels_for_drift_and_sigma(pendulum_chain):
     ("name", "signature"),
     [("run.png", b"\x89PNG"), ("run.PDF", b"%PDF"), ("run.svg", b"<?xml")],
 )
-def test_suffix_decides_the_format_of_the_file(pendulum_chain, tmp_path, name, signature):
+def test_suffix_decides_the_format_of_the_file(
+    pendulum_chain: Solution, tmp_path: Path, name: str, signature: bytes
+) -> None:
     path = tmp_path / name
     pendulum_chain.plot(path)
     assert path.read_bytes().startswith(signature)
@@ -179,7 +196,9 @@ def test_suffix_decides_the_format_of_the_file(pendulum_chain, tmp_path, name, s
 
 
 @pytest.mark.parametrize("name", ["run.xyz", "run"])
-def test_unknown_suffix_is_refused_with_the_known_ones(pendulum_chain, tmp_path, name):
+def test_unknown_suffix_is_refused_with_the_known_ones(
+    pendulum_chain: Solution, tmp_path: Path, name: str
+) -> None:
     path = tmp_path / name
     with pytest.raises(srm.InputError, match=r"\.png, \.pdf, \.svg") as caught:
         pendulum_chain.plot(path)
@@ -187,10 +206,10 @@ def test_unknown_suffix_is_refused_with_the_known_ones(pendulum_chain, tmp_path,
     assert not path.exists()
 
 
-def fails_at(time):
+def fails_at(time: float) -> Any:
     """A controller that gives up at ``time`` (s)."""
 
-    def controller(t, q, v):
+    def controller(t: float, q: Any, v: Any) -> Any:
         if t >= time:
             raise ValueError("no power")
         return np.zeros(len(v))
@@ -200,7 +219,9 @@ def fails_at(time):
 
 @pytest.mark.parametrize("name", ["slider_crank", "pendulum_chain"])
 @pytest.mark.parametrize(("time", "some_steps"), [(0.0, False), (0.5, True)])
-def test_unfinished_runs_are_drawn_as_far_as_they_went(tmp_path, name, time, some_steps):
+def test_unfinished_runs_are_drawn_as_far_as_they_went(
+    tmp_path: Path, name: str, time: float, some_steps: bool
+) -> None:
     solution = srm.simulate(srm.load(name), 2.0, controller=fails_at(time))
     assert (solution.status, solution.stats.steps > 0) == ("failed", some_steps)
     path = tmp_path / "run.png"
@@ -209,7 +230,7 @@ def test_unfinished_runs_are_drawn_as_far_as_they_went(tmp_path, name, time, som
     assert path.stat().st_size > 5000
 
 
-def test_runaway_states_are_drawn_without_warnings(tmp_path):
+def test_runaway_states_are_drawn_without_warnings(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run's own, of overflow
         solution = srm.simulate(srm.load("four_bar"), 100.0, step=0.3)
@@ -217,13 +238,13 @@ def test_runaway_states_are_drawn_without_warnings(tmp_path):
     solution.plot(tmp_path / "run.png")
 
 
-def test_names_with_dollars_and_braces_are_no_formulas(four_bar, tmp_path):
+def test_names_with_dollars_and_braces_are_no_formulas(four_bar: Solution, tmp_path: Path) -> None:
     mechanism = replace(four_bar.mechanism, name="a$b_{c")
     figure = srm.simulate(mechanism, 0.1).plot(tmp_path / "run.png")
     assert figure.get_suptitle().startswith("a$b_{c, PSRM")
 
 
-def test_plots_need_neither_pyplot_nor_a_display(tmp_path):
+def test_plots_need_neither_pyplot_nor_a_display(tmp_path: Path) -> None:
     code = (
         "import sys, srm_mbs as srm\n"
         "solution = srm.simulate(srm.load('pendulum_chain'), 0.1)\n"

@@ -1,6 +1,6 @@
 r"""The Predicted Sequential Regularization Method in its split form.
 
-Exact prediction, and the corrector as a splitting at the step end (METHODS section 4): the
+Exact prediction, and the corrector as a splitting at the step end (docs/notation.md): the
 stages integrate
 
     q' = v,   v' = M^{-1} f - E gamma,

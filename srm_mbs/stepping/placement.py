@@ -1,6 +1,6 @@
 r"""Steps placed so that no stage lands on a singular configuration.
 
-A wrapper of step-size control (METHODS sections 4 and 4b):
+A wrapper of step-size control (docs/notation.md, "Singular configurations"):
 
 * a priori, when sigma falls, the predicted zero is put at the centre of the widest gap between
   the abscissae of the tableau;

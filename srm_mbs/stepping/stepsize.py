@@ -19,7 +19,7 @@ from srm_mbs.systems.base import System
 SAFETY = 0.9
 MIN_FACTOR, MAX_FACTOR = 0.2, 5.0
 PROPORTIONAL, INTEGRAL = 0.4, 0.7
-"""h_new = h 0.9 xi^(-0.7/k) xi_old^(0.4/k): the PI control of Gustafsson as in METHODS 4."""
+"""h_new = h 0.9 xi^(-0.7/k) xi_old^(0.4/k): PI control after Gustafsson."""
 XI_OLD_FLOOR = 1e-4
 XI_FLOOR = 1e-10
 FAILED_EVALUATION = 1e6

@@ -1,0 +1,193 @@
+"""The table in the README: error, work, drift and energy on the bundled mechanisms.
+
+    python -m benchmarks.headline [--repeats 5] [--json FILE]
+
+Run from a checkout with one BLAS thread (set before NumPy loads, below).  Errors are against
+reduced models integrated by SciPy at 1e-13, or the exact solutions in tests/data; times are the
+median over the repeats of one process, so that ratios between rows can be compared.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+import argparse
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+import srm_mbs as srm
+from srm_mbs.systems.multibody import make_system
+from tests import reduced
+
+EXACT = json.loads((Path(__file__).parent.parent / "tests/data/exact_solutions.json").read_text())
+
+
+def _exact(*path: str) -> tuple[float, float]:
+    values = EXACT
+    for key in path:
+        values = values[key]
+    return float(values[0]), float(values[1])
+
+
+def _four_bar() -> tuple[float, float]:
+    state = EXACT["fourbar"]["state p(9),v(9)"]["10"]
+    return float(state[2]), float(state[11])
+
+
+def _reduced(field: reduced.Field, start: list[float], t: float) -> tuple[float, float]:
+    theta, omega = reduced.integrate(field, start, t)
+    return float(theta), float(omega)
+
+
+Reference = Callable[[], tuple[float, float]]
+CASES: tuple[tuple[str, float, str, Reference], ...] = (
+    ("slider_crank", 100.0, "crank", lambda: _exact("slidercrank", "theta1,omega1", "100")),
+    (
+        "slider_crank_slider",
+        100.0,
+        "crank",
+        lambda: _reduced(reduced.slider_crank(0.5), [7 * np.pi / 4, 0.0], 100.0),
+    ),
+    ("slider_crank_whirl", 10.0, "crank", lambda: (25.8858770871720776, 2.07434062447342553)),
+    ("parallelogram", 10.0, "crank", lambda: _exact("parallelogram", "theta,omega", "10")),
+    (
+        "n_four_bar_2",
+        10.0,
+        "crank_0",
+        lambda: _reduced(reduced.n_four_bar(2), [np.pi / 2, -1.0], 10.0),
+    ),
+    (
+        "slider_crank_regular",
+        10.0,
+        "crank",
+        lambda: _reduced(reduced.regular_slider_crank(), [np.pi / 4, 4.0], 10.0),
+    ),
+    ("four_bar", 10.0, "crank", _four_bar),
+)
+RUNS = (("dop853", 1e-6), ("dop853", 1e-8), ("dopr54", 1e-8))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run: what it cost and how good it is."""
+
+    mechanism: str
+    t_end: float
+    tableau: str
+    tolerance: float
+    passages: int
+    error: float
+    evaluations: int
+    drift: float
+    energy_error: float
+    median_seconds: float
+
+
+def measure(
+    name: str, t_end: float, joint: str, reference: tuple[float, float], repeats: int
+) -> list[Row]:
+    mechanism = srm.load(name)
+    rows = []
+    for tableau, tol in RUNS:
+        times = []
+        for _ in range(repeats):
+            start = time.perf_counter()
+            solution = srm.simulate(mechanism, t_end, tableau=tableau, rtol=tol, atol=tol)
+            times.append(time.perf_counter() - start)
+        position, rate = solution.joint(joint)
+        error = max(abs(position[-1] - reference[0]), abs(rate[-1] - reference[1]))
+        energy = solution.energy
+        rows.append(
+            Row(
+                name,
+                t_end,
+                tableau,
+                tol,
+                len(solution.crossings),
+                error,
+                solution.stats.evaluations,
+                float(solution.drift[:, 0].max()),
+                float(np.abs(energy / energy[0] - 1.0).max()),
+                statistics.median(times),
+            )
+        )
+    return rows
+
+
+def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float]:
+    """Median microseconds of one evaluation with its rate, and of the Pinocchio calls in it."""
+    mechanism = srm.load(name)
+    system = make_system(mechanism)
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    model, data = mechanism.model, mechanism.model.createData()
+
+    def whole() -> None:
+        system.evaluate(0.0, state).rate()
+
+    def pinocchio_only() -> None:
+        pin.crba(model, data, mechanism.q0, pin.Convention.WORLD)
+        pin.nonLinearEffects(model, data, mechanism.q0, mechanism.v0)
+
+    def per_call(function: Callable[[], None], calls: int = 2000) -> float:
+        samples = []
+        for _ in range(repeats):
+            start = time.perf_counter()
+            for _ in range(calls):
+                function()
+            samples.append((time.perf_counter() - start) / calls)
+        return 1e6 * statistics.median(samples)
+
+    return per_call(whole), per_call(pinocchio_only)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rows = [
+        row
+        for name, t_end, joint, reference in CASES
+        for row in measure(name, t_end, joint, reference(), arguments.repeats)
+    ]
+    print("| mechanism | t_end | tableau, rtol | passages | error | evaluations | drift | energy |")
+    print("|---|---|---|---|---|---|---|---|")
+    for row in rows:
+        print(
+            f"| {row.mechanism} | {row.t_end:g} s | {row.tableau}, {row.tolerance:.0e} "
+            f"| {row.passages} | {row.error:.1e} | {row.evaluations} | {row.drift:.0e} m "
+            f"| {row.energy_error:.0e} |"
+        )
+    costs = {}
+    print("\n| mechanism | microseconds per evaluation | of which Pinocchio |")
+    print("|---|---|---|")
+    for name in ("slider_crank", "four_bar", "n_four_bar_2", "spatial_four_bar", "pendulum_chain"):
+        costs[name] = cost_per_evaluation(name, arguments.repeats)
+        print(f"| {name} | {costs[name][0]:.0f} | {costs[name][1]:.1f} |")
+    if arguments.json:
+        record = {
+            "machine": platform.machine(),
+            "processor_count": os.cpu_count(),
+            "python": platform.python_version(),
+            "pin": pin.__version__,
+            "numpy": np.__version__,
+            "srm_mbs": srm.__version__,
+            "rows": [asdict(row) for row in rows],
+            "microseconds_per_evaluation": costs,
+        }
+        arguments.json.write_text(json.dumps(record, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -18,6 +18,7 @@ import logging
 import math
 import sys
 import time
+import warnings
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_BODY_FRAMES = 30_000
-"""Key frames of all bodies together; in a page one costs 80 bytes, so 2.4 MB at most."""
+"""Key frames of all bodies together; in a page one costs up to 90 bytes, so 2.7 MB at most."""
 MIN_FPS = 10.0
 """Key frames per second below which the limit above is not kept: motion would look wrong."""
 
@@ -96,10 +97,10 @@ def sample_motion(solution: Solution, joints: tuple[int, ...], fps: float) -> Mo
     """
     start, end = (float(t) for t in solution.steps.times[[0, -1]])
     duration = end - start
-    wanted = math.ceil(duration * fps * (1.0 - 1e-12))
+    wanted = duration * fps * (1.0 - 1e-12)  # rounding must not add one to a whole number
     allowed = max(MAX_BODY_FRAMES // max(1, len(joints)), math.ceil(MIN_FPS * duration))
-    intervals = min(wanted, allowed)
-    if intervals < wanted:
+    intervals = math.ceil(min(wanted, allowed))
+    if wanted > allowed:
         log.info(
             "%d bodies over %g s: %.3g key frames per second instead of %g",
             len(joints),
@@ -182,10 +183,14 @@ def _view_direction(mechanism: Mechanism) -> FloatArray:
 
 def _import_meshcat() -> Any:
     try:
-        import meshcat
-        import meshcat.animation
-        import meshcat.geometry
-        import meshcat.servers.zmqserver
+        with warnings.catch_warnings():
+            # Its imports are not the reader's to mend: it takes a deprecated module of pyzmq.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            import meshcat
+            import meshcat.animation
+            import meshcat.geometry
+            import meshcat.path
+            import meshcat.servers.zmqserver
     except ImportError as error:
         raise InputError(
             f"playback needs meshcat, which cannot be imported: {error}",
@@ -261,16 +266,16 @@ def _draw(meshcat: Any, scene: Any, solution: Solution, fps: float) -> None:
 def _seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
     """Corners (n, 3) m of all shapes at sampled times."""
     chosen = np.unique(np.linspace(0, len(motion.times) - 1, SAMPLES).astype(int))
-    points = []
+    corners: dict[int, list[FloatArray]] = {0: [np.empty((0, 3))]}
     for visual in visuals:
-        corners = visual.corners()
-        if visual.joint == 0:
-            points.append(corners)
-            continue
-        k = motion.joints.index(visual.joint)
+        corners.setdefault(visual.joint, []).append(visual.corners())
+    points = [np.concatenate(corners.pop(0))]
+    for joint, own in corners.items():
+        k = motion.joints.index(joint)
+        together = np.concatenate(own)
         for i in chosen:
             rotation = pin.Quaternion(motion.quaternions[i, k]).matrix()
-            points.append(corners @ rotation.T + motion.positions[i, k])
+            points.append(together @ rotation.T + motion.positions[i, k])
     return np.concatenate(points)
 
 
@@ -509,8 +514,9 @@ _PAGE = """<!DOCTYPE html>
 <style>
 body { margin: 0; background: #eef0f2; font: 15px system-ui, sans-serif; color: #333; }
 #meshcat-pane { width: 100vw; height: 100vh; overflow: hidden; }
-#bar { position: fixed; left: 0; right: 0; bottom: 0; padding: 10px 18px 12px; display: flex;
-  gap: 14px; align-items: center; background: rgba(255, 255, 255, 0.75); }
+#bar { position: fixed; left: 0; right: 0; bottom: 0; padding: 10px 18px 12px; gap: 14px;
+  align-items: center; background: rgba(255, 255, 255, 0.75); }
+#bar:not([hidden]) { display: flex; }
 #bar button { font: inherit; width: 5em; padding: 4px 0; cursor: pointer; }
 #bar input { flex: 1; min-width: 0; accent-color: #0072b2; }
 #bar output { min-width: 9em; text-align: right; font-variant-numeric: tabular-nums; }

@@ -20,7 +20,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.loading import rebuild
 from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism, SimulationDefaults, Source
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.tableaus import get_tableau
+from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.solution import Settings, Solution, Statistics
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.multibody import make_system
@@ -44,11 +44,19 @@ def save_solution(solution: Solution, path: Path) -> None:
 
     Raises
     ------
+    InputError
+        If the run used a tableau that is not in TABLEAUS.
     OSError
         If the file cannot be written.
     """
     mechanism = solution.mechanism
     structure = mechanism.structure
+    if TABLEAUS.get(solution.scheme.name) is not solution.scheme:
+        raise InputError(
+            f"the tableau {solution.scheme.name!r} is not one of the package's and is not saved",
+            file=str(path),
+            remedy="Save the arrays t, q and v instead",
+        )
     zones = solution.steps.zones
     meta = {
         "format": FORMAT,

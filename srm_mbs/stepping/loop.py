@@ -109,7 +109,7 @@ def integrate(
             proposal = control.propose(t, limit, memory)
             h = proposal.h
             if not h > max(smallest, 4.0 * np.spacing(abs(t))):
-                _fail(record, t, h, memory, trouble)
+                _fail(record, t, h, memory, trouble, control.adaptive)
                 break
             result: StepResult | None
             try:
@@ -122,7 +122,7 @@ def integrate(
                 ratio = np.inf if result is None else result.error_ratio
                 record.attempts.append(Attempt(t, h, ratio, verdict))
                 if not control.adaptive and verdict is Verdict.REJECTED:
-                    _fail(record, t, h, memory, trouble or "the state is no longer finite")
+                    _fail(record, t, h, memory, trouble or "the state is no longer finite", False)
                     break
                 continue
             trouble = ""
@@ -149,7 +149,9 @@ def integrate(
     return record
 
 
-def _fail(record: RunRecord, t: float, h: float, memory: Memory, trouble: str) -> None:
+def _fail(
+    record: RunRecord, t: float, h: float, memory: Memory, trouble: str, adaptive: bool
+) -> None:
     record.status = "failed"
     reason = trouble or "the error estimate stays above the tolerance however small the step"
     near = (
@@ -159,6 +161,6 @@ def _fail(record: RunRecord, t: float, h: float, memory: Memory, trouble: str) -
     )
     record.message = (
         f"Stopped at t = {t:.6g} s with step {h:.1e} s: {reason}.{near} "
-        "Everything up to there is kept. Try a smaller rtol, another tableau, or check that the "
-        "mechanism can move on from there (solution.q[-1])."
+        f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
+        "tableau, or check that the mechanism can move on from there (solution.q[-1])."
     )

@@ -23,7 +23,6 @@ import srm_mbs
 from srm_mbs.errors import InputError, SrmError, SrmWarning
 
 if TYPE_CHECKING:
-    from srm_mbs.mechanism import Anchor, Mechanism
     from srm_mbs.solution import Solution
 
 RUN_FAILED, BAD_INPUT = 1, 2
@@ -243,6 +242,8 @@ def simulate(
     A run that fails, or is interrupted with Ctrl-C, keeps everything computed so far: the files
     are written and the exit status is 1.
     """
+    from srm_mbs.summary import run_rows
+
     if out is not None:
         _check_output(out, "--out", (".npz",))
     if plot is not None:
@@ -268,7 +269,7 @@ def simulate(
     written, failed = _write(
         [(out, solution.save), (plot, solution.plot), (html, solution.export_html)]
     )
-    _print_summary(solution, written)
+    _table([*run_rows(solution), *(("written", str(path)) for path in written)])
     typer.echo(solution.message, err=not solution.success)
     if play:
         _play(solution)
@@ -283,34 +284,6 @@ def _first(*values: float | None) -> float:
     return next(value for value in values if value is not None)
 
 
-def _print_summary(solution: Solution, written: list[Path]) -> None:
-    stats = solution.stats
-    energy = solution.energy - solution.energy[0]
-    rows = [
-        ("mechanism", solution.mechanism.name),
-        ("status", solution.status),
-        ("end time", f"{solution.t[-1]:.6g} s"),
-        ("steps", f"{stats.steps}"),
-        ("rejected steps", f"{stats.rejected}"),
-        ("evaluations", f"{stats.evaluations}"),
-    ]
-    if solution.mechanism.loops:
-        position, rate = solution.drift.max(axis=0)
-        rows += [
-            ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
-            ("zone steps", f"{stats.zone_steps}"),
-            ("singular passages", f"{len(solution.crossings)}"),
-            ("largest ||g||", f"{position:.2e} (m, rad)"),
-            ("largest ||G v||", f"{rate:.2e} (m/s, rad/s)"),
-        ]
-    rows += [
-        ("energy change", f"{energy[-1]:.2e} J at the end, at most {abs(energy).max():.2e} J"),
-        ("wall time", f"{stats.wall_time:.3g} s"),
-        *(("written", str(path)) for path in written),
-    ]
-    _table(rows)
-
-
 @app.command()
 @_reported()
 def info(model: Model) -> None:
@@ -318,92 +291,20 @@ def info(model: Model) -> None:
 
     With the rank of its closure rows, the rows that are redundant, and the start.
     """
+    from srm_mbs.summary import joint_rows, loop_rows, mechanism_rows
+
     mechanism = srm_mbs.load(model)
-    structure = mechanism.structure
-    _table(
-        [
-            ("mechanism", mechanism.name),
-            ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
-            ("closure rows", f"{len(structure.row_names)}"),
-            ("rank", f"{structure.rank}"),
-            ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
-            ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
-        ]
-    )
+    _table(mechanism_rows(mechanism))
     typer.echo()
-    _table(_joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
+    _table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
     if mechanism.loops:
         typer.echo()
-        _table(_loop_rows(mechanism), ("loop", "type", "anchor a", "anchor b", "gap at the start"))
-    notes = (*mechanism.notes, *structure.notes)
+        _table(loop_rows(mechanism), ("loop", "type", "anchor a", "anchor b", "gap at the start"))
+    notes = (*mechanism.notes, *mechanism.structure.notes)
     if notes:
         typer.echo()
     for note in notes:
         typer.echo(f"note: {note}")
-
-
-_JOINT_TYPES = {
-    **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
-    **{f"RUB{axis}": f"continuous about {axis.lower()}" for axis in "XYZ"},
-    **{f"P{axis}": f"prismatic along {axis.lower()}" for axis in "XYZ"},
-    "RevoluteUnaligned": "revolute",
-    "RevoluteUnboundedUnaligned": "continuous",
-    "PrismaticUnaligned": "prismatic",
-    "FreeFlyer": "floating",
-    "Planar": "planar",
-    "Spherical": "ball",
-}
-"""Pinocchio's joint types as URDF calls them."""
-
-
-def _joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
-    import numpy as np
-
-    for name in mechanism.joint_names:
-        joint = mechanism.joint(name)
-        short = joint.shortname().removeprefix("JointModel")
-        kind = _JOINT_TYPES.get(short, short)
-        q = mechanism.q0[joint.idx_q : joint.idx_q + joint.nq]
-        v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
-        if joint.nv > 1:
-            yield name, kind, _vector(q), _vector(v)
-            continue
-        unit = "m" if kind.startswith("prismatic") else "rad"
-        position = q[0] if joint.nq == 1 else np.arctan2(q[1], q[0])
-        yield name, kind, f"{position:.6g} {unit}", f"{v[0]:.6g} {unit}/s"
-
-
-def _loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
-    import numpy as np
-    import pinocchio as pin
-
-    from srm_mbs.systems.loops import LoopKinematics
-
-    rows = LoopKinematics(mechanism.model, mechanism.loops)
-    data = mechanism.model.createData()
-    pin.crba(mechanism.model, data, np.array(mechanism.q0), pin.Convention.WORLD)
-    rows.update(data, with_bias=False)
-    at = 0
-    for loop in mechanism.loops:
-        g = rows.g[at : at + loop.rows.count]
-        at += loop.rows.count
-        positions = len(loop.rows.directions)
-        gaps = [(g[:positions], "m"), (g[positions:], "rad")]
-        gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
-        yield loop.name, loop.type, _anchor(loop.a), _anchor(loop.b), gap
-
-
-def _anchor(anchor: Anchor) -> str:
-    text = anchor.where
-    if any(anchor.xyz):
-        text += f" xyz {_vector(anchor.xyz)} m"
-    if any(anchor.rpy):
-        text += f" rpy {_vector(anchor.rpy)} rad"
-    return text
-
-
-def _vector(values: Iterable[float]) -> str:
-    return f"[{', '.join(f'{value:.6g}' for value in values)}]"
 
 
 @app.command()

@@ -25,7 +25,7 @@ LAYERS = (
     ("loading",),
     ("storage",),
     ("progress", "simulation"),
-    ("plots", "visuals", "playback"),
+    ("plots", "visuals", "scene", "playback", "summary"),
     ("cli",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -16,8 +16,9 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs import playback
-from srm_mbs.playback import choose_view, close, export_html, play, sample_motion
+from srm_mbs import playback, scene
+from srm_mbs.playback import close, export_html, play
+from srm_mbs.scene import choose_view, sample_motion
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, visuals_of
 
 MEGABYTE = 1e6
@@ -182,10 +183,10 @@ def test_quaternions_turn_the_short_way_between_key_frames(slider_crank: srm.Sol
 def test_key_frames_are_thinned_where_bodies_or_seconds_are_many(
     slider_crank: srm.Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(playback, "MAX_BODY_FRAMES", 5000)
+    monkeypatch.setattr(scene, "MAX_BODY_FRAMES", 5000)
     assert len(sample_motion(slider_crank, (1, 2), 60.0).times) == 2501
-    monkeypatch.setattr(playback, "MAX_BODY_FRAMES", 100)
-    at_least = 1 + round(playback.MIN_FPS * 100.0)
+    monkeypatch.setattr(scene, "MAX_BODY_FRAMES", 100)
+    at_least = 1 + round(scene.MIN_FPS * 100.0)
     assert len(sample_motion(slider_crank, (1, 2), 60.0).times) == at_least
     assert len(sample_motion(slider_crank, (1, 2), 2.0).times) == 201
 
@@ -302,11 +303,11 @@ def test_without_visuals_every_part_of_the_tree_is_drawn(name: str) -> None:
 # Camera
 
 
-def screen(view: playback.View, points: Any) -> Any:
+def screen(view: scene.View, points: Any) -> Any:
     """Positions in the window, 1 at its edges."""
     x, y, z = view.axes @ (np.asarray(points) - view.target).T
-    slope = np.tan(np.radians(playback.FIELD_OF_VIEW / 2.0))
-    return np.array([x / playback.ASPECT, y]) / (slope * (z + view.distance))
+    slope = np.tan(np.radians(scene.FIELD_OF_VIEW / 2.0))
+    return np.array([x / scene.ASPECT, y]) / (slope * (z + view.distance))
 
 
 def test_planar_mechanisms_are_seen_from_minus_y_with_z_up() -> None:

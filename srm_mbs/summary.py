@@ -1,0 +1,105 @@
+"""A mechanism and a run as rows of text, for the command line and for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from srm_mbs.mechanism import Anchor, Mechanism
+from srm_mbs.solution import Solution
+from srm_mbs.systems.loops import closure_errors
+
+JOINT_TYPES = {
+    **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
+    **{f"RUB{axis}": f"continuous about {axis.lower()}" for axis in "XYZ"},
+    **{f"P{axis}": f"prismatic along {axis.lower()}" for axis in "XYZ"},
+    "RevoluteUnaligned": "revolute",
+    "RevoluteUnboundedUnaligned": "continuous",
+    "PrismaticUnaligned": "prismatic",
+    "FreeFlyer": "floating",
+    "Planar": "planar",
+    "Spherical": "ball",
+}
+"""Pinocchio's joint types as URDF calls them."""
+
+
+def run_rows(solution: Solution) -> list[tuple[str, str]]:
+    """What a run did: (quantity, value with unit)."""
+    stats = solution.stats
+    energy = solution.energy - solution.energy[0]
+    rows = [
+        ("mechanism", solution.mechanism.name),
+        ("status", solution.status),
+        ("end time", f"{solution.t[-1]:.6g} s"),
+        ("steps", f"{stats.steps}"),
+        ("rejected steps", f"{stats.rejected}"),
+        ("evaluations", f"{stats.evaluations}"),
+    ]
+    if solution.mechanism.loops:
+        position, rate = solution.drift.max(axis=0)
+        rows += [
+            ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
+            ("zone steps", f"{stats.zone_steps}"),
+            ("singular passages", f"{len(solution.crossings)}"),
+            ("largest ||g||", f"{position:.2e} (m, rad)"),
+            ("largest ||G v||", f"{rate:.2e} (m/s, rad/s)"),
+        ]
+    rows += [
+        ("energy change", f"{energy[-1]:.2e} J at the end, at most {abs(energy).max():.2e} J"),
+        ("wall time", f"{stats.wall_time:.3g} s"),
+    ]
+    return rows
+
+
+def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
+    """Degrees of freedom, rank and redundancy: (quantity, value)."""
+    structure = mechanism.structure
+    return [
+        ("mechanism", mechanism.name),
+        ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
+        ("closure rows", f"{len(structure.row_names)}"),
+        ("rank", f"{structure.rank}"),
+        ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
+        ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
+    ]
+
+
+def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, type, initial position, initial rate) of each moving joint."""
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        short = joint.shortname().removeprefix("JointModel")
+        kind = JOINT_TYPES.get(short, short)
+        q = mechanism.q0[joint.idx_q : joint.idx_q + joint.nq]
+        v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
+        if joint.nv > 1:
+            yield name, kind, _vector(q), _vector(v)
+            continue
+        unit = "m" if kind.startswith("prismatic") else "rad"
+        position = q[0] if joint.nq == 1 else np.arctan2(q[1], q[0])
+        yield name, kind, f"{position:.6g} {unit}", f"{v[0]:.6g} {unit}/s"
+
+
+def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
+    """(name, type, anchor a, anchor b, gap at the start) of each loop."""
+    model, loops = mechanism.model, mechanism.loops
+    g = closure_errors(model, loops, mechanism.q0[None], mechanism.v0[None])[0][0]
+    for loop, own in zip(loops, np.split(g, np.cumsum([loop.rows.count for loop in loops])[:-1])):
+        positions = len(loop.rows.directions)
+        gaps = [(own[:positions], "m"), (own[positions:], "rad")]
+        gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
+        yield loop.name, loop.type, _anchor(loop.a), _anchor(loop.b), gap
+
+
+def _anchor(anchor: Anchor) -> str:
+    text = anchor.where
+    if any(anchor.xyz):
+        text += f" xyz {_vector(anchor.xyz)} m"
+    if any(anchor.rpy):
+        text += f" rpy {_vector(anchor.rpy)} rad"
+    return text
+
+
+def _vector(values: Iterable[float]) -> str:
+    return f"[{', '.join(f'{value:.6g}' for value in values)}]"

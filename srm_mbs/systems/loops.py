@@ -126,28 +126,32 @@ class LoopKinematics:
             Tb = oMi[jb] * loop.in_b if jb else loop.in_b
             H = pin.SE3(Tb.rotation, Ta.translation)
             X = H.toActionMatrixInverse()
-            XJ = (X @ J) * loop.support
             rows = loop.position_slice
             if with_bias:
-                Vb = oMi[jb].act(v[jb])
-                Va = oMi[ja].act(v[ja])
-                W = H.actInv(Va - Vb)
                 # a_gf carries -gravity on every body and on the ground: it cancels here.
-                B = H.actInv(oMi[ja].act(a[ja]) - oMi[jb].act(a[jb]) - Vb.cross(Va))
-                w = W.angular
+                if jb == 0:
+                    W = H.actInv(oMi[ja].act(v[ja]))
+                    B = H.actInv(oMi[ja].act(a[ja]) - a[0])
+                else:
+                    Va, Vb = oMi[ja].act(v[ja]), oMi[jb].act(v[jb])
+                    W = H.actInv(Va - Vb)
+                    B = H.actInv(oMi[ja].act(a[ja]) - oMi[jb].act(a[jb]) - Vb.cross(Va))
             if len(loop.directions):
                 self.g[rows] = loop.directions @ Tb.actInv(Ta.translation)
-                self.G[rows] = loop.directions @ XJ[:3]
-                if with_bias:
-                    self.bias[rows] = loop.directions @ (B.linear + cross(w, W.linear))
+                self.G[rows] = ((loop.directions @ X[:3]) @ J) * loop.support
+                if with_bias:  # classicAcceleration: B_lin + w x r
+                    self.bias[rows] = loop.directions @ pin.classicAcceleration(W, B)
             if loop.alignments:
                 R = Tb.rotation.T @ Ta.rotation
+                XJ = (X[3:] @ J) * loop.support
+                if with_bias:
+                    w, angular = W.angular.tolist(), B.angular.tolist()
                 for k, (u, n) in enumerate(loop.alignments, loop.alignment_start):
                     m = R @ u
                     self.g[k] = n @ m
-                    self.G[k] = cross(m, n) @ XJ[3:]
+                    self.G[k] = cross(m, n) @ XJ
                     if with_bias:
-                        self.bias[k] = n @ (cross(B.angular, m) + cross(w, cross(w, m)))
+                        self.bias[k] = n @ (cross(angular, m) + cross(w, cross(w, m)))
 
 
 def closure_errors(

@@ -2,20 +2,16 @@
 
     python -m benchmarks.headline [--repeats 5] [--json FILE]
 
-Run from a checkout with one BLAS thread (set before NumPy loads, below).  Errors are against
+Run from a checkout; BLAS runs on one thread.  Errors are against
 reduced models integrated by SciPy at 1e-13, or the exact solutions in tests/data; times are the
 median over the repeats of one process, so that ratios between rows can be compared.
 """
 
 from __future__ import annotations
 
-import os
-
-for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")
-
 import argparse
 import json
+import os
 import platform
 import statistics
 import time

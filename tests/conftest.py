@@ -1,11 +1,6 @@
-"""Shared fixtures: reference data, and one thread for BLAS."""
+"""Shared fixtures: reference data."""
 
 from __future__ import annotations
-
-import os
-
-for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")
 
 import json
 from pathlib import Path

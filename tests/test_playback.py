@@ -16,7 +16,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs import playback, scene
+from srm_mbs import scene
 from srm_mbs.playback import close, export_html, play
 from srm_mbs.scene import choose_view, sample_motion
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, visuals_of

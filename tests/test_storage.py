@@ -99,13 +99,13 @@ def test_the_file_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_file_that_is_no_run_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "strange.npz"
     path.write_bytes(content)
-    with pytest.raises(srm.InputError, match="strange.npz: it is no saved run"):
+    with pytest.raises(srm.InputError, match=r"strange\.npz: it is no saved run"):
         srm.load_solution(path)
 
 
 def test_another_npz_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
-    with pytest.raises(srm.InputError, match="other.npz: it is no saved run"):
+    with pytest.raises(srm.InputError, match=r"other\.npz: it is no saved run"):
         srm.load_solution(tmp_path / "other.npz")
     with pytest.raises(srm.InputError, match="no such file"):
         srm.load_solution(tmp_path / "missing.npz")

@@ -307,7 +307,7 @@ class Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
         changed = replace(self, q0=q0, v0=v0)
         if "structure" in self.__dict__:
-            changed.__dict__["structure"] = self.structure
+            changed.__dict__["structure"] = self.structure.at(changed)
         return changed
 
     @cached_property

@@ -247,6 +247,30 @@ def test_rotations_per_step_stay_inside_the_chart() -> None:
     assert turned.max() <= 1.5 * (1 + 1e-9)
 
 
+def test_a_step_that_turns_a_ball_joint_too_far_is_refused_not_integrated_wrongly() -> None:
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "ball")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    mechanism = srm.Mechanism(model)
+
+    def kick(t: float, q: Any, v: Any) -> np.ndarray:
+        return np.array([0.0, 50.0, 0.0])
+
+    fixed = srm.simulate(mechanism, 2.0, controller=kick, tableau="erk4", step=0.5)
+    assert fixed.status == "failed"
+    assert "turns too far within one step" in fixed.message
+    adaptive = srm.simulate(mechanism, 2.0, controller=kick)
+    assert adaptive.success
+
+
+def test_a_new_start_renews_the_units_of_the_rates() -> None:
+    mechanism = srm.load("four_bar")
+    fast = mechanism.with_state(mechanism.q0, 100.0 * mechanism.v0)
+    units = fast.structure.units
+    assert units.rate == pytest.approx(100.0 * np.abs(mechanism.v0).max())
+    assert fast.structure.sigma_ref == mechanism.structure.sigma_ref
+
+
 def test_leaving_joint_limits_is_said() -> None:
     model = pin.Model()
     joint = model.addJoint(

@@ -7,9 +7,9 @@ q_n \oplus h sum a_ij v_j is of order 2 (H. Munthe-Kaas, Appl. Numer. Math. 29 (
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
-from math import comb, factorial
 
 import numpy as np
 import pinocchio as pin
@@ -18,15 +18,17 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 
 ROTATION_PER_STEP = 1.5
-"""Rotation in one step (rad) that the charts allow; dexp^-1 is singular at 2 pi."""
+"""Rotation in one step (rad) that step-size control aims at; dexp^-1 is exact to round-off."""
+LARGEST_ROTATION = 2.5
+"""Rotation (rad) of a stage that the charts accept: the series errs by 2e-11 there."""
 
 
 def _bernoulli_terms(count: int) -> tuple[float, ...]:
     """B_{2n} / (2n)! for n = 1 .. count, exact before rounding."""
     numbers = [Fraction(1)]
     for m in range(1, 2 * count + 1):
-        numbers.append(-sum(comb(m + 1, k) * numbers[k] for k in range(m)) / Fraction(m + 1))
-    return tuple(float(numbers[2 * n] / factorial(2 * n)) for n in range(1, count + 1))
+        numbers.append(-sum(math.comb(m + 1, k) * numbers[k] for k in range(m)) / Fraction(m + 1))
+    return tuple(float(numbers[2 * n] / math.factorial(2 * n)) for n in range(1, count + 1))
 
 
 # 14 terms reach round-off for 1.5 rad (each gains (angle / 2 pi)^2) with room to spare for the
@@ -43,6 +45,8 @@ class GroupJoint:
     start: int
     """First velocity index."""
     size: int
+    position: int
+    """First configuration index."""
 
     def ad(self, u: FloatArray) -> FloatArray:
         """Matrix of w -> [u, w] in Pinocchio's order (linear, angular)."""
@@ -56,8 +60,8 @@ class GroupJoint:
         out[:3, 3:] = _skew(u[:3])
         return out
 
-    def rotation_speed(self, v: FloatArray) -> float:
-        """Angular speed (rad/s) of the joint for the whole velocity vector v (nv,)."""
+    def rotation(self, v: FloatArray) -> float:
+        """Size of the joint's angular part of a whole tangent vector v (nv,): rad or rad/s."""
         angular = {"so3": 0, "se3": 3, "se2": 2}[self.group]
         return float(np.linalg.norm(v[self.start + angular : self.start + self.size]))
 
@@ -99,8 +103,23 @@ def group_joints(model: pin.Model) -> tuple[GroupJoint, ...]:
                 "which is not supported",
                 remedy="Split it into spherical, planar, free-flyer and one-degree joints",
             )
-        found.append(GroupJoint(group, joint.idx_v, joint.nv))
+        found.append(GroupJoint(group, joint.idx_v, joint.nv, joint.idx_q))
     return tuple(found)
+
+
+def planar_translation(q: FloatArray, u: FloatArray) -> tuple[float, float]:
+    """Translation of the planar joint coordinates q (4,) (+) u (3,).
+
+    Pinocchio's own loses eps / angle of the displacement, 1e-8 of it at 1e-8 rad, because it
+    forms 1 - cos; here the displacement is turned by half the angle.
+    """
+    x, y, c, s = q.tolist()
+    dx, dy, turn = u.tolist()
+    half = 0.5 * turn
+    chord = math.sin(half) / half if half else 1.0
+    along, across = chord * math.cos(half), chord * math.sin(half)
+    a, b = along * dx - across * dy, across * dx + along * dy
+    return x + c * a - s * b, y + s * a + c * b
 
 
 def dexp_inverse(joint: GroupJoint, u: FloatArray, v: FloatArray) -> FloatArray:

@@ -12,12 +12,19 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import blas
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.base import Terms, Zone
-from srm_mbs.systems.charts import ROTATION_PER_STEP, dexp_inverse, group_joints
+from srm_mbs.systems.charts import (
+    LARGEST_ROTATION,
+    ROTATION_PER_STEP,
+    dexp_inverse,
+    group_joints,
+    planar_translation,
+)
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import Projection
 
@@ -25,6 +32,8 @@ Controller = Callable[[float, FloatArray, FloatArray], Any]
 """(t, q, v) -> generalised forces tau (nv,), N and N m."""
 
 _WORLD = pin.Convention.WORLD
+_OVERFLOW = 1e100
+"""Size of a state from which products of its rates may overflow."""
 
 
 class _Mechanics:
@@ -40,6 +49,7 @@ class _Mechanics:
         self._controller = controller
         self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
         self._groups = group_joints(self.model)
+        self._planar = tuple(joint for joint in self._groups if joint.group == "se2")
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
         self._position_of = self._vector_coordinates()
@@ -85,6 +95,9 @@ class _Mechanics:
             return state + delta
         out = np.empty_like(state)
         out[: self.nq] = pin.integrate(self.model, state[: self.nq], delta[: self.nv])
+        for joint in self._planar:
+            k, i = joint.position, joint.start
+            out[k : k + 2] = planar_translation(state[k : k + 4], delta[i : i + 3])
         out[self.nq :] = state[self.nq :] + delta[self.nv :]
         return out
 
@@ -94,6 +107,8 @@ class _Mechanics:
             return rate
         out = rate.copy()
         for joint in self._groups:
+            if joint.rotation(delta) > LARGEST_ROTATION:
+                raise EvaluationError("a ball or free joint turns too far within one step")
             own = slice(joint.start, joint.start + joint.size)
             out[own] = dexp_inverse(joint, delta[own], rate[own])
         return out
@@ -112,7 +127,7 @@ class _Mechanics:
     def step_limit(self, state: FloatArray) -> float:
         """Step over which no group joint turns by more than ``ROTATION_PER_STEP``."""
         v = state[self.nq :]
-        speed = max((joint.rotation_speed(v) for joint in self._groups), default=0.0)
+        speed = max((joint.rotation(v) for joint in self._groups), default=0.0)
         return ROTATION_PER_STEP / speed if speed > 0.0 else np.inf
 
     def energy(self, state: FloatArray) -> float:
@@ -250,6 +265,9 @@ class ClosedSystem(_Mechanics):
         nonLinearEffects the velocities and bias accelerations: the closures need no further call.
         """
         self.evaluations += 1
+        # First, because LAPACK may factorise what is not finite without reporting it.
+        if not blas.dasum(state) < _OVERFLOW:
+            raise EvaluationError("the state is not finite, or overflows")
         model, data, nq = self.model, self.data, self.nq
         q, v = state[:nq], state[nq:]
         pin.crba(model, data, q, _WORLD)

@@ -1,6 +1,6 @@
 r"""The constraint algebra of one stage: E, P, rank and sigma from one pivoted factorisation.
 
-With M = L L^T and W = L^{-1} G^T a column-pivoted QR, W Pi = Q R, gives (METHODS section 4)
+With M = L L^T and W = L^{-1} G^T a column-pivoted QR, W Pi = Q R, gives (docs/notation.md)
 
     E g = L^{-T} Q R^{-T} Pi^T g,        P v = L^{-T} Q Q^T L^T v,
     yhat = E gamma,                      gamma = W^T (L^{-1} f) + Gdot v.
@@ -107,6 +107,8 @@ class Projection:
         packed, permutation, tau, pivots = pivoted_qr(W)
         structural = self.structural_rank
         self.sigma = float(pivots[structural - 1]) / self.sigma_ref
+        if not self.sigma >= 0.0:
+            raise EvaluationError("the mass matrix or the closures are not finite")
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
         rank = structural
         while rank > 0 and not pivots[rank - 1] >= floor:
@@ -122,7 +124,7 @@ class Projection:
         """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
         if self.rank == 0:
             return np.zeros(self.U.shape[0])
-        z = lapack.dtrtrs(self.R, right, lower=0, trans=1)[0]
+        z: FloatArray = lapack.dtrtrs(self.R, right, lower=0, trans=1)[0]
         return self.Q @ z
 
     def unwhiten(self, right: FloatArray) -> FloatArray:

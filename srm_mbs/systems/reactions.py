@@ -1,8 +1,9 @@
 r"""Reaction forces and multipliers of the closures.
 
-From yhat = M^{-1} G^T lam the multipliers follow as the least-norm solution of
-(L^{-1} G^T) lam = L^T yhat over all rows, unscaled; the wrench that a exerts on b is
-C^T lam with the rows C of the closure taken at b's origin.
+From yhat = M^{-1} G^T lam the multipliers follow as the solution of (L^{-1} G^T) lam = L^T yhat
+over all rows whose norm, in the scaled rows, is least.  Singular values beyond the rank of the
+solve hold the closure error only and are left out.  The wrench that a exerts on b is C^T lam with
+the rows C of the closure taken at b's origin.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.systems.loops import LoopKinematics, row_wrenches
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
-from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, whiten
+from srm_mbs.systems.projection import cholesky, whiten
 
 
 def reactions_at(
@@ -35,13 +36,15 @@ def reactions_at(
     scale = mechanism.structure.row_scale
     data = model.createData()
     for i in range(len(t)):
-        yhat = system.evaluate(t[i], np.concatenate([q[i], v[i]])).multiplier().copy()
+        terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
+        yhat = terms.multiplier().copy()
         pin.crba(model, data, q[i], pin.Convention.WORLD)
         rows.update(data, with_bias=False)
         U = cholesky(data.M)
-        # Scaled rows make the rank decision independent of units.
         W = whiten(U, np.asfortranarray((rows.G / scale[:, None]).T))
-        lam = np.linalg.lstsq(W, U @ yhat, rcond=PIVOT_ZERO)[0] / scale
+        left, singular, right = np.linalg.svd(W, full_matrices=False)
+        k = terms.rank
+        lam = ((left[:, :k].T @ (U @ yhat)) / singular[:k]) @ right[:k] / scale
         at = 0
         for loop in mechanism.loops:
             own = lam[at : at + loop.rows.count]

@@ -1,6 +1,6 @@
 """Load-time analysis of the closures: row scales, structural rank, redundant rows.
 
-A walk on the closure manifold (METHODS section 4b; the notation is in docs/notation.md) visits
+A walk on the closure manifold (docs/notation.md, "The walk") visits
 closed configurations from several restarts, because the start may itself be singular, and open
 random configurations alone give the wrong rank for over-constrained loops.
 """
@@ -8,14 +8,14 @@ random configurations alone give the wrong rank for over-constrained loops.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.loops import LoopKinematics, world_jacobian
 from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
 from srm_mbs.systems.units import Units, coordinate_units, row_units
 
@@ -27,6 +27,8 @@ WALK_STEPS = 12
 WALK_AMPLITUDE = 0.5
 STRUCTURAL_PIVOT = 1e-6
 """A pivot (of scaled rows) above this counts as independent."""
+ROUNDING_ROW = 1e-12
+"""Rows of one kind whose rms stays below this part of their uncancelled terms are rounding."""
 ZERO_ROW = 1e-9
 """A scaled row that stays below this in every closed sample is zero."""
 RANK_GAP = 1e3
@@ -66,6 +68,10 @@ class Structure:
     units: Units
     samples: int
     notes: tuple[str, ...]
+
+    def at(self, mechanism: Mechanism) -> Structure:
+        """The same facts with the units of ``mechanism``, which differs in its start only."""
+        return replace(self, units=coordinate_units(mechanism, mechanism.q0, mechanism.v0))
 
     @property
     def redundant_rows(self) -> tuple[str, ...]:
@@ -119,16 +125,26 @@ class _Walker:
     def set_scale(self, mechanism: Mechanism, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""
         squares = np.zeros_like(self.scale)
+        uncancelled = np.zeros(2)
         for _ in range(OPEN_SAMPLES):
             spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
-            W, _ = self.white(pin.integrate(self.model, mechanism.q0, spread))
+            W, U = self.white(pin.integrate(self.model, mechanism.q0, spread))
             squares += (W**2).sum(axis=0)
+            # What rows would measure if nothing in them cancelled: their rounding is eps of it.
+            J = world_jacobian(self.data)
+            turn = np.linalg.norm(J[3:], axis=0)
+            shift = np.linalg.norm(J[:3], axis=0) + self.units.length * turn
+            uncancelled += [(whiten(U, np.diag(each)) ** 2).sum() for each in (shift, turn)]
         squares /= OPEN_SAMPLES
+        uncancelled /= OPEN_SAMPLES
         at = 0
         for loop in mechanism.loops:
             k = len(loop.rows.directions)
-            for block in (slice(at, at + k), slice(at + k, at + loop.rows.count)):
+            blocks = (slice(at, at + k), slice(at + k, at + loop.rows.count))
+            for block, whole in zip(blocks, uncancelled):
                 mean = squares[block].mean() if block.stop > block.start else 0.0
+                if mean <= ROUNDING_ROW**2 * whole:
+                    mean = whole  # always satisfied: keep rounding from being scaled up to a row
                 self.scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
             at += loop.rows.count
 
@@ -174,7 +190,8 @@ def _closed_samples(
             null = left[:, rank:]
             if null.shape[1] == 0:
                 break
-            direction = unwhiten(U, null @ rng.standard_normal(null.shape[1]))
+            # Projected, not combined from the columns of null: their choice is LAPACK's.
+            direction = unwhiten(U, null @ (null.T @ rng.standard_normal(len(U))))
             if k == 0 and restart < 2 and moving:
                 direction = mechanism.v0 if restart == 0 else -mechanism.v0
             closed = walker.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
@@ -188,7 +205,7 @@ def _closed_samples(
 def analyse(mechanism: Mechanism) -> Structure:
     """Row scales, structural rank, reference pivot and zero rows of ``mechanism``.
 
-    Deterministic: the walk uses a fixed seed.  Source: METHODS section 4b, steps 1 to 4.
+    Deterministic: the walk uses a fixed seed.  Source: docs/notation.md, "The walk".
 
     Raises
     ------

@@ -1,14 +1,19 @@
 r"""Consistent initial states: close the loops, then make the rates fit.
 
-Positions are found in two stages on the configuration manifold: a trust-region least-squares
-solve from the guess (SciPy), whose residual has the intended closing as its only zero, and
-Gauss-Newton on the closure rows to round-off.  The guess chooses the branch.
+Positions are found in two stages on the configuration manifold: a damped least-squares solve
+from the guess, whose residual has the intended closing as its only zero, and Gauss-Newton on the
+closure rows to round-off.  The guess chooses the branch: where the closing found lies far from
+it, others are looked for and the nearest is taken.
+
+Rates solve G v = 0.  Where the configuration is singular, that is not enough: a motion through it
+also has u^T (Gdot v) = 0 for every left null vector u of G (the tangents of the branches).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +23,7 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, InputError
 from srm_mbs.mechanism import LoopClosure, Mechanism
-from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.loops import LoopKinematics, support
 from srm_mbs.systems.units import coordinate_units, row_units
 
 CLOSED = 1e-12
@@ -26,6 +31,18 @@ CLOSED = 1e-12
 RATE_TOLERANCE = 1e-12
 RANK = 1e-10
 """Relative singular value below which a direction does not move the closures."""
+SINGULAR = 1e-7
+"""Singular value of G, rows over their usual size, that counts as zero: the square root of
+round-off, because a singular closing is known no better where it could not be sharpened."""
+NEARLY_SINGULAR = 1e-4
+"""Singular value below which a closing may be an inaccurate singular one."""
+CURVATURE = 1e-7
+"""Largest u^T (Gdot v) of consistent rates, over the square of the rates."""
+FAR = 0.5
+"""Motion of a joint (rad, scene diagonals) from the guess beyond which nearer closings are looked
+for."""
+OTHER_STARTS = 8
+SEARCH_STEPS = 200
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts when the guess itself leads nowhere."""
 
@@ -62,6 +79,7 @@ class _Problem:
 
     def __init__(self, mechanism: Mechanism, start: FloatArray) -> None:
         self.mechanism = mechanism
+        self.start = start
         self.model = mechanism.model
         self.data = self.model.createData()
         self.rows = LoopKinematics(self.model, mechanism.loops)
@@ -76,6 +94,38 @@ class _Problem:
         self.rows.update(self.data, with_bias=False)
         return self.rows.g / self.row_unit, self.rows.G / self.row_unit[:, None] * self.unit
 
+    @cached_property
+    def row_size(self) -> FloatArray:
+        """Usual norm of the rows of G in :meth:`closure`: rms over open configurations (rows,).
+
+        One size for the position rows of a loop and one for its alignments; 1 where all are zero.
+        """
+        rng = np.random.default_rng(0)
+        squares = np.zeros(len(self.row_unit))
+        for _ in range(8):
+            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.unit
+            _, G = self.closure(pin.integrate(self.model, self.start, spread))
+            squares += (G**2).sum(axis=1) / 8
+        at = 0
+        for loop in self.mechanism.loops:
+            middle, end = at + len(loop.rows.directions), at + loop.rows.count
+            for block in (slice(at, middle), slice(middle, end)):
+                if block.stop > block.start:
+                    squares[block] = squares[block].mean()
+            at = end
+        return np.sqrt(np.where(squares > 0.0, squares, 1.0))
+
+    def normalised(self, q: FloatArray) -> FloatArray:
+        """G of :meth:`closure`, rows over their usual size: what ranks are judged by."""
+        return self.closure(q)[1] / self.row_size[:, None]
+
+    def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
+        """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        pin.nonLinearEffects(self.model, self.data, q, u * self.unit)
+        self.rows.update(self.data)
+        return self.rows.bias / self.row_unit / self.row_size
+
     def mismatch(self, q: FloatArray) -> FloatArray:
         """Closing residual whose only zero is the intended closing: gaps and axis differences."""
         self.closure(q)
@@ -86,6 +136,22 @@ class _Problem:
             if len(loop.rows.matched):
                 R = Tb.rotation.T @ Ta.rotation
                 parts.append((loop.rows.matched @ R.T - loop.rows.matched).ravel())
+        return np.concatenate(parts)
+
+    def mismatch_jacobian(self, q: FloatArray) -> FloatArray:
+        """Derivative of :meth:`mismatch` for motions of the joints, in units (entries, nv)."""
+        _, G = self.closure(q)
+        parts, at = [], 0
+        for loop in self.mechanism.loops:
+            parts.append(G[at : at + len(loop.rows.directions)])
+            at += loop.rows.count
+            if len(loop.rows.matched):
+                Ta, Tb = self._anchors(loop)
+                moves = support(self.model, loop.a.resolve(self.model)[0])
+                moves = moves - support(self.model, loop.b.resolve(self.model)[0])
+                turn = Tb.rotation.T @ (self.data.J[3:] * moves * self.unit)
+                R = Tb.rotation.T @ Ta.rotation
+                parts += [-pin.skew(m) @ turn for m in loop.rows.matched @ R.T]
         return np.concatenate(parts)
 
     def gaps(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
@@ -116,6 +182,20 @@ class _Problem:
         full[free] = delta * self.unit[free]
         return pin.integrate(self.model, q, full)  # type: ignore[no-any-return]
 
+    def distance(self, q: FloatArray) -> float:
+        """From the start to q: the norm of the joint motions in units."""
+        return float(np.linalg.norm(pin.difference(self.model, self.start, q) / self.unit))
+
+    def unwound(self, q: FloatArray) -> FloatArray:
+        """q without full turns of its hinges away from the start."""
+        q = q.copy()
+        for joint in list(self.model.joints)[1:]:
+            if joint.nq == joint.nv == 1 and joint.shortname().startswith("JointModelR"):
+                turns = np.round((q[joint.idx_q] - self.start[joint.idx_q]) / (2.0 * np.pi))
+                if turns:
+                    q[joint.idx_q] -= 2.0 * np.pi * turns
+        return q
+
     def closed(self, q: FloatArray) -> bool:
         """Whether every loop is closed as intended, axes in the right sense."""
         g, _ = self.closure(q)
@@ -123,28 +203,47 @@ class _Problem:
 
 
 def _search(problem: _Problem, q: FloatArray, free: IndexArray) -> FloatArray:
-    """Least-squares solve of the closing residual over the free coordinates, from q."""
-    from scipy.optimize import least_squares
+    """Least-squares solve of the closing residual over the free coordinates, from q.
 
-    found = least_squares(
-        lambda delta: problem.mismatch(problem.move(q, free, delta)),
-        np.zeros(len(free)),
-        method="trf",
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-        max_nfev=200,
-    )
-    return problem.move(q, free, found.x)
+    Levenberg-Marquardt with a damping in proportion to the residual (J. Fan and Y. Yuan,
+    Computing 74 (2005) 23): it keeps close to the guess, also where the closings near it are not
+    isolated or G loses rank, and Newton's steps would lead anywhere.
+    """
+    residual = problem.mismatch(q)
+    size = float(np.linalg.norm(residual))
+    damping = 1.0
+    J = problem.mismatch_jacobian(q)[:, free]
+    identity = np.eye(len(free))
+    for _ in range(SEARCH_STEPS):
+        if size <= CLOSED:
+            break
+        damped = np.concatenate([J, np.sqrt(damping * size) * identity])
+        right = np.concatenate([-residual, np.zeros(len(free))])
+        step = np.linalg.lstsq(damped, right, rcond=None)[0]
+        if float(np.abs(step).max()) < 1e-14:
+            break
+        trial = problem.move(q, free, step)
+        new = problem.mismatch(trial)
+        new_size = float(np.linalg.norm(new))
+        predicted = size**2 - float(np.linalg.norm(residual + J @ step)) ** 2
+        gain = (size**2 - new_size**2) / predicted if predicted > 0.0 else 0.0
+        if gain < 0.25:
+            damping *= 4.0
+        elif gain > 0.75:
+            damping = max(0.25 * damping, 1e-8)
+        if gain > 1e-4:
+            q, residual, size = trial, new, new_size
+            J = problem.mismatch_jacobian(q)[:, free]
+    return q
 
 
-def _polish(problem: _Problem, q: FloatArray, free: IndexArray) -> tuple[FloatArray, int]:
-    """Gauss-Newton on the closure rows until they stop improving; q and the iterations used."""
+def _polish(problem: _Problem, q: FloatArray, free: IndexArray) -> FloatArray:
+    """Gauss-Newton on the closure rows until they stop improving."""
     g, G = problem.closure(q)
     best, error = q, float(np.abs(g).max())
-    iterations = 0
-    while error > 0.0 and iterations < 60:
-        iterations += 1
+    for _ in range(60):
+        if error == 0.0:
+            break
         step = np.linalg.lstsq(G[:, free], g, rcond=RANK)[0]
         q = problem.move(q, free, -step)
         g, G = problem.closure(q)
@@ -152,66 +251,89 @@ def _polish(problem: _Problem, q: FloatArray, free: IndexArray) -> tuple[FloatAr
         if not new_error < error:
             break
         best, error = q, new_error
-    return best, iterations
+    return best
 
 
 def _onto_singular_point(problem: _Problem, q: FloatArray, free: IndexArray) -> FloatArray:
-    """Sharpen a double root: Newton on [g; u^T G] with u the left null vectors of G.
+    """Sharpen a double root: Newton on g = 0 together with the loss of rank of G.
 
     At a singular configuration g has a double root in the free coordinates, which Gauss-Newton
-    finds only to the square root of round-off.  Returns q unchanged where this does not help.
+    finds only to the square root of round-off.  G loses rank where the Schur complement S of its
+    well-conditioned part vanishes.  Returns q unchanged where this does not help.
     """
 
-    def equations(x: FloatArray, left: FloatArray) -> FloatArray:
-        g, G = problem.closure(x)
-        return np.concatenate([g, (left @ G[:, free]).ravel()])
+    def normalised(x: FloatArray) -> FloatArray:
+        return problem.normalised(x)[:, free]
 
-    x = q
-    error = np.inf
-    best = q
+    left, singular, right = np.linalg.svd(normalised(q))
+    if not np.any((singular > 1e-13) & (singular < NEARLY_SINGULAR)):
+        return q
+    rank = int(np.sum(singular > NEARLY_SINGULAR))
+
+    def equations(x: FloatArray) -> FloatArray:
+        g, _ = problem.closure(x)
+        turned = left.T @ normalised(x) @ right.T
+        strong, up, down = turned[:rank, :rank], turned[:rank, rank:], turned[rank:, :rank]
+        schur = turned[rank:, rank:] - down @ np.linalg.solve(strong, up)
+        return np.concatenate([g, schur.ravel()])
+
+    rows = len(problem.row_unit)
+    # A regular closing close to a singular one must stay: g may not become larger.
+    allowed = max(2e-15, float(np.abs(problem.closure(q)[0]).max()))
+    tau = 1e-6
+    x, value = q, equations(q)
     for _ in range(8):
-        _, G = problem.closure(x)
-        left, singular, _ = np.linalg.svd(G[:, free])
-        rank = int(np.sum(singular > 1e-4))
-        null = left[:, rank:].T
-        value = equations(x, null)
-        new_error = float(np.abs(value).max())
-        if not new_error < error:
-            break
-        best, error = x, new_error
-        tau = 1e-6
         jacobian = np.array(
             [
-                equations(problem.move(x, free, tau * e), null)
-                - equations(problem.move(x, free, -tau * e), null)
+                equations(problem.move(x, free, tau * e))
+                - equations(problem.move(x, free, -tau * e))
                 for e in np.eye(len(free))
             ]
         ).T / (2.0 * tau)
         x = problem.move(x, free, -np.linalg.lstsq(jacobian, value, rcond=1e-9)[0])
-    if error < 1e-11 and float(np.abs(pin.difference(problem.model, q, best)).max()) < 1e-4:
-        return best
+        moved = float(np.abs(pin.difference(problem.model, q, x) / problem.unit).max())
+        if not moved < NEARLY_SINGULAR:
+            return q
+        value = equations(x)
+        g_size, loss = np.abs(value[:rows]).max(), np.abs(value[rows:]).max()
+        if g_size <= allowed and loss < 1e-13:
+            return x
     return q
 
 
 def _close(problem: _Problem, start: FloatArray, free: IndexArray) -> FloatArray:
-    """The closed configuration that the guess ``start`` leads to, or the closest one found."""
+    """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
     if not len(free):
         return start
     rng = np.random.default_rng(0)
-    best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
-    for size in (0.0, *PERTURBATIONS):
-        q = start
-        if size:
-            q = problem.move(start, free, rng.uniform(-size, size, len(free)))
+
+    def attempt(q: FloatArray) -> FloatArray:
         if np.linalg.norm(problem.mismatch(q)) > CLOSED:
             q = _search(problem, q, free)
-        q, iterations = _polish(problem, q, free)
+        return problem.unwound(_polish(problem, q, free))
+
+    best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
+    for size in (0.0, *PERTURBATIONS):
+        spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
+        q = attempt(problem.move(start, free, spread))
         if problem.closed(q):
-            return _onto_singular_point(problem, q, free) if iterations > 10 else q
+            break
         gap = float(np.linalg.norm(problem.mismatch(q)))
         if gap < best_gap:
             best, best_gap = q, gap
-    return best
+    else:
+        return best
+    away = (pin.difference(problem.model, start, q) / problem.unit)[free]
+    far = float(np.abs(away).max())
+    if far > FAR:
+        # Another branch may be nearer: look on the other side of the guess and around it.
+        others = [-0.5 * away, -away]
+        others += list(rng.uniform(-far, far, (OTHER_STARTS, len(free))))
+        for other in others:
+            candidate = attempt(problem.move(start, free, other))
+            if problem.distance(candidate) < problem.distance(q) and problem.closed(candidate):
+                q = candidate
+    return _onto_singular_point(problem, q, free)
 
 
 def _describe(gaps: Mapping[str, tuple[float | None, float | None]]) -> str:
@@ -279,29 +401,106 @@ def _rates(
     mechanism: Mechanism, problem: _Problem, q: FloatArray, v: FloatArray, held: tuple[str, ...]
 ) -> FloatArray:
     _, G = problem.closure(q)
+    normalised = G / problem.row_size[:, None]
+    left, singular, _ = np.linalg.svd(normalised)
+    left = left[:, int(np.sum(singular > SINGULAR)) :]
 
-    def solve(names: Iterable[str]) -> tuple[FloatArray, float]:
+    def curvature(u: FloatArray) -> FloatArray:
+        return left.T @ problem.bias(q, u)
+
+    def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
+        """Rates in units, the largest G v left, and whether a motion has these rates."""
         free = _free_coordinates(mechanism, names)
+        _, s, right = np.linalg.svd(normalised[:, free])
+        rank = int(np.sum(s > SINGULAR))
+        inverse = np.linalg.pinv(normalised[:, free], rcond=SINGULAR / max(s[:1].sum(), SINGULAR))
         u = v / problem.unit
         for _ in range(2):  # the second pass removes the rounding of the first
-            u[free] -= np.linalg.lstsq(G[:, free], G @ u, rcond=RANK)[0]
-        return u * problem.unit, float(np.abs(G @ u).max())
+            u[free] -= inverse @ (normalised @ u)
+        error = float(np.abs(G @ u).max())
+        bent = _onto_tangent(u, free, right[rank:].T, curvature)
+        return (u, error, False) if bent is None else (bent, error, True)
 
     tolerance = RATE_TOLERANCE * max(1.0, float(np.abs(v / problem.unit).max()))
-    solved, error = solve(held)
-    if error <= tolerance:
-        return solved
+
+    def consistent(error: float, moves: bool) -> bool:
+        return error <= tolerance and moves
+
+    solved, error, moves = solve(held)
+    if consistent(error, moves):
+        return solved * problem.unit
     guilty = [
-        name for name in held if solve([h for h in held if h != name])[1] <= tolerance
+        name for name in held if consistent(*solve([h for h in held if h != name])[1:])
     ] or list(held)
+    if error > tolerance:
+        what = f"the held rates of {_quoted(held)} contradict the closures (G v = {error:.2e})"
+    elif held:
+        what = f"no motion through this singular configuration has the rates of {_quoted(held)}"
+    else:
+        what = "no motion through this singular configuration has rates close to these"
+    remedy = f"Change or free one of {_quoted(guilty)}" if guilty else "Give other rates"
+    if np.any((singular > 1e-13) & (singular < 10.0 * SINGULAR)):
+        remedy += (
+            "; the held positions lie so close to a singular configuration that the rates are not "
+            "determined: give them with all digits, or further away"
+        )
     raise AssemblyError(
-        f"the held rates of {_quoted(held)} contradict the closures (G v = {error:.2e})",
+        what,
         residuals=problem.gaps(q),
         q=q,
         held=tuple(guilty),
         element="initial.v",
-        remedy=f"Change or free one of {_quoted(guilty)}",
+        remedy=remedy,
     )
+
+
+def _onto_tangent(
+    u: FloatArray,
+    free: IndexArray,
+    null: FloatArray,
+    curvature: Callable[[FloatArray], FloatArray],
+) -> FloatArray | None:
+    """The rates nearest to u (nv,) that a motion has: ``curvature`` zero; None if there are none.
+
+    They differ from u by combinations of the columns of ``null`` in the ``free`` coordinates.
+    """
+    from scipy.optimize import least_squares
+
+    size = float(np.abs(u).max())
+    if size == 0.0 or np.abs(curvature(u)).max(initial=0.0) <= CURVATURE * size**2:
+        return u
+    if not null.shape[1]:
+        return None
+
+    def bent(w: FloatArray) -> FloatArray:
+        out = u.copy()
+        out[free] += size * (null @ w)
+        return out
+
+    rng = np.random.default_rng(0)
+    best = None
+    for start in (np.zeros(null.shape[1]), *rng.uniform(-2.0, 2.0, (8, null.shape[1]))):
+        found = least_squares(
+            lambda w: curvature(bent(w)) / size**2, start, xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
+        closer = best is None or np.linalg.norm(found.x) < np.linalg.norm(best)
+        if closer and np.abs(found.fun).max() <= CURVATURE:
+            best = found.x
+    return None if best is None else bent(best)
+
+
+def _vector(values: Any, size: int, what: str) -> FloatArray:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} must be {size} finite numbers",
+            element=what,
+            remedy="Give an array, or a mapping from joint names to values",
+        )
+    return array
 
 
 def assemble(
@@ -323,9 +522,11 @@ def assemble(
         or a configuration (nq,), of which only the joints in ``hold`` are held.
     v
         Joint name -> rate, held exactly; or a velocity (nv,), which is changed as little as
-        possible.  Rates not given are the least-norm ones.
+        possible.  Rates not given are the least-norm ones: at a singular configuration, those of
+        the branch on which the norm is least; give one more rate to choose another branch.
     guess
-        Joint name -> position from which assembly starts; chooses the branch.
+        Joint name -> position from which assembly starts; chooses the branch (the closing
+        nearest to it that was found, in rad and scene diagonals).
     hold
         Names of the joints whose position is held; by default those named in ``q``.
 
@@ -345,6 +546,12 @@ def assemble(
     model = mechanism.model
     start = np.array(mechanism.q0)
     for name, value in (guess or {}).items():
+        if isinstance(q, Mapping) and name in q:
+            raise InputError(
+                f"joint {name!r} is held in q and guessed in guess",
+                element="guess",
+                remedy="Keep one of the two",
+            )
         set_position(mechanism, start, name, value)
     held: tuple[str, ...] = ()
     if isinstance(q, Mapping):
@@ -352,12 +559,16 @@ def assemble(
             set_position(mechanism, start, name, value)
         held = tuple(q)
     elif q is not None:
-        start = np.array(q, dtype=float)
-        if start.shape != (model.nq,) or not np.isfinite(start).all():
-            raise InputError(f"q must be {model.nq} finite numbers", element="q")
+        start = _vector(q, model.nq, "q")
         start = pin.normalize(model, start)
+        if not (np.isfinite(start).all() and pin.isNormalized(model, start, 1e-9)):
+            raise InputError(
+                "q has a quaternion, or a (cos, sin) pair, of length zero",
+                element="q",
+                remedy="Use pinocchio.normalize(model, q)",
+            )
     if hold is not None:
-        held = tuple(hold)
+        held = (hold,) if isinstance(hold, str) else tuple(hold)
         for name in held:
             mechanism.joint(name)
     rates = np.zeros(model.nv)
@@ -367,19 +578,19 @@ def assemble(
             set_rate(mechanism, rates, name, value)
         held_rates = tuple(v)
     elif v is not None:
-        rates = np.array(v, dtype=float)
-        if rates.shape != (model.nv,) or not np.isfinite(rates).all():
-            raise InputError(f"v must be {model.nv} finite numbers", element="v")
+        rates = _vector(v, model.nv, "v")
     if not mechanism.loops:
         return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
     problem = _Problem(mechanism, start)
     closed = _positions(mechanism, problem, start, held)
+    for name in held:  # moving a quaternion by nothing rounds it
+        joint = mechanism.joint(name)
+        own = slice(joint.idx_q, joint.idx_q + joint.nq)
+        closed[own] = start[own]
     consistent = _rates(mechanism, problem, closed, rates, held_rates)
-    _, G = problem.closure(closed)
+    _, singular, right = np.linalg.svd(problem.normalised(closed))
     residuals, rate_residuals = problem.rows.g.copy(), problem.rows.G @ consistent
-    _, singular, right = np.linalg.svd(G)
-    # sqrt of round-off: a singular closing is known no better where it could not be sharpened
-    rank = int(np.sum(singular > 1e-7))
+    rank = int(np.sum(singular > SINGULAR))
     return Assembly(
         closed,
         consistent,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +16,11 @@ import pinocchio as pin
 
 from srm_mbs.assembly import assemble
 from srm_mbs.coordinates import set_position, set_rate
-from srm_mbs.errors import InputError
+from srm_mbs.errors import AssemblyError, InputError
 from srm_mbs.loading.bundled import bundled_models, generated_size, models_folder
-from srm_mbs.loading.description import Description, parse_description
+from srm_mbs.loading.description import LARGEST, Description, parse_description
 from srm_mbs.loading.generated import n_four_bar as _n_four_bar_texts
-from srm_mbs.loading.urdf import ROOT_JOINTS, build_urdf, lock_joints
+from srm_mbs.loading.urdf import ROOT_JOINTS, build_urdf, check_inertia, lock_joints
 from srm_mbs.mechanism import Mechanism, SimulationDefaults, Source
 
 __all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]
@@ -27,13 +30,23 @@ log = logging.getLogger(__name__)
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # Windows editors put a mark first
     except FileNotFoundError as error:
-        raise InputError("there is no such file", file=str(path)) from error
+        raise InputError(
+            "there is no such file", file=str(path), remedy="Check the path"
+        ) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"it is not UTF-8 text: {error}", file=str(path)) from error
+        raise InputError(
+            f"it is not UTF-8 text: {error}", file=str(path), remedy="Save it as UTF-8"
+        ) from error
     except OSError as error:
-        raise InputError(f"it cannot be read: {error.strerror}", file=str(path)) from error
+        raise InputError(
+            f"it cannot be read: {error.strerror}",
+            file=str(path),
+            remedy="Give the path of a readable file",
+        ) from error
+    except ValueError as error:  # a null character
+        raise InputError(f"it is no file name: {error}", file=repr(path)) from error
 
 
 def _check_joint_names(description: Description, model: pin.Model, file: str) -> None:
@@ -54,6 +67,11 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
                     element=where,
                     remedy=f"Known: {', '.join(known)}",
                 )
+    for i, name in enumerate(description.lock):
+        if name in description.lock[:i]:
+            raise InputError(
+                f"joint {name!r} stands there twice", file=file, element="lock", remedy="Keep one"
+            )
     for name in description.initial.q:
         if name in description.initial.guess:
             raise InputError(
@@ -62,6 +80,34 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
                 element="initial.guess",
                 remedy="Keep one of the two",
             )
+
+
+@contextmanager
+def _element(where: str) -> Iterator[None]:
+    """Name the key of the description in errors that do not name one."""
+    try:
+        yield
+    except InputError as error:
+        error.element = error.element or where
+        raise
+
+
+def _check_frames(description: Description, model: pin.Model) -> None:
+    """Refuse an anchor's frame name that means two different frames, say a joint's and a link's."""
+    for i, loop in enumerate(description.loop):
+        for side, anchor in (("a", loop.a), ("b", loop.b)):
+            if anchor.frame is None:
+                continue
+            first, *others = [f for f in model.frames if f.name == anchor.frame] or [None]
+            for other in others:
+                if other.parentJoint != first.parentJoint or not other.placement.isApprox(
+                    first.placement, 1e-12
+                ):
+                    raise InputError(
+                        f"the name {anchor.frame!r} belongs to a joint and to another joint's link",
+                        element=f"loop[{i}].{side}.frame",
+                        remedy="Rename one of them in the URDF, or write link = instead of frame =",
+                    )
 
 
 def _without_locked(
@@ -75,11 +121,13 @@ def _without_locked(
     whole = Mechanism(model)
     frozen = np.array(whole.q0)
     for name in description.lock:
-        value = q.pop(name, guess.pop(name, None))
-        if value is not None:
-            set_position(whole, frozen, name, value)
+        for where, values in (("initial.q", q), ("initial.guess", guess)):
+            if name in values:
+                with _element(where):
+                    set_position(whole, frozen, name, values.pop(name))
         rate = np.zeros(model.nv)
-        set_rate(whole, rate, name, v.pop(name, np.zeros(whole.joint(name).nv)))
+        with _element("initial.v"):
+            set_rate(whole, rate, name, v.pop(name, np.zeros(whole.joint(name).nv)))
         if rate.any():
             raise InputError(
                 f"joint {name!r} is locked but has an initial rate",
@@ -95,10 +143,12 @@ def _unassembled(
 ) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
     """The mechanism with the guess as its q0, and the held positions and rates."""
     file = source.path
-    built = build_urdf(source.urdf, source.urdf_path, source.base)
+    built = build_urdf(source.urdf, source.urdf_path, source.base, description.lock)
     built.model.gravity.linear = np.array(source.gravity)
     _check_joint_names(description, built.model, file)
     model, q, v, guess = _without_locked(description, built.model, file)
+    check_inertia(model, source.urdf_path)
+    _check_frames(description, model)
     defaults = description.simulation
     mechanism = Mechanism(
         model,
@@ -109,9 +159,13 @@ def _unassembled(
         notes=built.notes,
     )
     start = np.array(mechanism.q0)
-    for values in (guess, q):
+    for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
-            set_position(mechanism, start, name, value)
+            with _element(where):
+                set_position(mechanism, start, name, value)
+    for name, value in v.items():
+        with _element("initial.v"):
+            set_rate(mechanism, np.zeros(model.nv), name, value)
     return replace(mechanism, q0=start), q, v
 
 
@@ -122,7 +176,14 @@ def rebuild(source: Source) -> Mechanism:
 
 def _assembled(description: Description, source: Source) -> Mechanism:
     mechanism, q, v = _unassembled(description, source)
-    state = assemble(mechanism, q, v)
+    try:
+        state = assemble(mechanism, q, v)
+    except AssemblyError as error:
+        if description.lock:
+            error.remedy = f"{error.remedy}. Locked, so that they cannot help: " + ", ".join(
+                map(repr, description.lock)
+            )
+        raise
     # A fresh mechanism: its structure is analysed from the assembled state.
     mechanism = replace(mechanism, q0=state.q, v0=state.v)
     log.info(
@@ -135,9 +196,16 @@ def _assembled(description: Description, source: Source) -> Mechanism:
 
 
 def _gravity(value: Any) -> tuple[float, float, float]:
-    array = np.asarray(value, dtype=float)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(f"gravity = {value!r} is not three finite numbers", element="gravity")
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        array = np.zeros(0)
+    if array.shape != (3,) or not (np.abs(array) <= LARGEST).all():
+        raise InputError(
+            f"gravity = {value!r} is not three finite numbers",
+            element="gravity",
+            remedy="Give [x, y, z] in m/s^2",
+        )
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
@@ -155,13 +223,14 @@ def _load_text(
             urdf = _read(urdf_path)
         except InputError as error:
             raise InputError(
-                f"cannot read the URDF {description.urdf!r} ({error.problem}: {urdf_path})",
+                f"cannot read the URDF {description.urdf!r} ({error.problem}: {str(urdf_path)!r})",
                 file=file,
                 element="urdf",
                 remedy="The path is relative to the description",
             ) from error
-    base = overrides.get("base") or description.base
-    if base not in ROOT_JOINTS:
+    base = overrides.get("base")
+    base = description.base if base is None else base
+    if not isinstance(base, str) or base not in ROOT_JOINTS:
         raise InputError(
             f"there is no base {base!r}", element="base", remedy=f"Known: {', '.join(ROOT_JOINTS)}"
         )
@@ -204,9 +273,9 @@ def load(
     """
     overrides = {"gravity": gravity, "base": base}
     name = str(path)
-    is_name = not name.endswith((".toml", ".urdf")) and "/" not in name and "\\" not in name
+    is_name = not Path(name).suffix and "/" not in name and "\\" not in name
     if is_name and name in bundled_models():
-        path = models_folder() / f"{name}.toml"
+        name = str(models_folder() / f"{name}.toml")
     elif is_name:
         size = generated_size(name)
         if size is None:
@@ -215,14 +284,20 @@ def load(
                 remedy=f"Bundled: {', '.join(bundled_models())}; or give a .toml or .urdf path",
             )
         return _generated(size, overrides)
-    path = Path(path)
+    path = Path(name)
     file = str(path)
+    kind = path.suffix.lower()
     try:
-        if path.suffix == ".toml":
+        if kind == ".toml":
             return _load_text(_read(path), file, None, overrides)
-        if path.suffix == ".urdf":
-            text = f'format = 1\nurdf = "{path.name}"\n'
+        if kind == ".urdf":
+            # A JSON string is a TOML string too.
+            text = f"format = 1\nurdf = {json.dumps(path.name)}\n"
             return _load_text(text, file, _read(path), overrides)
+        if path.is_dir():
+            raise InputError("it is a directory", remedy="Give a .toml description or a .urdf")
+        if not path.exists():
+            raise InputError("there is no such file", remedy="Check the path")
     except InputError as error:
         raise error.located(file) from error.__cause__
     raise InputError(
@@ -245,6 +320,6 @@ def n_four_bar(n: int) -> Mechanism:
     InputError
         If n < 1.
     """
-    if n < 1:
-        raise InputError(f"an N-four-bar needs n >= 1, not {n}", element="n")
-    return _generated(n, {})
+    if not isinstance(n, Integral) or n < 1:
+        raise InputError(f"an N-four-bar needs n >= 1, not {n!r}", element="n")
+    return _generated(int(n), {})

@@ -9,24 +9,34 @@ from __future__ import annotations
 import tomllib
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import (
-    AllowInfNan,
-    BaseModel,
-    ConfigDict,
-    Field,
-    StrictFloat,
-    StrictInt,
-    StrictStr,
-    ValidationError,
-)
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, StrictStr, ValidationError
+from pydantic_core import PydanticCustomError
 
 from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Anchor, LoopClosure
 
-Number = Annotated[StrictFloat | StrictInt, AllowInfNan(False)]
+LARGEST = 1e30
+"""Numbers beyond this have lost their meaning, and their squares may overflow."""
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise PydanticCustomError("number", "a finite number is wanted")
+    if not abs(value) <= LARGEST:
+        raise PydanticCustomError("number", "a finite number of sensible size is wanted")
+    return float(value)
+
+
+def _joint_value(value: Any) -> float | list[float]:
+    if isinstance(value, list) and value:
+        return [_number(part) for part in value]
+    return _number(value)
+
+
+Number = Annotated[float, PlainValidator(_number)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
-JointValue = Number | Annotated[list[Number], Field(min_length=1)]
+JointValue = Annotated[float | list[float], PlainValidator(_joint_value)]
 Base = Literal["fixed", "floating", "planar"]
 
 LATER = {
@@ -35,6 +45,20 @@ LATER = {
     "sdf": "SDF files are not read by this version; give a URDF",
     "mjcf": "MJCF files are not read by this version; give a URDF",
 }
+
+
+PROBLEMS = {
+    "string_type": ("a text is wanted", "Put it in quotes"),
+    "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
+    "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "number": (None, "Give a finite number"),
+    "greater_than": (None, "Give a positive number"),
+    "too_short": (None, "Give the right number of values"),
+    "too_long": (None, "Give the right number of values"),
+    "literal_error": (None, "Choose one of those"),
+}
+"""By pydantic's type of error: the problem (None: pydantic's own words) and the remedy."""
 
 
 class _Strict(BaseModel):
@@ -109,7 +133,8 @@ class Description(_Strict):
                             given.link, given.frame, _triple(given.xyz), _triple(given.rpy)
                         )
                     except InputError as error:
-                        error.element = f"{label_side}: {error.element}"
+                        what = "" if error.element == "anchor" else f": {error.element}"
+                        error.element = label_side + what
                         raise
                 axis = None if entry.axis is None else _triple(entry.axis)
                 out.append(LoopClosure(entry.type, anchors["a"], anchors["b"], axis, entry.name))
@@ -120,8 +145,8 @@ class Description(_Strict):
         return tuple(out)
 
 
-def _triple(values: list[Any]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
+def _triple(values: list[float]) -> tuple[float, float, float]:
+    x, y, z = values
     return (x, y, z)
 
 
@@ -130,8 +155,6 @@ def _key_path(location: tuple[int | str, ...]) -> str:
     for part in location:
         if isinstance(part, int):
             path += f"[{part}]"
-        elif part.startswith(("function", "constrained", "float", "int", "list[")):
-            continue  # pydantic names the branches of a union; a reader does not need them
         else:
             path += f".{part}" if path else part
     return path
@@ -161,9 +184,19 @@ def _explain(error: ValidationError) -> tuple[str, str, str | None]:
         return key, f"unknown key {name!r}", f"Known here: {_known_keys(location)}"
     if first["type"] == "missing":
         return key, "this key is missing", "Add it"
-    given = repr(first.get("input"))
-    shown = given if len(given) < 60 else given[:57] + "..."
-    return key, f"{first['msg'][0].lower()}{first['msg'][1:]}, not {shown}", None
+    message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+    problem, remedy = PROBLEMS.get(first["type"], (None, None))
+    if location[0] == "initial" and first["type"] == "number":
+        remedy = "Give a finite number, or a list of them for a joint with several coordinates"
+    return key, f"{problem or message}, not {_shown(first.get('input'))}", remedy
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no integer of more than 4300 digits
+        return "this one"
+    return text if len(text) < 60 else text[:57] + "..."
 
 
 def parse_description(text: str, file: str) -> Description:
@@ -176,8 +209,12 @@ def parse_description(text: str, file: str) -> Description:
     """
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"this is not valid TOML: {error}", file=file) from error
+    except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
+        raise InputError(
+            f"this is not valid TOML: {error}",
+            file=file,
+            remedy="Correct it there; text stands in quotes, lists in [ ]",
+        ) from error
     try:
         description = Description.model_validate(raw)
     except ValidationError as error:

@@ -1,8 +1,10 @@
 """URDF: checked by us, built by Pinocchio.
 
 Pinocchio's parser drops what it does not know without a word: unknown elements, a second joint
-with the same child, joint friction.  Everything that would change the mechanism is therefore
-checked on the XML first; what is dropped knowingly is listed in the notes.
+with the same child, joint friction, a whole <inertial> whose numbers are separated by a newline.
+Everything that would change the mechanism is therefore checked on the XML first, and Pinocchio
+gets a copy that holds nothing but what was checked, with the numbers written afresh.  What is
+dropped knowingly is listed in the notes.
 """
 
 from __future__ import annotations
@@ -10,24 +12,38 @@ from __future__ import annotations
 import logging
 import math
 import re
+import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element, ParseError, tostring
 
 import numpy as np
 import pinocchio as pin
 from defusedxml import DefusedXmlException
 from defusedxml import ElementTree as SafeTree
+from scipy.linalg.lapack import dpotrf
 
 from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.loading.description import LARGEST
 from srm_mbs.mechanism import WORLD
 
 log = logging.getLogger(__name__)
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 WITH_AXIS = ("revolute", "continuous", "prismatic", "planar")
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+DEEPEST = 1000
+"""Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""
+UNIVERSE = "universe"
+"""Pinocchio's name for the ground."""
+ROOT_JOINT = "root_joint"
+"""Pinocchio's name for the joint of a floating or planar base."""
+NO_INERTIA = 1e-13
+"""An articulated inertia below this fraction of the composite one is the rounding of zero."""
+POINT_LIKE = 1e-18
+"""m^2: a radius of gyration below a nanometre is the rounding of zero."""
 LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
 IGNORED = {
     "robot": ("material", "transmission", "gazebo", "sensor", "ros2_control", "verbose"),
@@ -61,8 +77,13 @@ ATTRIBUTES = {
     "child": ("link",),
     "axis": ("xyz",),
     "limit": ("lower", "upper", "effort", "velocity"),
-    "dynamics": ("damping", "friction", "D", "K", "mu_coulomb", "mu_viscous"),
+    "dynamics": ("damping", "friction"),
 }
+INFORMATIVE = {
+    "limit": ("command_effort", "current", "gear_velocity"),
+    "dynamics": ("D", "K", "mu_coulomb", "mu_viscous"),
+}
+"""Attributes of other tools found in published files: ignored, with a note."""
 DRAWN_ONLY = ("material", "visual", "collision")
 """Elements whose loss needs no note: they do not act."""
 
@@ -95,39 +116,59 @@ class _Checker:
         return InputError(problem, file=self.file, element=element, remedy=remedy)
 
     def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
-        """``count`` finite numbers of attribute ``key``."""
+        """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
         text = node.get(key)
-        try:
-            values = [float(part) for part in (text or "").split()]
-        except ValueError:
-            values = []
-        if len(values) != count or not all(map(math.isfinite, values)):
-            wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+        parts = (text or "").split()
+        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
+        # Limits do not act, and exporters write the largest double there.
+        largest = sys.float_info.max if node.tag == "limit" else LARGEST
+        if len(values) != count or not all(abs(value) <= largest for value in values):
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
             raise self.fault(
-                where, f"<{node.tag} {key}={text!r}> is not {wanted}", f"Write {wanted}"
+                where,
+                f"<{node.tag}> has no {key!r}"
+                if text is None
+                else f"<{node.tag} {key}={text!r}> is not {wanted}",
+                f"Write {wanted}",
             )
+        node.set(key, " ".join(map(repr, values)))
         return values
 
     def attributes(self, node: Element, where: str) -> None:
         known = ATTRIBUTES.get(node.tag)
-        for key in node.attrib:
-            if known is not None and key not in known:
+        ignored = INFORMATIVE.get(node.tag, ())
+        for key in list(node.attrib):
+            if key in ignored:
+                self._ignore(f"<{node.tag} {key}> attribute")
+                del node.attrib[key]
+            elif known is not None and key not in known:
                 raise self.fault(
                     where,
                     f"<{node.tag}> has an unknown attribute {key!r}",
                     f"Known: {', '.join(known)}",
                 )
 
+    def _ignore(self, what: str) -> None:
+        self._ignored[what] = self._ignored.get(what, 0) + 1
+
     def children(self, node: Element, where: str) -> None:
-        """Refuse unknown elements of ``node``; count those that are ignored."""
+        """Refuse unknown elements of ``node``; count and remove those that are ignored."""
         read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
-        for child in node:
+        for child in list(node):
             tag = child.tag
             local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
             if tag in read:
                 self.attributes(child, where)
             elif tag in ignored:
-                self._ignored[tag] = self._ignored.get(tag, 0) + 1
+                if tag not in DRAWN_ONLY:
+                    self._ignore(f"<{tag}> element")
+                node.remove(child)
+            elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
+                raise self.fault(
+                    f"{where}, <xacro:{local}>" if where else f"<xacro:{local}>",
+                    "this is a xacro macro, not URDF",
+                    "Run xacro on the file first",
+                )
             elif local in LOOP_ELEMENTS or tag != local:
                 raise self.fault(
                     f"{where}, <{local}>" if where else f"<{local}>",
@@ -159,32 +200,64 @@ class _Checker:
             found[name] = node
         return found
 
-    def check(self, root: Element, base: str) -> None:
-        """The whole file."""
-        if root.tag != "robot":
-            raise self.fault(f"<{root.tag}>", "the root element is not <robot>")
-        self.children(root, "")
+    def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
+        """The whole file; leaves in ``root`` what Pinocchio is to read."""
+        self.root(root)
         for block in root.findall("gazebo"):
-            if block.find("joint") is not None:
-                raise self.fault(
-                    "<gazebo><joint>",
-                    "joints inside <gazebo> close loops and are not read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
-                )
+            for joint in block.iter("joint"):
+                if joint.find("child") is not None or joint in list(block):
+                    raise self.fault(
+                        f"<gazebo><joint> {joint.get('name', '')!r}",
+                        "joints inside <gazebo> close loops and are not read by this version",
+                        "Describe the loop as [[loop]] in a TOML description and remove the "
+                        "element",
+                    )
+        self.children(root, "")
         links, joints = self.named(root, "link"), self.named(root, "joint")
         if not links:
-            raise self.fault("<robot>", "there is no <link>")
+            raise self.fault("<robot>", "there is no <link>", "Add one for every body")
         for name, link in links.items():
             self.link(name, link)
         self.tree(links, joints, base)
         for name, joint in joints.items():
-            self.joint(name, joint)
-        for tag, count in self._ignored.items():
-            if tag not in DRAWN_ONLY:
-                self.notes.append(f"{count} <{tag}> element(s) do not act and are ignored")
+            self.joint(name, joint, base, name in locked)
+        for what, count in self._ignored.items():
+            self.notes.append(f"{count} {what}(s) do not act and are ignored")
+
+    def root(self, root: Element) -> None:
+        """The root element and its attributes, of which the name is kept."""
+        if root.tag.endswith("}robot"):
+            raise self.fault(
+                "<robot>",
+                "it has a default namespace (xmlns=...), so that none of its elements is URDF",
+                "Remove the attribute xmlns",
+            )
+        if root.tag != "robot":
+            raise self.fault(f"<{root.tag}>", "the root element is not <robot>", "Give a URDF file")
+        version = root.get("version", "1.0")
+        if version not in ("1", "1.0", "1.1", "1.2"):
+            raise self.fault(
+                "<robot>", f"there is no URDF version {version!r}", "Known: 1.0, 1.1, 1.2"
+            )
+        name = root.get("name")
+        if not name:
+            raise self.fault("<robot>", "it has no name", 'Give name="..."')
+        root.attrib.clear()
+        root.set("name", name)
 
     def link(self, name: str, link: Element) -> None:
         where = f"link {name!r}"
+        origin = link.find("origin")
+        if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
+            self.attributes(origin, where)
+            for key in ("xyz", "rpy"):
+                if origin.get(key) is not None and any(self.numbers(origin, key, 3, where)):
+                    raise self.fault(
+                        where,
+                        "<origin> in <link> has no meaning in URDF and would not move anything",
+                        "Put it into the joint, <inertial> or <visual> that it belongs to",
+                    )
+            link.remove(origin)
         self.children(link, where)
         inertial = link.find("inertial")
         if inertial is None:
@@ -202,7 +275,7 @@ class _Checker:
             self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
         )
         principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        rounding = 1e-9 * float(np.abs(principal).max())
+        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_LIKE * value
         if principal[0] < -rounding:
             raise self.fault(
                 where,
@@ -263,24 +336,50 @@ class _Checker:
             raise self.fault(
                 "<robot>", problem, "A URDF needs exactly one root link; close loops by [[loop]]"
             )
-        for link in links:
-            seen, at = {link}, link
-            while at in parent_link:
+        children: dict[str, list[str]] = {}
+        for child, parent in parent_link.items():
+            children.setdefault(parent, []).append(child)
+        level, depth, loose = roots, 0, set(links)
+        while level:
+            if depth > DEEPEST:
+                raise self.fault(
+                    f"link {level[0]!r}",
+                    f"more than {DEEPEST} joints lie between it and the root link",
+                    "Split the chain: Pinocchio cannot read such a deep one",
+                )
+            loose -= set(level)
+            level = [child for link in level for child in children.get(link, ())]
+            depth += 1
+        if loose:
+            ring: dict[str, None] = {}
+            at = next(link for link in links if link in loose)
+            while at not in ring:
+                ring[at] = None
                 at = parent_link[at]
-                if at in seen:
-                    raise self.fault(
-                        f"link {link!r}", "it is its own ancestor", "Close loops by [[loop]]"
-                    )
-                seen.add(at)
-        if WORLD in links and (roots[0] != WORLD or base != "fixed"):
             raise self.fault(
-                f"link {WORLD!r}",
-                f"{WORLD!r} is reserved for the ground, but here it moves",
-                'Rename the link, or use base = "fixed"',
+                f"link {at!r}",
+                f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a ring",
+                "Close loops by [[loop]] in a TOML description",
             )
+        for reserved in (WORLD, UNIVERSE):
+            if reserved in links and (roots[0] != reserved or base != "fixed"):
+                raise self.fault(
+                    f"link {reserved!r}",
+                    f"{reserved!r} is reserved for the ground, but here it moves",
+                    'Rename the link, or use base = "fixed"'
+                    if roots[0] == reserved
+                    else "Rename the link",
+                )
 
-    def joint(self, name: str, joint: Element) -> None:
+    def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
         where = f"joint {name!r}"
+        if name == UNIVERSE or (name == ROOT_JOINT and base != "fixed"):
+            raise self.fault(
+                where,
+                f"the name {name!r} is reserved"
+                + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
+                "Rename the joint",
+            )
         self.children(joint, where)
         kind = joint.get("type")
         if kind not in JOINT_TYPES:
@@ -288,35 +387,73 @@ class _Checker:
                 where, f"unknown joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
             )
         self.origin(joint, where)
-        if joint.find("mimic") is not None:
+        mimic = joint.find("mimic")
+        if mimic is not None and not locked and kind != "fixed":
             raise self.fault(
                 where,
                 "<mimic> (a coupling of two joints) is not read by this version",
-                "Remove it, or lock the joint",
+                "Remove it, or name the joint in lock in a TOML description",
             )
+        if mimic is not None:
+            joint.remove(mimic)
+        self.axis(joint, kind, where)
+        self.limit(joint, kind, where)
+        self.dynamics(joint, kind, where, locked)
+
+    def axis(self, joint: Element, kind: str, where: str) -> None:
         axis = joint.find("axis")
-        turns = axis is not None and kind in WITH_AXIS
-        if axis is not None and turns and not any(self.numbers(axis, "xyz", 3, where)):
+        if axis is not None and kind not in WITH_AXIS:
+            joint.remove(axis)
+            axis = None
+        direction = [1.0, 0.0, 0.0] if axis is None else self.numbers(axis, "xyz", 3, where)
+        if not any(direction):
             raise self.fault(where, "its axis is zero", "Give a direction")
+        if axis is not None:
+            # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
+            length = math.hypot(*direction)
+            direction = [component / length for component in direction]
+            axis.set("xyz", " ".join(map(repr, direction)))
+        if kind == "planar" and (direction[:2] != [0.0, 0.0] or direction[2] < 0.0):
+            given = " (the default of URDF)" if axis is None else ""
+            raise self.fault(
+                where,
+                f"the normal of a planar joint is read along z only, not {direction}{given}",
+                'Write <axis xyz="0 0 1"/> and turn the joint by <origin rpy=...>',
+            )
+
+    def limit(self, joint: Element, kind: str, where: str) -> None:
         limit = joint.find("limit")
-        if kind in ("revolute", "prismatic"):
-            if limit is None:
+        if limit is None:
+            if kind in ("revolute", "prismatic"):
                 raise self.fault(
                     where,
                     f"a {kind} joint needs <limit lower upper effort velocity>",
-                    'Add it, or use type="continuous" for an unlimited angle',
+                    'Add it, or use type="continuous" for an unlimited angle'
+                    if kind == "revolute"
+                    else "Add it",
                 )
-            for key in ("effort", "velocity"):
-                self.numbers(limit, key, 1, where)
-        if limit is not None:
-            for key in limit.attrib:
-                self.numbers(limit, key, 1, where)
+            return
+        for key in limit.attrib:
+            self.numbers(limit, key, 1, where)
+        if kind not in ("revolute", "continuous", "prismatic"):
+            joint.remove(limit)
+            return
+        for key in ("effort", "velocity"):
+            if limit.get(key) is None and kind == "continuous":
+                limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
+            (value,) = self.numbers(limit, key, 1, where)
+            if value < 0.0:
+                raise self.fault(
+                    where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
+                )
+
+    def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
         dynamics = joint.find("dynamics")
         if dynamics is None:
             return
         for key in dynamics.attrib:
             (value,) = self.numbers(dynamics, key, 1, where)
-            if key == "friction" and value != 0.0 and kind != "fixed":
+            if key == "friction" and value != 0.0 and kind != "fixed" and not locked:
                 raise self.fault(
                     where,
                     f"joint friction ({value:g}) is not simulated by this version",
@@ -324,8 +461,16 @@ class _Checker:
                 )
             if key == "damping" and value < 0.0:
                 raise self.fault(where, f"the damping {value:g} is negative", "Give a value >= 0")
-            if key not in ("damping", "friction") and value != 0.0:
-                self.notes.append(f"{where}: <dynamics {key}> is no URDF attribute and is ignored")
+            if key == "damping" and value != 0.0 and kind in ("floating", "planar") and not locked:
+                raise self.fault(
+                    where,
+                    f"the damping ({value:g}) of a {kind} joint is not simulated by this version",
+                    "Set it to 0; that of one-degree joints acts",
+                )
+        # What is left acts nowhere: it is zero, or the joint does not move.
+        dynamics.attrib.pop("friction", None)
+        if not dynamics.attrib:
+            joint.remove(dynamics)
 
 
 def parse_urdf(text: str, file: str) -> Element:
@@ -339,7 +484,7 @@ def parse_urdf(text: str, file: str) -> Element:
     try:
         return SafeTree.fromstring(text)  # type: ignore[no-any-return]
     except ParseError as error:
-        hint = None
+        hint = "Correct the file there"
         prefix = re.search(r"unbound prefix", str(error))
         if prefix:
             hint = "An element with a namespace prefix, such as <drake:...>, is not read"
@@ -359,30 +504,80 @@ ROOT_JOINTS: dict[str, Callable[[], Any] | None] = {
 }
 
 
-def _check_inertia(model: pin.Model, file: str) -> None:
-    """Refuse a joint that moves no inertia at all: its equation of motion has no solution."""
+def check_inertia(model: pin.Model, file: str) -> None:
+    """Refuse joints that move no inertia: the equations of motion have no solution.
+
+    Raises
+    ------
+    InputError
+        Naming the joint and the links that it moves.
+    """
+    if model.nv == 0:
+        return
     moved = np.zeros((model.njoints, 2))
     for joint in range(model.njoints - 1, 0, -1):
         inertia = model.inertias[joint]
         moved[joint] += inertia.mass, np.trace(inertia.inertia)
         moved[model.parents[joint]] += moved[joint]
+
+    def links(joint: int) -> str:
+        return ", ".join(
+            repr(f.name)
+            for f in model.frames
+            if f.parentJoint == joint and f.type == pin.FrameType.BODY
+        )
+
     for joint in range(1, model.njoints):
         if not moved[joint].any():
-            links = [
-                f.name
-                for f in model.frames
-                if f.parentJoint == joint and f.type == pin.FrameType.BODY
-            ]
             raise InputError(
-                f"neither {', '.join(map(repr, links))} nor anything behind it has inertia",
+                f"neither {links(joint)} nor anything behind it has inertia",
                 file=file,
                 element=f"joint {model.names[joint]!r}",
                 remedy="Give the moving end of the chain an <inertial>",
             )
+    # A joint may move mass and yet no inertia, as one whose axis runs through a point mass.  The
+    # pivots of M, tips first, show it; they are those of the articulated inertias over M_ii.
+    rng = np.random.default_rng(0)
+    q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
+    with np.errstate(all="ignore"):
+        M = pin.crba(model, model.createData(), q)
+        M = (np.triu(M) + np.triu(M, 1).T)[::-1, ::-1]
+        size = np.sqrt(np.diag(M))
+        scaled = M / size[:, None] / size
+    if not np.isfinite(M).all():
+        raise InputError(
+            "the mass matrix is not finite",
+            file=file,
+            remedy="Check the size of the masses, inertias and lengths",
+        )
+    bad = np.flatnonzero(~(size > 0.0))
+    if bad.size:
+        failed = int(bad[0])
+    else:
+        factor, info = dpotrf(scaled, lower=1)
+        small = np.flatnonzero(np.diag(factor)[: info - 1 if info else None] ** 2 < NO_INERTIA)
+        if not small.size and not info:
+            return
+        failed = int(small[0]) if small.size else info - 1
+    component = model.nv - 1 - failed
+    joint = next(i for i in range(1, model.njoints) if component < _velocity_end(model, i))
+    raise InputError(
+        f"the joint moves mass ({links(joint)} and what is behind it) but no inertia in one of "
+        "its directions: its acceleration is not determined",
+        file=file,
+        element=f"joint {model.names[joint]!r}",
+        remedy="Give a moment of inertia, or a centre of mass off the axis",
+    )
 
 
-def build_urdf(text: str, file: str, base: str) -> UrdfModel:
+def _velocity_end(model: pin.Model, joint: int) -> int:
+    return int(model.joints[joint].idx_v + model.joints[joint].nv)
+
+
+def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> UrdfModel:
     """Check ``text`` and build its tree on a fixed, floating or planar base.
+
+    Inertias are checked by :func:`check_inertia`, after locking.
 
     Parameters
     ----------
@@ -391,6 +586,8 @@ def build_urdf(text: str, file: str, base: str) -> UrdfModel:
     base
         ``fixed``, ``floating`` (root joint ``root_joint``, a free flyer) or ``planar`` (motion in
         the x-y plane of the world).
+    locked
+        Joints that will be locked: friction and ``<mimic>`` do not matter there.
 
     Raises
     ------
@@ -398,7 +595,9 @@ def build_urdf(text: str, file: str, base: str) -> UrdfModel:
         Naming the file, the element and the remedy.
     """
     checker = _Checker(file)
-    checker.check(parse_urdf(text, file), base)
+    root = parse_urdf(text, file)
+    checker.check(root, base, locked)
+    text = tostring(root, encoding="unicode")
     root_joint = ROOT_JOINTS[base]
     try:
         if root_joint is None:
@@ -407,7 +606,6 @@ def build_urdf(text: str, file: str, base: str) -> UrdfModel:
             model = pin.buildModelFromXML(text, root_joint())
     except Exception as error:  # Boost.Python raises whatever Pinocchio throws
         raise InputError(f"Pinocchio cannot read it: {error}", file=file) from error
-    _check_inertia(model, file)
     for note in checker.notes:
         log.info("%s: %s", file, note)
     return UrdfModel(model, tuple(checker.notes))

@@ -1,0 +1,730 @@
+"""Bad descriptions, URDFs and arguments: one clear error each, naming file, element and remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+
+URDF = """<?xml version="1.0"?>
+<robot name="two_bars">
+  <link name="base"/>
+  <link name="crank">
+    <inertial>
+      <origin xyz="0.5 0 0" rpy="0 0 0"/>
+      <mass value="1"/>
+      <inertia ixx="0.001" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+  <link name="rod">
+    <inertial>
+      <origin xyz="0.75 0 0"/>
+      <mass value="1.5"/>
+      <inertia ixx="0.002" iyy="0.3" izz="0.3" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+  <joint name="hinge" type="revolute">
+    <parent link="base"/>
+    <child link="crank"/>
+    <origin xyz="0 0 0" rpy="0 0 0"/>
+    <axis xyz="0 -1 0"/>
+    <limit lower="-10" upper="10" effort="1" velocity="1"/>
+    <dynamics damping="0.5"/>
+  </joint>
+  <joint name="knee" type="continuous">
+    <parent link="crank"/>
+    <child link="rod"/>
+    <origin xyz="1 0 0"/>
+    <axis xyz="0 -1 0"/>
+  </joint>
+</robot>
+"""
+
+TOML = """format = 1
+name = "two_bars"
+urdf = "two_bars.urdf"
+base = "fixed"
+gravity = [0.0, 0.0, -9.81]
+lock = []
+
+[[loop]]
+name = "pin"
+type = "point_on_line"
+a = { link = "rod", xyz = [1.5, 0.0, 0.0] }
+b = { link = "world" }
+axis = [1.0, 0.0, 0.0]
+
+[initial]
+q = { hinge = 1.0 }
+v = { hinge = 2.0 }
+guess = { knee = -1.6 }
+
+[simulation]
+t_end = 1.0
+"""
+
+INERTIAL = """<inertial><origin xyz="1 0 0"/><mass value="1"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>"""
+POINT_MASS = '<inertial><mass value="1"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+
+
+def changed(text: str, old: str, new: str) -> str:
+    assert text.count(old) >= 1, f"{old!r} is not in the text to be changed"
+    return text.replace(old, new, 1)
+
+
+def write(folder: Path, toml: str | bytes = TOML, urdf: str | bytes = URDF) -> Path:
+    for name, content in (("two_bars.urdf", urdf), ("two_bars.toml", toml)):
+        data = content.encode() if isinstance(content, str) else content
+        (folder / name).write_bytes(data)
+    return folder / "two_bars.toml"
+
+
+def refusal(path: Any, *needles: str, file: str | None = None, **options: Any) -> srm.InputError:
+    """The error of ``srm.load(path)``; it names the file, every needle, and a remedy."""
+    with pytest.raises(srm.InputError) as caught:
+        srm.load(path, **options)
+    error = caught.value
+    assert type(error) in (srm.InputError, srm.AssemblyError)
+    text = str(error)
+    expected = Path(path).name if file is None else file
+    assert error.file is not None
+    assert error.file.endswith(expected)
+    assert text.startswith(error.file)
+    for needle in needles:
+        assert needle in text, f"{needle!r} is not in: {text}"
+    assert error.remedy, f"no remedy in: {text}"
+    assert text.endswith(error.remedy)
+    assert "Traceback" not in text
+    assert "pydantic" not in text.lower()
+    return error
+
+
+def loaded_or_refused(path: Path) -> srm.Mechanism | None:
+    """The mechanism of ``path``, or None if that was refused in our own words."""
+    try:
+        return srm.load(path)
+    except srm.SrmWarning:
+        return None
+    except srm.InputError as error:
+        text = str(error)
+    assert str(path.with_suffix("")) in text
+    assert "Pinocchio cannot read" not in text
+    return None
+
+
+@pytest.fixture(autouse=True)
+def parsers_are_silent(capfd: pytest.CaptureFixture[str]) -> Any:
+    """What goes wrong is in the error, and not on the terminal in the words of a C++ library."""
+    yield
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err == ""
+
+
+def test_the_unchanged_mechanism_loads(tmp_path: Path) -> None:
+    mechanism = srm.load(write(tmp_path))
+    assert mechanism.joint_names == ("hinge", "knee")
+    assert mechanism.degrees_of_freedom == 1
+
+
+# --- the description ----------------------------------------------------------------------------
+
+DESCRIPTION_FAULTS = {
+    # key: (old, new, what the message holds)
+    "unknown key": ("base =", "bases =", ("bases", "unknown key", "base, gravity")),
+    "unknown key in a loop": ("axis =", "axes =", ("loop[0].axes", "unknown key", "axis")),
+    "unknown key in an anchor": ('{ link = "world"', '{ lnk = "world"', ("loop[0].b.lnk", "frame")),
+    "unknown key in initial": ("v = {", "w = {", ("initial.w", "q, v, guess")),
+    "unknown key in simulation": ("t_end", "tend", ("simulation.tend", "t_end, rtol, atol")),
+    "unknown table": ("[simulation]", "[simulations]", ("simulations", "unknown key")),
+    "a force": ("[simulation]", '[[force]]\ntype = "torque"\n[simulation]', ("force", "Remove")),
+    "a drive": ("[simulation]", '[[drive]]\njoint = "hinge"\n[simulation]', ("drive", "Remove")),
+    "an SDF": ("urdf =", 'sdf = "a.sdf"\nurdf =', ("sdf", "give a URDF", "Remove")),
+    "an MJCF": ("urdf =", 'mjcf = "a.xml"\nurdf =', ("mjcf", "give a URDF", "Remove")),
+    "no format": ("format = 1\n", "", ("format", "missing", "format = 1")),
+    "a later format": ("format = 1", "format = 2", ("format", "not 2", "format = 1")),
+    "a text for format": ("format = 1", 'format = "1"', ("format", "format = 1")),
+    "no urdf": ('urdf = "two_bars.urdf"\n', "", ("urdf", "missing", "Add it")),
+    "an absent urdf": ("two_bars.urdf", "other.urdf", ("'other.urdf'", "no such file", "relative")),
+    "a folder as urdf": ('"two_bars.urdf"', '"."', ("urdf", "irectory", "relative")),
+    "an empty urdf": ('"two_bars.urdf"', '""', ("urdf", "irectory", "relative")),
+    "a null in urdf": ("two_bars.urdf", "two\\u0000bars.urdf", ("urdf", "no file name")),
+    "an overlong urdf": ("two_bars.urdf", "a" * 5000, ("urdf", "cannot be read")),
+    "an unknown base": ('"fixed"', '"fixd"', ("base", "'fixed', 'floating' or 'planar'", "'fixd'")),
+    "a number for base": ('"fixed"', "1", ("base", "'floating'")),
+    "short gravity": ("[0.0, 0.0, -9.81]", "[0.0, -9.81]", ("gravity", "3 items")),
+    "long gravity": ("[0.0, 0.0, -9.81]", "[0, 0, 0, -9.81]", ("gravity", "3 items")),
+    "scalar gravity": ("[0.0, 0.0, -9.81]", "-9.81", ("gravity", "a list is wanted")),
+    "a text in gravity": ("-9.81]", '"down"]', ("gravity[2]", "'down'", "finite number")),
+    "nan gravity": ("-9.81]", "nan]", ("gravity[2]", "nan", "finite number")),
+    "infinite gravity": ("-9.81]", "-inf]", ("gravity[2]", "-inf", "finite number")),
+    "a huge gravity": ("-9.81]", "1e200]", ("gravity[2]", "1e+200", "finite number")),
+    "a huge integer": ("-9.81]", "1" + "0" * 400 + "]", ("gravity[2]", "finite number")),
+    "an endless integer": ("-9.81]", "1" + "0" * 9000 + "]", ("TOML",)),
+    "a text for lock": ("lock = []", 'lock = "knee"', ("lock", "a list is wanted")),
+    "an unknown lock": ("lock = []", 'lock = ["kneee"]', ("lock", "'kneee'", "hinge, knee")),
+    "a fixed twice": ("lock = []", 'lock = ["knee", "knee"]', ("lock", "'knee'", "twice")),
+    "a link in lock": ("lock = []", 'lock = ["rod"]', ("lock", "'rod'", "hinge, knee")),
+    "a locked rate": ("lock = []", 'lock = ["hinge"]', ("'hinge'", "initial.v", "Remove the rate")),
+    "one bracket": ("[[loop]]", "[loop]", ("loop", "a list is wanted", "[[")),
+    "no loop type": ('type = "point_on_line"\n', "", ("loop[0].type", "missing")),
+    "an unknown loop type": (
+        '"point_on_line"',
+        '"pointonline"',
+        ("loop[0].type", "'pointonline'", "point_on_line, point_on_plane"),
+    ),
+    "a number for type": ('"point_on_line"', "3", ("loop[0].type", "a text is wanted")),
+    "no anchor": ('b = { link = "world" }\n', "", ("loop[0].b", "missing")),
+    "an anchor that is a text": ('{ link = "world" }', '"world"', ("loop[0].b", "a table")),
+    "an empty anchor": ('{ link = "world" }', "{}", ("'pin', anchor b", "link or a frame")),
+    "link and frame": (
+        '{ link = "world" }',
+        '{ link = "world", frame = "universe" }',
+        ("'pin', anchor b", "not both"),
+    ),
+    "an unknown link": ('"rod",', '"rd",', ("'pin', anchor a", "'rd'", "crank, rod, world")),
+    "a joint as link": ('"rod",', '"knee",', ("'pin', anchor a", "'knee'", "crank, rod, world")),
+    "an unknown frame": (
+        'link = "world"',
+        'frame = "wrld"',
+        ("'pin', anchor b", "there is no frame 'wrld'", "knee"),
+    ),
+    "short xyz": ("[1.5, 0.0, 0.0]", "[1.5, 0.0]", ("loop[0].a.xyz", "3 items")),
+    "nan xyz": ("[1.5, 0.0, 0.0]", "[nan, 0, 0]", ("loop[0].a.xyz[0]", "finite number")),
+    "huge xyz": ("[1.5, 0.0, 0.0]", "[1e300, 0, 0]", ("loop[0].a.xyz[0]", "finite number")),
+    "xyz as in URDF": ("[1.5, 0.0, 0.0]", '"1.5 0 0"', ("loop[0].a.xyz", "a list is wanted")),
+    "no axis": ("axis = [1.0, 0.0, 0.0]\n", "", ("'pin'", "needs an axis", "axis = [x, y, z]")),
+    "a zero axis": ("axis = [1.0", "axis = [0.0", ("'pin'", "axis is zero", "direction")),
+    "a superfluous axis": ('"point_on_line"', '"point"', ("'pin'", "takes no axis", "Remove")),
+    "both ends on one body": (
+        '"world" }',
+        '"rod" }',
+        ("'pin'", "same body", "two bodies that move"),
+    ),
+    "an unknown joint in q": ("hinge = 1.0", "hing = 1.0", ("initial.q", "'hing'", "hinge, knee")),
+    "an unknown joint in v": ("hinge = 2.0", "hing = 2.0", ("initial.v", "'hing'", "hinge, knee")),
+    "an unknown guess": ("knee = -1.6", "kne = 0", ("initial.guess", "'kne'", "hinge, knee")),
+    "held and guessed": ("knee = -1.6", "hinge = 1.0", ("initial.guess", "'hinge'", "Keep one")),
+    "a text as angle": ("hinge = 1.0", 'hinge = "1"', ("initial.q.hinge", "'1'", "finite number")),
+    "true as angle": ("hinge = 1.0", "hinge = true", ("initial.q.hinge", "True", "finite number")),
+    "nan as angle": ("hinge = 1.0", "hinge = nan", ("initial.q.hinge", "nan", "finite number")),
+    "a table as angle": ("hinge = 1.0", "hinge = {}", ("initial.q.hinge", "finite number")),
+    "a date as angle": ("= 1.0", "= 1979-05-27", ("initial.q.hinge", "finite number")),
+    "no angle": ("hinge = 1.0", "hinge = []", ("initial.q.hinge", "[]", "finite number")),
+    "two angles": ("= 1.0 }", "= [1, 2] }", ("initial.q", "'hinge'", "[1.0, 2.0]", "rad or m")),
+    "two guesses": ("= -1.6", "= [1, 2]", ("initial.guess", "'knee'", "[1.0, 2.0]", "rad or m")),
+    "two rates": ("= 2.0", "= [1, 2]", ("initial.v", "'hinge'", "[1.0, 2.0]", "rad/s or m/s")),
+    "a list as initial": ("[initial]", "[[initial]]", ("initial", "a table is wanted")),
+    "negative t_end": ("t_end = 1.0", "t_end = -1", ("simulation.t_end", "greater than 0")),
+    "zero rtol": ("t_end = 1.0", "rtol = 0", ("simulation.rtol", "greater than 0")),
+    "infinite t_end": ("t_end = 1.0", "t_end = inf", ("simulation.t_end", "finite number")),
+    "a text as atol": ("t_end = 1.0", 'atol = "1"', ("simulation.atol", "finite number")),
+    "a number as name": ('"two_bars"', "2", ("name", "a text is wanted", "quotes")),
+    "a key twice": ("base =", "name = 'x'\nbase =", ("TOML", "line")),
+    "broken TOML": ("format = 1", "format = = 1", ("TOML", "line 1")),
+    "endless nesting": ("lock = []", "lock = " + "[" * 20000, ("TOML",)),
+}
+
+
+@pytest.mark.parametrize("fault", DESCRIPTION_FAULTS)
+def test_a_faulty_description_is_refused_by_key(fault: str, tmp_path: Path) -> None:
+    old, new, needles = DESCRIPTION_FAULTS[fault]
+    refusal(write(tmp_path, changed(TOML, old, new)), *needles)
+
+
+@pytest.mark.parametrize("name", ["float_arm", "int_1", "function_x", "constrained", "list[a]"])
+def test_a_key_is_named_even_where_it_resembles_a_type(name: str, tmp_path: Path) -> None:
+    path = write(tmp_path, changed(TOML, "hinge = 1.0", f'"{name}" = "x"'))
+    refusal(path, f"initial.q.{name}:")
+
+
+def test_a_loop_without_name_is_called_by_its_number(tmp_path: Path) -> None:
+    text = changed(changed(TOML, 'name = "pin"\n', ""), "axis = [1.0", "axis = [0.0")
+    refusal(write(tmp_path, text), "loop", "the axis is zero")
+    text = changed(changed(TOML, 'name = "pin"\n', ""), '{ link = "world" }', "{ }")
+    refusal(write(tmp_path, text), "loop[0], anchor b", "link or a frame")
+
+
+LOOP = TOML[TOML.index("[[loop]]") : TOML.index("[initial]")]
+
+
+def test_a_loop_name_used_twice_is_refused(tmp_path: Path) -> None:
+    refusal(write(tmp_path, changed(TOML, "[initial]", LOOP + "[initial]")), "'pin'", "twice")
+
+
+def test_a_default_loop_name_used_twice_is_refused(tmp_path: Path) -> None:
+    nameless = changed(LOOP, 'name = "pin"\n', "")
+    text = changed(TOML, LOOP, nameless + nameless)
+    refusal(write(tmp_path, text), "'point_on_line_rod_world'", "Give every loop its own name")
+
+
+def test_a_frame_name_with_two_meanings_is_refused(tmp_path: Path) -> None:
+    # A joint called as the link of the other joint: the two frames differ.
+    urdf = URDF.replace('"hinge"', '"rod"')
+    text = TOML.replace("hinge", "rod").replace('link = "rod"', 'frame = "rod"')
+    refusal(write(tmp_path, text, urdf), "loop[0].a.frame", "'rod'", "write link =")
+
+
+def test_locking_everything_leaves_nothing_to_simulate(tmp_path: Path) -> None:
+    text = TOML.replace("lock = []", 'lock = ["hinge", "knee"]').replace("v = { hinge = 2.0 }", "")
+    refusal(write(tmp_path, text.replace(LOOP, "")), "can move", "locked")
+
+
+def test_a_loop_that_locking_holds_open_names_the_locked_joints(tmp_path: Path) -> None:
+    text = TOML.replace("lock = []", 'lock = ["knee"]').replace("knee = -1.6", "knee = 0.3")
+    error = refusal(write(tmp_path, text), "'hinge'", "pin: 2.29 m", "Locked", "'knee'")
+    # The height of the tip.
+    height = np.sin(1.0) + 1.5 * np.sin(1.3)
+    assert isinstance(error, srm.AssemblyError)
+    assert error.residuals == {"pin": (pytest.approx(height, rel=1e-12), None)}
+    assert error.held == ("hinge",)
+
+
+def test_a_loop_within_a_locked_body_is_refused(tmp_path: Path) -> None:
+    text = TOML.replace("lock = []", 'lock = ["knee"]').replace("knee = -1.6", "knee = 0.3")
+    refusal(write(tmp_path, text.replace('"world"', '"crank"')), "'pin'", "same body")
+
+
+def test_cutting_a_description_anywhere_raises_nothing_else(tmp_path: Path) -> None:
+    for at in range(0, len(TOML), 7):
+        for text in (TOML[:at], TOML[:at] + TOML[at + 5 :]):
+            loaded_or_refused(write(tmp_path, text))
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".toml", ".urdf"])
+def test_an_absent_file_is_named(suffix: str, tmp_path: Path) -> None:
+    refusal(tmp_path / f"absent{suffix}", "no such file", "Check the path")
+
+
+@pytest.mark.parametrize("name", ["folder.toml", "folder.urdf", "folder"])
+def test_a_folder_is_not_a_mechanism(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).mkdir()
+    refusal(tmp_path / name, "irectory")
+
+
+@pytest.mark.parametrize("suffix", [".toml", ".urdf"])
+def test_an_unreadable_file_is_named(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(*_: Any, **__: Any) -> str:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", denied)
+    refusal(tmp_path / f"secret{suffix}", "cannot be read: Permission denied", "readable file")
+
+
+@pytest.mark.parametrize("suffix", [".toml", ".urdf"])
+@pytest.mark.parametrize(
+    "content", [bytes(range(256)), TOML.encode("utf-16"), b"\xff\xfe", "grün".encode("latin-1")]
+)
+def test_a_file_that_is_not_utf8_is_named(content: bytes, suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"binary{suffix}"
+    path.write_bytes(content)
+    refusal(path, "not UTF-8", "Save it as UTF-8")
+
+
+@pytest.mark.parametrize("content", [b"\0\0\0\0", b"\x7fELF\x02\x01", b"hello", b""])
+@pytest.mark.parametrize("suffix", [".toml", ".urdf"])
+def test_a_file_of_another_kind_is_named(content: bytes, suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"other{suffix}"
+    path.write_bytes(content)
+    refusal(path)
+
+
+def test_a_binary_urdf_is_named_with_the_description(tmp_path: Path) -> None:
+    refusal(write(tmp_path, urdf=bytes(range(256))), "two_bars.urdf", "not UTF-8")
+
+
+@pytest.mark.parametrize("name", ["robot.sdf", "robot.xml", "robot.yaml", "robot.urdf.xacro"])
+def test_files_of_other_formats_are_refused_by_their_type(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).write_text("<robot/>")
+    refusal(tmp_path / name, Path(name).suffix, ".toml description or a .urdf")
+    monkeypatch.chdir(tmp_path)
+    refusal(name, Path(name).suffix, ".toml description or a .urdf")
+
+
+@pytest.mark.parametrize("name", ["slider-crank", "", "n_four_bar_0", "n_four_bar_x", "Four_bar"])
+def test_an_unknown_bundled_name_lists_the_known_ones(name: str) -> None:
+    with pytest.raises(srm.InputError) as caught:
+        srm.load(name)
+    for needle in (repr(name), "slider_crank", "four_bar", ".toml or .urdf path"):
+        assert needle in str(caught.value)
+
+
+@pytest.mark.parametrize("path", [None, 3, 1.5, "a\0b.toml", "a\0b.urdf", "a\0b", "/\0"])
+def test_what_cannot_be_a_path_is_refused(path: Any) -> None:
+    with pytest.raises(srm.InputError):
+        srm.load(path)
+
+
+@pytest.mark.parametrize("n", [0, -1, 1.5, "2", None])
+def test_an_n_four_bar_needs_a_positive_number_of_loops(n: Any) -> None:
+    with pytest.raises(srm.InputError, match="n >= 1"):
+        srm.n_four_bar(n)
+
+
+# --- arguments ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "gravity",
+    [
+        "down",
+        9.81,
+        [],
+        [0.0, -9.81],
+        [0.0, 0.0, 0.0, -9.81],
+        [0.0, 0.0, "x"],
+        [0.0, 0.0, float("nan")],
+        [0.0, 0.0, float("-inf")],
+        [0.0, 0.0, 1e200],
+        [0, 0, 10**400],
+        [[0.0], [0.0], [1.0]],
+        [0.0, [0.0, 1.0], 0.0],
+        {"z": -9.81},
+        object(),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_a_gravity_that_is_not_three_finite_numbers_is_refused(
+    gravity: Any, tmp_path: Path
+) -> None:
+    refusal(write(tmp_path), "gravity", "three finite numbers", "m/s^2", gravity=gravity)
+
+
+@pytest.mark.parametrize("base", ["", "Fixed", 1, ["fixed"], True, b"fixed"], ids=repr)
+def test_an_unknown_base_is_refused(base: Any, tmp_path: Path) -> None:
+    refusal(write(tmp_path), "base", repr(base), "fixed, floating, planar", base=base)
+
+
+# --- the URDF -----------------------------------------------------------------------------------
+
+END = "</robot>"
+LINK_C = f'<link name="c">{INERTIAL}</link>'
+
+
+def joint_c(kind: str, inside: str = "", link: str = LINK_C, name: str = "c") -> str:
+    ends = '<parent link="rod"/><child link="c"/>'
+    return f'{link}<joint name="{name}" type="{kind}">{ends}{inside}</joint>{END}'
+
+
+AXIS = '<axis xyz="0 -1 0"/>\n    <limit'
+URDF_FAULTS = {
+    # loops and couplings of other tools
+    "loop_joint": (END, '<loop_joint name="l"/>' + END, ("<loop_joint>", "[[loop]]", "remove")),
+    "loop": (END, '<loop name="l"/>' + END, ("<loop>", "[[loop]]")),
+    "constraint": (END, '<constraint name="l"/>' + END, ("<constraint>", "[[loop]]")),
+    "coupling": (END, '<coupling name="l"/>' + END, ("<coupling>", "[[loop]]")),
+    "loop in a joint": (AXIS, "<loop/>" + AXIS, ("'hinge', <loop>", "[[loop]]")),
+    "drake with a namespace": (
+        END,
+        '<drake:loop_joint xmlns:drake="http://drake.mit.edu"/>' + END,
+        ("<loop_joint>", "[[loop]]"),
+    ),
+    "drake bushing": (
+        END,
+        '<drake:linear_bushing_rpy xmlns:drake="http://drake.mit.edu"/>' + END,
+        ("<linear_bushing_rpy>", "remove"),
+    ),
+    "drake without a namespace": (END, "<drake:loop/>" + END, ("unbound prefix", "<drake:...>")),
+    "gazebo joint": (
+        END,
+        '<gazebo><joint name="x" type="revolute"/></gazebo>' + END,
+        ("<gazebo><joint> 'x'", "[[loop]]"),
+    ),
+    "gazebo joint inside a model": (
+        END,
+        '<gazebo><model><joint name="x"><child>rod</child></joint></model></gazebo>' + END,
+        ("<gazebo><joint> 'x'", "[[loop]]"),
+    ),
+    "mimic": (AXIS, '<mimic joint="knee"/>' + AXIS, ("'hinge'", "<mimic>", "lock")),
+    "xacro": (
+        END,
+        '<xacro:macro xmlns:xacro="http://wiki.ros.org/xacro"/>' + END,
+        ("<xacro:macro>", "Run xacro"),
+    ),
+    # elements and attributes
+    "unknown element": (END, "<lnk/>" + END, ("<lnk>", "unknown element", "link, joint")),
+    "unknown element in a link": ("<inertial>", "<inertal/><inertial>", ("'crank'", "<inertal>")),
+    "unknown element in a joint": (AXIS, "<axes/>" + AXIS, ("'hinge'", "<axes>", "axis")),
+    "unknown element in inertial": ("<mass", "<weight/><mass", ("'crank'", "<weight>", "mass")),
+    "origin in a link": (
+        '<link name="base"/>',
+        '<link name="base"><origin xyz="0 0 1"/></link>',
+        ("'base'", "<origin> in <link>"),
+    ),
+    "xzy": ('xyz="0.5', 'xzy="0.5', ("'crank'", "'xzy'", "xyz, rpy")),
+    "xzy in a joint": ('xyz="1 0 0"/>', 'xzy="1 0 0"/>', ("'knee'", "'xzy'", "xyz, rpy")),
+    "xzy in an axis": ('axis xyz="0', 'axis xzy="0', ("'hinge'", "'xzy'", "xyz")),
+    "valeu": ("mass value", "mass valeu", ("'crank'", "'valeu'", "Known: value")),
+    "ixz twice": ('ixy="0"', 'ixyy="0"', ("'crank'", "'ixyy'", "ixx")),
+    "lnk": ("parent link", "parent lnk", ("'hinge'", "<parent link=...>")),
+    "lowr": ("lower", "lowr", ("'hinge'", "'lowr'", "lower, upper")),
+    "dampin": ("damping", "dampin", ("'hinge'", "'dampin'", "damping, friction")),
+    "type of a robot": ("two_bars", "", ("<robot>", "has no name")),
+    "a later version": ('"two_bars"', '"two_bars" version="2.0"', ("version '2.0'", "1.0")),
+    "a default namespace": ('"two_bars"', '"two_bars" xmlns="http://x"', ("xmlns", "Remove")),
+    "two masses": ('<mass value="1"/>', '<mass value="1"/><mass value="2"/>', ("'crank'", "twice")),
+    "two inertials": ("<inertial>", INERTIAL + "<inertial>", ("'crank'", "<inertial>", "twice")),
+    "two axes": (AXIS, '<axis xyz="1 0 0"/>' + AXIS, ("'hinge'", "<axis>", "twice")),
+    "two children": ('<child link="crank"/>', '<child link="crank"/>' * 2, ("'hinge'", "<child>")),
+    # numbers
+    "nan mass": ('mass value="1"', 'mass value="nan"', ("'crank'", "mass", "'nan'", "finite")),
+    "infinite mass": ('mass value="1"', 'mass value="inf"', ("'crank'", "mass", "'inf'", "finite")),
+    "overflowing mass": ('mass value="1"', 'mass value="1e400"', ("'crank'", "'1e400'", "finite")),
+    "huge mass": ('mass value="1"', 'mass value="1e31"', ("'crank'", "'1e31'", "finite")),
+    "negative mass": ('mass value="1"', 'mass value="-1"', ("'crank'", "-1 kg", ">= 0")),
+    "textual mass": ('mass value="1"', 'mass value="one"', ("'crank'", "'one'", "finite")),
+    "empty mass": ('mass value="1"', 'mass value=""', ("'crank'", "mass", "''", "finite")),
+    "mass with a unit": ('mass value="1"', 'mass value="1 kg"', ("'crank'", "'1 kg'", "finite")),
+    "decimal comma": ('mass value="1"', 'mass value="1,5"', ("'crank'", "'1,5'", "finite")),
+    "grouped digits": ('mass value="1"', 'mass value="1_0"', ("'crank'", "'1_0'", "finite")),
+    "hexadecimal mass": ('mass value="1"', 'mass value="0x1"', ("'crank'", "'0x1'", "finite")),
+    "other digits": ('mass value="1"', 'mass value="\uff11"', ("'crank'", "finite")),
+    "no mass": ('<mass value="1"/>', "", ("'crank'", "no <mass>", "Add it")),
+    "no mass value": ('<mass value="1"/>', "<mass/>", ("'crank'", "<mass> has no 'value'")),
+    "no inertia": (
+        '<inertia ixx="0.001" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>',
+        "",
+        ("'crank'", "no <inertia>", "Add it"),
+    ),
+    "no iyz": (' iyz="0"', "", ("'crank'", "<inertia> has no 'iyz'")),
+    "nan inertia": ('iyy="0.1"', 'iyy="nan"', ("'crank'", "iyy", "'nan'")),
+    "negative inertia": ('iyy="0.1"', 'iyy="-0.1"', ("'crank'", "negative", "<inertia>")),
+    "indefinite inertia": ('ixy="0"', 'ixy="0.2"', ("'crank'", "principal", "negative")),
+    "two coordinates": ('xyz="0.5 0 0"', 'xyz="0.5 0"', ("'crank'", "'0.5 0'", "3 finite")),
+    "four coordinates": ('xyz="1 0 0"', 'xyz="1 0 0 0"', ("'knee'", "'1 0 0 0'", "3 finite")),
+    "commas": ('xyz="1 0 0"', 'xyz="1, 0, 0"', ("'knee'", "'1, 0, 0'", "3 finite")),
+    "nan rpy": (
+        'rpy="0 0 0"/>\n    <axis',
+        'rpy="0 0 nan"/>\n    <axis',
+        ("'hinge'", "rpy", "nan"),
+    ),
+    "zero axis": ("0 -1 0", "0 0 0", ("'hinge'", "axis is zero", "direction")),
+    "nan axis": ("0 -1 0", "0 nan 0", ("'hinge'", "'0 nan 0'", "3 finite")),
+    "nan limit": ('lower="-10"', 'lower="nan"', ("'hinge'", "lower", "'nan'")),
+    "negative effort": ('effort="1"', 'effort="-1"', ("'hinge'", "effort = -1", ">= 0")),
+    "negative velocity": ('velocity="1"', 'velocity="-2"', ("'hinge'", "velocity = -2", ">= 0")),
+    "negative damping": ('"0.5"', '"-0.5"', ("'hinge'", "damping -0.5", ">= 0")),
+    "nan damping": ('"0.5"', '"nan"', ("'hinge'", "damping", "'nan'")),
+    "friction": ('"0.5"', '"0.5" friction="0.1"', ("'hinge'", "friction (0.1)", "Set it to 0")),
+    "negative friction": ('"0.5"', '"0.5" friction="-1"', ("'hinge'", "friction (-1)")),
+    # the tree
+    "no limit": (
+        '<limit lower="-10" upper="10" effort="1" velocity="1"/>',
+        "",
+        ("'hinge'", "<limit", "continuous"),
+    ),
+    "no effort": (' effort="1"', "", ("'hinge'", "<limit> has no 'effort'")),
+    "no joint type": (' type="revolute"', "", ("'hinge'", "None", "revolute, continuous")),
+    "unknown joint type": ('"revolute"', '"hinge"', ("'hinge'", "joint type", "revolute, cont")),
+    "ball joint": (END, joint_c("spherical"), ("'c'", "'spherical'", "revolute, continuous")),
+    "planar along x": (
+        END,
+        joint_c("planar"),
+        ("'c'", "planar", "default of URDF", '<axis xyz="0 0 1"/>'),
+    ),
+    "planar along y": (
+        END,
+        joint_c("planar", '<axis xyz="0 1 0"/>'),
+        ("'c'", "planar", "[0.0, 1.0, 0.0]", '<axis xyz="0 0 1"/>'),
+    ),
+    "planar downwards": (
+        END,
+        joint_c("planar", '<axis xyz="0 0 -1"/>'),
+        ("'c'", "planar", '<axis xyz="0 0 1"/>'),
+    ),
+    "damped floating joint": (
+        END,
+        joint_c("floating", '<dynamics damping="2"/>'),
+        ("'c'", "damping (2)", "floating", "Set it to 0"),
+    ),
+    "joint without name": ('name="hinge" ', "", ("<joint>", "no name", "Give name")),
+    "link without name": ('<link name="base"/>', "<link/>", ("<link>", "no name", "Give name")),
+    "two joints of one name": ('"knee"', '"hinge"', ("'hinge'", "two joints", "Rename")),
+    "two links of one name": ('<link name="rod"', '<link name="crank"', ("'crank'", "two links")),
+    "no parent": ('<parent link="base"/>', "", ("'hinge'", "<parent link=...>", "parent link")),
+    "unknown parent": ('parent link="base"', 'parent link="bas"', ("'hinge'", "'bas'", "base, c")),
+    "unknown child": ('child link="rod"', 'child link="rd"', ("'knee'", "'rd'", "crank, rod")),
+    "two parents": (
+        END,
+        '<joint name="third" type="fixed"><parent link="base"/><child link="rod"/></joint>' + END,
+        ("'rod'", "child of two joints", "'knee'", "'third'", "[[loop]]"),
+    ),
+    "its own parent": ('parent link="crank"', 'parent link="rod"', ("'rod'", "ancestor")),
+    "ring": ('parent link="base"', 'parent link="rod"', ("ancestor", "ring", "[[loop]]")),
+    "two roots": (END, '<link name="spare"/>' + END, ("base, spare", "exactly one root")),
+    "moving world": (END, joint_c("fixed").replace('"c"', '"world"'), ("'world'", "reserved")),
+    "moving universe": (END, joint_c("fixed").replace('"c"', '"universe"'), ("'universe'",)),
+    "joint called universe": (
+        END,
+        joint_c("fixed", name="universe"),
+        ("'universe'", "reserved", "Rename"),
+    ),
+    # inertia
+    "massless end": (
+        END,
+        joint_c("continuous", link='<link name="c"/>'),
+        ("'c'", "inertia", "<inertial>"),
+    ),
+    "massless chain at the end": (
+        END,
+        joint_c("fixed", link='<link name="c"/><link name="d"/>').replace(END, "")
+        + '<joint name="d" type="prismatic"><parent link="c"/><child link="d"/>'
+        + '<limit effort="1" velocity="1"/></joint>'
+        + END,
+        ("joint 'd'", "inertia", "<inertial>"),
+    ),
+    "point mass on its axis": (
+        END,
+        joint_c("continuous", link=f'<link name="c">{POINT_MASS}</inertial></link>'),
+        ("joint 'c'", "moves mass", "moment of inertia"),
+    ),
+    # the file
+    "another root element": ("<robot", "<model", ("XML", "mismatched tag")),
+    "entities": (
+        '<?xml version="1.0"?>',
+        '<!DOCTYPE robot [<!ENTITY a "b">]>',
+        ("entities", "refused for safety"),
+    ),
+    "truncated": ("</robot>", "", ("XML", "line")),
+    "unquoted attribute": ('"two_bars"', "two_bars", ("XML", "line 2")),
+}
+
+
+@pytest.mark.parametrize("fault", URDF_FAULTS)
+def test_a_faulty_urdf_is_refused_by_element(fault: str, tmp_path: Path) -> None:
+    old, new, needles = URDF_FAULTS[fault]
+    urdf = changed(URDF, old, new)
+    # Both by itself and through a description, whose own faults come later.
+    refusal(write(tmp_path, urdf=urdf).with_suffix(".urdf"), *needles)
+    refusal(tmp_path / "two_bars.toml", *needles, file="two_bars.urdf")
+
+
+@pytest.mark.parametrize("root", ["<sdf version='1.6'/>", "<mujoco/>", "<gazebo/>"])
+def test_another_format_is_recognised_by_its_root_element(root: str, tmp_path: Path) -> None:
+    path = write(tmp_path, urdf=root).with_suffix(".urdf")
+    refusal(path, root[: root.index(" ") if " " in root else -2], "not <robot>", "URDF")
+
+
+def test_a_robot_without_links_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, urdf='<robot name="nothing"/>').with_suffix(".urdf")
+    refusal(path, "there is no <link>")
+
+
+def test_a_robot_that_cannot_move_is_refused(tmp_path: Path) -> None:
+    urdf = f'<robot name="rock"><link name="base">{INERTIAL}</link></robot>'
+    path = write(tmp_path, urdf=urdf).with_suffix(".urdf")
+    refusal(path, "can move", "joint")
+    assert srm.load(path, base="floating").joint_names == ("root_joint",)
+
+
+def test_a_ring_beside_the_tree_is_found(tmp_path: Path) -> None:
+    ring = "".join(
+        f'<link name="r{i}"/><joint name="r{i}" type="fixed"><parent link="r{(i + 1) % 3}"/>'
+        f'<child link="r{i}"/></joint>'
+        for i in range(3)
+    )
+    path = write(tmp_path, urdf=changed(URDF, END, ring + END)).with_suffix(".urdf")
+    refusal(path, "ancestor", "'r", "ring")
+
+
+def with_fixed_chain(links: int) -> str:
+    chain = "".join(
+        f'<link name="l{i}"/><joint name="l{i}" type="fixed">'
+        f'<parent link="{f"l{i - 1}" if i else "rod"}"/><child link="l{i}"/></joint>'
+        for i in range(links)
+    )
+    return changed(URDF, END, chain + END)
+
+
+@pytest.mark.parametrize("links", [1200, 30000])
+def test_a_chain_too_deep_for_the_parser_is_refused_before_it_crashes(
+    links: int, tmp_path: Path
+) -> None:
+    path = write(tmp_path, urdf=with_fixed_chain(links)).with_suffix(".urdf")
+    refusal(path, "more than 1000 joints", "Split the chain")
+
+
+def test_a_deep_chain_loads(tmp_path: Path) -> None:
+    path = write(tmp_path, urdf=with_fixed_chain(900)).with_suffix(".urdf")
+    assert srm.load(path).joint_names == ("hinge", "knee")
+
+
+def test_deeply_nested_xml_does_not_crash(tmp_path: Path) -> None:
+    path = write(tmp_path, urdf="<robot>" * 100_000).with_suffix(".urdf")
+    refusal(path, "XML")
+
+
+@pytest.mark.parametrize("base", ["floating", "planar"])
+def test_a_joint_named_as_the_root_joint_is_refused(base: str, tmp_path: Path) -> None:
+    path = write(tmp_path, urdf=URDF.replace('"knee"', '"root_joint"')).with_suffix(".urdf")
+    refusal(path, "'root_joint'", "reserved", base, "Rename", base=base)
+    assert srm.load(path).joint_names == ("hinge", "root_joint")
+
+
+@pytest.mark.parametrize("base", ["floating", "planar"])
+def test_a_link_called_world_cannot_float(base: str, tmp_path: Path) -> None:
+    urdf = URDF.replace('<link name="base"/>', f'<link name="world">{INERTIAL}</link>')
+    path = write(tmp_path, urdf=urdf.replace('"base"', '"world"')).with_suffix(".urdf")
+    refusal(path, "'world'", "reserved", 'base = "fixed"', base=base)
+    assert srm.load(path).joint_names == ("hinge", "knee")
+
+
+def test_a_floating_base_needs_inertia_about_every_axis(tmp_path: Path) -> None:
+    """Of a massless base, the turn about the first hinge is not determined."""
+    path = write(tmp_path).with_suffix(".urdf")
+    refusal(path, "'root_joint'", "moves mass", "inertia", base="floating")
+
+
+def test_a_point_mass_off_its_axis_is_no_fault(tmp_path: Path) -> None:
+    """Zero principal moments are those of a pendulum's bob."""
+    link = POINT_MASS.replace("<inertial>", '<inertial><origin xyz="0.3 0 0"/>') + "</inertial>"
+    joint = joint_c("continuous", '<axis xyz="0 1 0"/>', f'<link name="c">{link}</link>')
+    path = write(tmp_path, urdf=changed(URDF, END, joint)).with_suffix(".urdf")
+    assert srm.load(path).model.inertias[3].mass == 1.0
+
+
+def test_inertia_that_no_body_has_is_a_warning(tmp_path: Path) -> None:
+    path = write(tmp_path, urdf=changed(URDF, 'iyy="0.1"', 'iyy="0.3"')).with_suffix(".urdf")
+    with pytest.warns(srm.SrmWarning, match=r"two_bars\.urdf: link 'crank'.*triangle inequality"):
+        mechanism = srm.load(path)
+    assert any("'crank'" in note and "triangle" in note for note in mechanism.notes)
+
+
+def test_cutting_a_urdf_anywhere_raises_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "cut.urdf"
+    for at in range(0, len(URDF), 13):
+        for text in (URDF[:at], URDF[:at] + URDF[at + 6 :], URDF[:at] + "x" + URDF[at:]):
+            path.write_text(text)
+            loaded_or_refused(path)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_urdfs_load_or_are_refused(seed: int, tmp_path: Path) -> None:
+    """Words of the file replaced by words of the file, and numbers by odd numbers."""
+    rng = np.random.default_rng(seed)
+    words = URDF.split('"')
+    odd = ["-1", "0", "1e30", "-1e-30", "nan", "", "0 0 0", "1 2 3", "base", "rod", "knee", "\t"]
+    path = tmp_path / "damaged.urdf"
+    for _ in range(60):
+        damaged = list(words)
+        for _ in range(rng.integers(1, 4)):
+            at = 2 * int(rng.integers(len(words) // 2)) + 1
+            damaged[at] = str(rng.choice(odd))
+        path.write_text('"'.join(damaged))
+        mechanism = loaded_or_refused(path)
+        if mechanism is not None:
+            M = pin.crba(mechanism.model, mechanism.model.createData(), mechanism.q0)
+            assert np.isfinite(M).all()

@@ -21,7 +21,7 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.loading.urdf import parse_urdf
+from srm_mbs.loading.safe_xml import parse_urdf
 from srm_mbs.mechanism import Mechanism
 
 log = logging.getLogger(__name__)

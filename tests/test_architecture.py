@@ -21,6 +21,7 @@ LAYERS = (
     ("coordinates", "systems"),
     ("methods",),
     ("stepping",),
+    ("closing",),
     ("assembly", "solution"),
     ("loading",),
     ("storage",),

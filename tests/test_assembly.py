@@ -182,6 +182,16 @@ def test_the_guess_chooses_the_turn_too(turns: int) -> None:
     )
 
 
+@pytest.mark.parametrize("seed", [0, 8, 19, 26, 37])
+def test_no_hinge_is_wound_up(seed: int) -> None:
+    """However poor the guess, every angle stays within half a turn of it."""
+    mechanism = load("n_four_bar_2")
+    guess = mechanism.q0 + np.random.default_rng(seed).uniform(-3.0, 3.0, 5)
+    state = srm.assemble(mechanism, guess, hold=["crank_0"])
+    check(mechanism, state)
+    assert np.abs(state.q - guess).max() <= PI + 1e-9
+
+
 def test_a_guess_next_to_a_continuum_of_closings_stays_next_to_it() -> None:
     """With the cranks on the ground line, coupler and second crank turn about the same point."""
     mechanism = load("n_four_bar_1")
@@ -603,10 +613,16 @@ def test_rates_change_as_little_as_possible(name: str) -> None:
 def test_free_directions_keep_the_loops_closed() -> None:
     mechanism = load("slider_crank_slider")
     state = srm.assemble(mechanism)
-    unit = mechanism.structure.units.coordinate
-    for direction in state.free_directions.T:
-        v = direction * unit
+    for v in state.free_directions.T:
         np.testing.assert_allclose(srm.assemble(mechanism, state.q, v).v, v, atol=1e-12)
+
+
+def test_free_directions_are_orthonormal_in_units() -> None:
+    mechanism = load("slider_crank_slider")
+    by_unit = (
+        srm.assemble(mechanism).free_directions / mechanism.structure.units.coordinate[:, None]
+    )
+    np.testing.assert_allclose(by_unit.T @ by_unit, np.eye(by_unit.shape[1]), atol=1e-12)
 
 
 def test_free_rates_are_the_smallest_that_fit() -> None:

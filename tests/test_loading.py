@@ -319,6 +319,15 @@ def test_another_way_to_write_it_is_the_same_mechanism(
     assert capfd.readouterr().err == ""
 
 
+def test_the_rounding_of_a_point_mass_is_no_negative_inertia(tmp_path: Path) -> None:
+    """Exporters write products of inertia of 1e-20 kg m^2 where they mean none."""
+    text = zoo_urdf()
+    badge = INERTIAL.format(**LINKS["badge"])
+    point = INERTIAL.format(c="0 0 0", r="0 0 0", m=0.2, i=(0, 0, 0, 0, 1e-20, 0))
+    assert badge in text
+    assert srm.load(write(tmp_path, text.replace(badge, point))).model.nv == 6
+
+
 def test_what_is_ignored_is_noted(tmp_path: Path) -> None:
     text = zoo_urdf().replace(
         "</robot>", '<transmission/><transmission/><gazebo/><material name="m"/></robot>'
@@ -357,6 +366,9 @@ def test_a_urdf_may_have_any_file_name(name: str, tmp_path: Path) -> None:
     path.write_text(zoo_urdf())
     assert srm.load(path).joint_names == ("shoulder", "track", "axle", "pond")
     assert srm.load(str(path)).model.nv == 6
+    source = srm.load(path).source
+    assert source is not None
+    assert (source.path, source.urdf_path) == (str(path), str(path))
 
 
 @pytest.mark.parametrize("suffix", [".TOML", ".Urdf"])

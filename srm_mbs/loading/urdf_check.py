@@ -1,0 +1,445 @@
+"""What a URDF says, checked before Pinocchio reads it.
+
+Pinocchio's parser drops what it does not know without a word: unknown elements, a second joint
+with the same child, joint friction, a whole <inertial> whose numbers are separated by a newline.
+Everything that would change the mechanism is therefore checked on the XML, and what is left of it
+holds nothing but what was checked, with the numbers written afresh.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.loading.description import LARGEST
+from srm_mbs.mechanism import WORLD
+
+JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+WITH_AXIS = ("revolute", "continuous", "prismatic", "planar")
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+DEEPEST = 1000
+"""Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""
+UNIVERSE = "universe"
+"""Pinocchio's name for the ground."""
+ROOT_JOINT = "root_joint"
+"""Pinocchio's name for the joint of a floating or planar base."""
+POINT_LIKE = 1e-18
+"""m^2: a radius of gyration below a nanometre is the rounding of zero."""
+LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
+IGNORED = {
+    "robot": ("material", "transmission", "gazebo", "sensor", "ros2_control", "verbose"),
+    "link": (
+        "visual",
+        "collision",
+        "contact",
+        "self_filter",
+        "sensor",
+        "self_collision_checking",
+        "collision_checking",
+        "surface",
+        "kinematic",
+        "gravity",
+    ),
+    "joint": ("safety_controller", "calibration"),
+}
+READ = {
+    "robot": ("link", "joint"),
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+    "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
+}
+ATTRIBUTES = {
+    "link": ("name", "type"),
+    "joint": ("name", "type", "dont_collapse"),
+    "origin": ("xyz", "rpy"),
+    "mass": ("value",),
+    "inertia": ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
+    "parent": ("link",),
+    "child": ("link",),
+    "axis": ("xyz",),
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction"),
+}
+INFORMATIVE = {
+    "limit": ("command_effort", "current", "gear_velocity"),
+    "dynamics": ("D", "K", "mu_coulomb", "mu_viscous"),
+}
+"""Attributes of other tools found in published files: ignored, with a note."""
+DRAWN_ONLY = ("material", "visual", "collision")
+"""Elements whose loss needs no note: they do not act."""
+
+
+class UrdfChecker:
+    """Walks a URDF once; raises :class:`InputError` at the first fault."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.notes: list[str] = []
+        self._ignored: dict[str, int] = {}
+
+    def fault(self, element: str, problem: str, remedy: str | None = None) -> InputError:
+        return InputError(problem, file=self.file, element=element, remedy=remedy)
+
+    def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
+        """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
+        text = node.get(key)
+        parts = (text or "").split()
+        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
+        # Limits do not act, and exporters write the largest double there.
+        largest = sys.float_info.max if node.tag == "limit" else LARGEST
+        if len(values) != count or not all(abs(value) <= largest for value in values):
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
+            raise self.fault(
+                where,
+                f"<{node.tag}> has no {key!r}"
+                if text is None
+                else f"<{node.tag} {key}={text!r}> is not {wanted}",
+                f"Write {wanted}",
+            )
+        node.set(key, " ".join(map(repr, values)))
+        return values
+
+    def attributes(self, node: Element, where: str) -> None:
+        known = ATTRIBUTES.get(node.tag)
+        ignored = INFORMATIVE.get(node.tag, ())
+        for key in list(node.attrib):
+            if key in ignored:
+                self._ignore(f"<{node.tag} {key}> attribute")
+                del node.attrib[key]
+            elif known is not None and key not in known:
+                raise self.fault(
+                    where,
+                    f"<{node.tag}> has an unknown attribute {key!r}",
+                    f"Known: {', '.join(known)}",
+                )
+
+    def _ignore(self, what: str) -> None:
+        self._ignored[what] = self._ignored.get(what, 0) + 1
+
+    def children(self, node: Element, where: str) -> None:
+        """Refuse unknown elements of ``node``; count and remove those that are ignored."""
+        read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
+        for child in list(node):
+            tag = child.tag
+            local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
+            if tag in read:
+                self.attributes(child, where)
+            elif tag in ignored:
+                if tag not in DRAWN_ONLY:
+                    self._ignore(f"<{tag}> element")
+                node.remove(child)
+            elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
+                raise self.fault(
+                    f"{where}, <xacro:{local}>" if where else f"<xacro:{local}>",
+                    "this is a xacro macro, not URDF",
+                    "Run xacro on the file first",
+                )
+            elif local in LOOP_ELEMENTS or tag != local:
+                raise self.fault(
+                    f"{where}, <{local}>" if where else f"<{local}>",
+                    f"the element <{local}> (a loop, coupling or force of another tool) is not "
+                    "read by this version",
+                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                )
+            else:
+                raise self.fault(
+                    where or f"<{tag}>",
+                    f"unknown element <{tag}> in <{node.tag}>",
+                    f"Known: {', '.join((*read, *ignored))}",
+                )
+        for tag in set(read) - {"link", "joint"}:
+            if len(node.findall(tag)) > 1:
+                raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
+
+    def named(self, root: Element, tag: str) -> dict[str, Element]:
+        found: dict[str, Element] = {}
+        for node in root.findall(tag):
+            self.attributes(node, f"<{tag}>")
+            name = node.get("name")
+            if not name:
+                raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')
+            if name in found:
+                raise self.fault(
+                    f"{tag} {name!r}", f"two {tag}s have this name", "Rename one of them"
+                )
+            found[name] = node
+        return found
+
+    def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
+        """The whole file; leaves in ``root`` what Pinocchio is to read."""
+        self.root(root)
+        for block in root.findall("gazebo"):
+            for joint in block.iter("joint"):
+                if joint.find("child") is not None or joint in list(block):
+                    raise self.fault(
+                        f"<gazebo><joint> {joint.get('name', '')!r}",
+                        "joints inside <gazebo> close loops and are not read by this version",
+                        "Describe the loop as [[loop]] in a TOML description and remove the "
+                        "element",
+                    )
+        self.children(root, "")
+        links, joints = self.named(root, "link"), self.named(root, "joint")
+        if not links:
+            raise self.fault("<robot>", "there is no <link>", "Add one for every body")
+        for name, link in links.items():
+            self.link(name, link)
+        self.tree(links, joints, base)
+        for name, joint in joints.items():
+            self.joint(name, joint, base, name in locked)
+        for what, count in self._ignored.items():
+            self.notes.append(f"{count} {what}(s) do not act and are ignored")
+
+    def root(self, root: Element) -> None:
+        """The root element and its attributes, of which the name is kept."""
+        if root.tag.endswith("}robot"):
+            raise self.fault(
+                "<robot>",
+                "it has a default namespace (xmlns=...), so that none of its elements is URDF",
+                "Remove the attribute xmlns",
+            )
+        if root.tag != "robot":
+            raise self.fault(f"<{root.tag}>", "the root element is not <robot>", "Give a URDF file")
+        version = root.get("version", "1.0")
+        if version not in ("1", "1.0", "1.1", "1.2"):
+            raise self.fault(
+                "<robot>", f"there is no URDF version {version!r}", "Known: 1.0, 1.1, 1.2"
+            )
+        name = root.get("name")
+        if not name:
+            raise self.fault("<robot>", "it has no name", 'Give name="..."')
+        root.attrib.clear()
+        root.set("name", name)
+
+    def link(self, name: str, link: Element) -> None:
+        where = f"link {name!r}"
+        origin = link.find("origin")
+        if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
+            self.attributes(origin, where)
+            for key in ("xyz", "rpy"):
+                if origin.get(key) is not None and any(self.numbers(origin, key, 3, where)):
+                    raise self.fault(
+                        where,
+                        "<origin> in <link> has no meaning in URDF and would not move anything",
+                        "Put it into the joint, <inertial> or <visual> that it belongs to",
+                    )
+            link.remove(origin)
+        self.children(link, where)
+        inertial = link.find("inertial")
+        if inertial is None:
+            return
+        self.children(inertial, where)
+        self.origin(inertial, where)
+        mass, inertia = inertial.find("mass"), inertial.find("inertia")
+        if mass is None or inertia is None:
+            missing = "mass" if mass is None else "inertia"
+            raise self.fault(where, f"<inertial> has no <{missing}>", "Add it")
+        (value,) = self.numbers(mass, "value", 1, where)
+        if value < 0.0:
+            raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
+        xx, yy, zz, xy, xz, yz = (
+            self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
+        )
+        principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_LIKE * value
+        if principal[0] < -rounding:
+            raise self.fault(
+                where,
+                f"a principal moment of inertia is negative ({principal[0]:.3g} kg m^2)",
+                "Check the entries of <inertia>",
+            )
+        if principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
+            note = (
+                f"link {name!r}: the principal moments of inertia {principal[0]:.3g}, "
+                f"{principal[1]:.3g}, {principal[2]:.3g} violate the triangle inequality: "
+                "no real body has them"
+            )
+            self.notes.append(note)
+            warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
+
+    def origin(self, node: Element, where: str) -> None:
+        origin = node.find("origin")
+        if origin is None:
+            return
+        for key in ("xyz", "rpy"):
+            if origin.get(key) is not None:
+                self.numbers(origin, key, 3, where)
+
+    def tree(self, links: dict[str, Element], joints: dict[str, Element], base: str) -> None:
+        parent_joint: dict[str, str] = {}
+        parent_link: dict[str, str] = {}
+        for name, joint in joints.items():
+            ends = {}
+            for side in ("parent", "child"):
+                node = joint.find(side)
+                link = None if node is None else node.get("link")
+                if not link:
+                    raise self.fault(
+                        f"joint {name!r}", f"it has no <{side} link=...>", f"Name its {side} link"
+                    )
+                if link not in links:
+                    raise self.fault(
+                        f"joint {name!r}",
+                        f"its {side} link {link!r} does not exist",
+                        f"Links: {', '.join(links)}",
+                    )
+                ends[side] = link
+            child = ends["child"]
+            if child in parent_joint:
+                raise self.fault(
+                    f"link {child!r}",
+                    f"it is the child of two joints, {parent_joint[child]!r} and {name!r}",
+                    "Keep one of them and describe the other as [[loop]] in a TOML description",
+                )
+            parent_joint[child], parent_link[child] = name, ends["parent"]
+        roots = [link for link in links if link not in parent_joint]
+        if len(roots) != 1:
+            problem = (
+                "every link has a parent: the joints form a ring"
+                if not roots
+                else f"{len(roots)} links have no parent joint: {', '.join(roots)}"
+            )
+            raise self.fault(
+                "<robot>", problem, "A URDF needs exactly one root link; close loops by [[loop]]"
+            )
+        children: dict[str, list[str]] = {}
+        for child, parent in parent_link.items():
+            children.setdefault(parent, []).append(child)
+        level, depth, loose = roots, 0, set(links)
+        while level:
+            if depth > DEEPEST:
+                raise self.fault(
+                    f"link {level[0]!r}",
+                    f"more than {DEEPEST} joints lie between it and the root link",
+                    "Split the chain: Pinocchio cannot read such a deep one",
+                )
+            loose -= set(level)
+            level = [child for link in level for child in children.get(link, ())]
+            depth += 1
+        if loose:
+            ring: dict[str, None] = {}
+            at = next(link for link in links if link in loose)
+            while at not in ring:
+                ring[at] = None
+                at = parent_link[at]
+            raise self.fault(
+                f"link {at!r}",
+                f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a ring",
+                "Close loops by [[loop]] in a TOML description",
+            )
+        for reserved in (WORLD, UNIVERSE):
+            if reserved in links and (roots[0] != reserved or base != "fixed"):
+                raise self.fault(
+                    f"link {reserved!r}",
+                    f"{reserved!r} is reserved for the ground, but here it moves",
+                    'Rename the link, or use base = "fixed"'
+                    if roots[0] == reserved
+                    else "Rename the link",
+                )
+
+    def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
+        where = f"joint {name!r}"
+        if name == UNIVERSE or (name == ROOT_JOINT and base != "fixed"):
+            raise self.fault(
+                where,
+                f"the name {name!r} is reserved"
+                + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
+                "Rename the joint",
+            )
+        self.children(joint, where)
+        kind = joint.get("type")
+        if kind not in JOINT_TYPES:
+            raise self.fault(
+                where, f"unknown joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
+            )
+        self.origin(joint, where)
+        mimic = joint.find("mimic")
+        if mimic is not None and not locked and kind != "fixed":
+            raise self.fault(
+                where,
+                "<mimic> (a coupling of two joints) is not read by this version",
+                "Remove it, or name the joint in lock in a TOML description",
+            )
+        if mimic is not None:
+            joint.remove(mimic)
+        self.axis(joint, kind, where)
+        self.limit(joint, kind, where)
+        self.dynamics(joint, kind, where, locked)
+
+    def axis(self, joint: Element, kind: str, where: str) -> None:
+        axis = joint.find("axis")
+        if axis is not None and kind not in WITH_AXIS:
+            joint.remove(axis)
+            axis = None
+        direction = [1.0, 0.0, 0.0] if axis is None else self.numbers(axis, "xyz", 3, where)
+        if not any(direction):
+            raise self.fault(where, "its axis is zero", "Give a direction")
+        if axis is not None:
+            # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
+            length = math.hypot(*direction)
+            direction = [component / length for component in direction]
+            axis.set("xyz", " ".join(map(repr, direction)))
+        if kind == "planar" and (direction[:2] != [0.0, 0.0] or direction[2] < 0.0):
+            given = " (the default of URDF)" if axis is None else ""
+            raise self.fault(
+                where,
+                f"the normal of a planar joint is read along z only, not {direction}{given}",
+                'Write <axis xyz="0 0 1"/> and turn the joint by <origin rpy=...>',
+            )
+
+    def limit(self, joint: Element, kind: str, where: str) -> None:
+        limit = joint.find("limit")
+        if limit is None:
+            if kind in ("revolute", "prismatic"):
+                raise self.fault(
+                    where,
+                    f"a {kind} joint needs <limit lower upper effort velocity>",
+                    'Add it, or use type="continuous" for an unlimited angle'
+                    if kind == "revolute"
+                    else "Add it",
+                )
+            return
+        for key in limit.attrib:
+            self.numbers(limit, key, 1, where)
+        if kind not in ("revolute", "continuous", "prismatic"):
+            joint.remove(limit)
+            return
+        for key in ("effort", "velocity"):
+            if limit.get(key) is None and kind == "continuous":
+                limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
+            (value,) = self.numbers(limit, key, 1, where)
+            if value < 0.0:
+                raise self.fault(
+                    where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
+                )
+
+    def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
+        dynamics = joint.find("dynamics")
+        if dynamics is None:
+            return
+        for key in dynamics.attrib:
+            (value,) = self.numbers(dynamics, key, 1, where)
+            if key == "friction" and value != 0.0 and kind != "fixed" and not locked:
+                raise self.fault(
+                    where,
+                    f"joint friction ({value:g}) is not simulated by this version",
+                    "Set it to 0; viscous damping acts",
+                )
+            if key == "damping" and value < 0.0:
+                raise self.fault(where, f"the damping {value:g} is negative", "Give a value >= 0")
+            if key == "damping" and value != 0.0 and kind in ("floating", "planar") and not locked:
+                raise self.fault(
+                    where,
+                    f"the damping ({value:g}) of a {kind} joint is not simulated by this version",
+                    "Set it to 0; that of one-degree joints acts",
+                )
+        # What is left acts nowhere: it is zero, or the joint does not move.
+        dynamics.attrib.pop("friction", None)
+        if not dynamics.attrib:
+            joint.remove(dynamics)

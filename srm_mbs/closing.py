@@ -1,9 +1,9 @@
 r"""Closing loops: the closure equations of a mechanism as a root-finding problem.
 
-Two stages on the configuration manifold: a damped least-squares solve from the guess, whose
-residual has the intended closing as its only zero, and Gauss-Newton on the closure rows to
-round-off.  The guess chooses the branch: where the closing found lies far from it, others are
-looked for and the nearest is taken.
+Two stages on the configuration manifold: a trust-region least-squares solve from the guess
+(SciPy), whose residual has the intended closing as its only zero, and Gauss-Newton on the closure
+rows to round-off.  The guess chooses the branch: where the closing found lies far from it, others
+are looked for and the nearest is taken.
 """
 
 from __future__ import annotations
@@ -165,36 +165,30 @@ class ClosureProblem:
 def _search(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Least-squares solve of the closing residual over the free coordinates, from q.
 
-    Levenberg-Marquardt with a damping in proportion to the residual (J. Fan and Y. Yuan,
-    Computing 74 (2005) 23): it keeps close to the guess, also where the closings near it are not
-    isolated or G loses rank, and Newton's steps would lead anywhere.
+    To round-off: next to closings that are not isolated, or where G loses rank, convergence is
+    slow, and stopping early would leave the rest to Newton's steps, which may lead anywhere.
     """
-    residual = problem.mismatch(q)
-    size = float(np.linalg.norm(residual))
-    damping = 1.0
-    J = problem.mismatch_jacobian(q)[:, free]
-    identity = np.eye(len(free))
-    for _ in range(SEARCH_STEPS):
-        if size <= CLOSED:
-            break
-        damped = np.concatenate([J, np.sqrt(damping * size) * identity])
-        right = np.concatenate([-residual, np.zeros(len(free))])
-        step = np.linalg.lstsq(damped, right, rcond=None)[0]
-        if float(np.abs(step).max()) < 1e-14:
-            break
-        trial = problem.move(q, free, step)
-        new = problem.mismatch(trial)
-        new_size = float(np.linalg.norm(new))
-        predicted = size**2 - float(np.linalg.norm(residual + J @ step)) ** 2
-        gain = (size**2 - new_size**2) / predicted if predicted > 0.0 else 0.0
-        if gain < 0.25:
-            damping *= 4.0
-        elif gain > 0.75:
-            damping = max(0.25 * damping, 1e-8)
-        if gain > 1e-4:
-            q, residual, size = trial, new, new_size
-            J = problem.mismatch_jacobian(q)[:, free]
-    return q
+    from scipy.optimize import least_squares
+
+    def jacobian(delta: FloatArray) -> FloatArray:
+        full = np.zeros(problem.model.nv)
+        full[free] = delta * problem.unit[free]
+        chart = pin.dIntegrate(problem.model, q, full, pin.ARG1)
+        at_end = problem.mismatch_jacobian(problem.move(q, free, delta)) / problem.unit
+        out: FloatArray = ((at_end @ chart) * problem.unit)[:, free]
+        return out
+
+    found = least_squares(
+        lambda delta: problem.mismatch(problem.move(q, free, delta)),
+        np.zeros(len(free)),
+        jac=jacobian,
+        method="trf",
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+        max_nfev=SEARCH_STEPS,
+    )
+    return problem.move(q, free, found.x)
 
 
 def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:

@@ -294,7 +294,8 @@ class Mechanism:
                 raise InputError(
                     "both anchors lie on the same body",
                     element=f"loop {loop.name!r}",
-                    remedy="Anchor it on two bodies that move relative to each other",
+                    remedy="Anchor it on two bodies that move relative to each other "
+                    "(locked and fixed joints join bodies)",
                 )
         if np.any(model.friction != 0.0):
             raise InputError(

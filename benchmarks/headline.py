@@ -1,4 +1,4 @@
-"""The table in the README: error, work, drift and energy on the bundled mechanisms.
+"""The tables in the README: error, work, drift, orders, and the drift of SciPy beside ours.
 
     python -m benchmarks.headline [--repeats 5] [--json FILE]
 
@@ -21,10 +21,14 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
+from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.multibody import make_system
 from tests import reduced
+from tests.convergence import observed_order, turning
+from tests.mechanisms import floating_ring
 
 EXACT = json.loads((Path(__file__).parent.parent / "tests/data/exact_solutions.json").read_text())
 
@@ -147,6 +151,56 @@ def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float]:
     return per_call(whole), per_call(pinocchio_only)
 
 
+ORDER_PROBLEMS: tuple[tuple[str, str, float], ...] = (
+    ("trap", "slider_crank_regular", 2.0),
+    ("tvd32", "slider_crank_regular", 2.0),
+    ("erk4", "slider_crank_regular", 2.0),
+    ("dopr54", "four_bar", 4.0),
+    ("dop853", "slider_crank_regular", 2.0),
+)
+RING_STEPS = {"dopr54": (0.04, 0.02, 0.01)}
+
+
+def orders() -> list[tuple[str, int, float, float]]:
+    """(tableau, order, observed on a planar loop, observed on a floating ring with ball joints)."""
+    ring = floating_ring()
+    return [
+        (
+            tableau,
+            srm.TABLEAUS[tableau].order,
+            observed_order(turning(name, rate), srm.PSRM(tableau)),
+            observed_order(ring, srm.PSRM(tableau), RING_STEPS.get(tableau)),
+        )
+        for tableau, name, rate in ORDER_PROBLEMS
+    ]
+
+
+def beside_scipy(name: str, tol: float = 1e-6, t_end: float = 10.0) -> tuple[float, float]:
+    """Largest ||g|| of SciPy's DOP853 on the index-1 equations, and of ours, same tolerances."""
+    mechanism = srm.load(name)
+    start = np.concatenate([mechanism.q0, mechanism.v0])
+    theirs = solve_ivp(
+        reduced.index_one(mechanism), (0.0, t_end), start, method="DOP853", rtol=tol, atol=tol
+    )
+    nv = mechanism.model.nv
+    g, _ = closure_errors(
+        mechanism.model, mechanism.loops, theirs.y[:nv].T.copy(), theirs.y[nv:].T.copy()
+    )
+    ours = srm.simulate(mechanism, t_end, rtol=tol, atol=tol)
+    return float(np.linalg.norm(g, axis=1).max()), float(ours.drift[:, 0].max())
+
+
+def scipy_leaves_the_branch(tol: float) -> float | None:
+    """When SciPy's DOP853 on the index-1 equations of slider_crank leaves its branch (s), if so."""
+    mechanism = srm.load("slider_crank")
+    start = np.concatenate([mechanism.q0, mechanism.v0])
+    run = solve_ivp(
+        reduced.index_one(mechanism), (0.0, 10.0), start, method="DOP853", rtol=tol, atol=tol
+    )
+    gone = np.flatnonzero(np.abs(run.y[1] + 2.0 * run.y[0]) > 1e-2)
+    return float(run.t[gone[0]]) if gone.size else None
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=5)
@@ -165,6 +219,20 @@ def main() -> None:
             f"| {row.passages} | {row.error:.1e} | {row.evaluations} | {row.drift:.0e} m "
             f"| {row.energy_error:.0e} |"
         )
+    observed = orders()
+    print("\n| tableau | order | observed, planar loop | observed, ball joints and free flyer |")
+    print("|---|---|---|---|")
+    for tableau, order, flat, group in observed:
+        print(f"| {tableau} | {order} | {flat:.2f} | {group:.2f} |")
+    drifts = {}
+    print("\n| mechanism, 10 s at 1e-6 | SciPy DOP853, index 1 | srm_mbs |")
+    print("|---|---|---|")
+    for name in ("slider_crank_regular", "four_bar", "spatial_four_bar"):
+        drifts[name] = beside_scipy(name)
+        print(f"| {name} | {drifts[name][0]:.0e} m | {drifts[name][1]:.0e} m |")
+    leaves = {tol: scipy_leaves_the_branch(tol) for tol in (1e-4, 1e-6, 1e-8, 1e-10)}
+    print("\nslider_crank: SciPy DOP853 on the index-1 equations leaves its branch at t =")
+    print(", ".join(f"{t:.2f} s (tolerance {tol:g})" for tol, t in leaves.items() if t is not None))
     costs = {}
     print("\n| mechanism | microseconds per evaluation | of which Pinocchio |")
     print("|---|---|---|")
@@ -180,6 +248,9 @@ def main() -> None:
             "numpy": np.__version__,
             "srm_mbs": srm.__version__,
             "rows": [asdict(row) for row in rows],
+            "orders": observed,
+            "largest_drift": drifts,
+            "scipy_leaves_the_branch": leaves,
             "microseconds_per_evaluation": costs,
         }
         arguments.json.write_text(json.dumps(record, indent=1))

@@ -263,12 +263,18 @@ def test_a_step_that_turns_a_ball_joint_too_far_is_refused_not_integrated_wrongl
     assert adaptive.success
 
 
-def test_a_new_start_renews_the_units_of_the_rates() -> None:
+def test_default_tolerances_of_rates_follow_gravity_or_else_the_start() -> None:
     mechanism = srm.load("four_bar")
-    fast = mechanism.with_state(mechanism.q0, 100.0 * mechanism.v0)
-    units = fast.structure.units
-    assert units.rate == pytest.approx(100.0 * np.abs(mechanism.v0).max())
-    assert fast.structure.sigma_ref == mechanism.structure.sigma_ref
+    units = mechanism.structure.units
+    assert units.rate == pytest.approx(np.sqrt(9.81 / units.length))
+    solution = srm.simulate(mechanism, 0.1, rtol=1e-7)
+    assert solution.settings.atol == pytest.approx([1e-7] * 3 + [1e-7 * units.rate] * 3)
+    weightless = srm.load("four_bar", gravity=(0.0, 0.0, 0.0))
+    rate = np.median(np.abs(mechanism.v0))
+    assert weightless.structure.units.rate == pytest.approx(rate)
+    faster = weightless.with_state(weightless.q0, 100.0 * weightless.v0)
+    assert faster.structure.units.rate == pytest.approx(100.0 * rate)
+    assert faster.structure.sigma_ref == weightless.structure.sigma_ref
 
 
 def test_leaving_joint_limits_is_said() -> None:

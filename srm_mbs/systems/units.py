@@ -28,8 +28,9 @@ class Units:
     coordinate : (nv,)
         1 rad for angles, ``length`` for translations.
     rate
-        Characteristic rate (1/s): the larger of sqrt(g / length) and the initial rates over their
-        units; 1 where both vanish.
+        Characteristic rate (1/s): sqrt(g / length); without gravity the median of the initial
+        rates over their units, as far as they are not zero; 1 if all are.  A fast rotor does not
+        loosen what is asked of the slow rest.
     """
 
     length: float
@@ -69,5 +70,7 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
     angular = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
     coordinate = np.where(angular, 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
-    rate = max(rate, float(np.max(np.abs(v) / coordinate)))
-    return Units(length, coordinate, rate if rate > 0.0 else 1.0)
+    moving = np.abs(v[v != 0.0]) / coordinate[v != 0.0]
+    if rate == 0.0:
+        rate = float(np.median(moving)) if moving.size else 1.0
+    return Units(length, coordinate, rate)

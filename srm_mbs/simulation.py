@@ -297,7 +297,7 @@ def simulate(
                 tick=tick,
             )
     except (EvaluationError, ControllerError) as error:
-        record = RunRecord(0.0, state.copy(), np.inf)
+        record = RunRecord(0.0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = 0 s: {error}."
     settings = Settings(
         type(method).__name__,

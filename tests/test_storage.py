@@ -59,6 +59,37 @@ def test_overridden_gravity_and_base_are_saved(tmp_path: Path) -> None:
     assert np.array_equal(loaded.energy, solution.energy)
 
 
+def test_locked_joints_and_moving_bases_are_saved(tmp_path: Path) -> None:
+    source = srm.load("five_bar").source
+    assert source is not None
+    (tmp_path / "five_bar.urdf").write_text(source.urdf)
+    text = source.description.replace("../urdf/", "").replace(
+        "base =", 'lock = ["crank_right"]\nbase ='
+    )
+    assert "lock" in text
+    (tmp_path / "locked.toml").write_text(text)
+    chain = srm.load("pendulum_chain").source
+    assert chain is not None
+    trunk = (
+        '<link name="trunk"><inertial><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.1" '
+        'ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    urdf = chain.urdf.replace('<link name="world">', trunk).replace('"world"', '"trunk"')
+    (tmp_path / "chain.urdf").write_text(urdf)
+    (tmp_path / "free.toml").write_text(
+        'format = 1\nurdf = "chain.urdf"\nbase = "floating"\n[initial]\nv = { link_0 = 1.0 }\n'
+    )
+    for name, nv in (("locked", 3), ("free", 9)):
+        mechanism = srm.load(tmp_path / f"{name}.toml")
+        assert mechanism.model.nv == nv
+        solution = srm.simulate(mechanism, 0.5)
+        solution.save(tmp_path / "run.npz")
+        loaded = srm.load_solution(tmp_path / "run.npz")
+        assert loaded.mechanism.joint_names == mechanism.joint_names
+        assert np.array_equal(loaded(0.3)[0], solution(0.3)[0])
+        assert np.array_equal(loaded.energy, solution.energy)
+
+
 def test_a_failed_run_can_be_saved(tmp_path: Path) -> None:
     solution = srm.simulate(srm.load("four_bar"), 1.0, controller=lambda t, q, v: [np.nan])
     assert not solution.success

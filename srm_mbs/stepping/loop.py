@@ -37,6 +37,8 @@ class RunRecord:
 
     Attributes
     ----------
+    t0, x0
+        Where it started.
     steps
         Accepted steps in order.
     times
@@ -51,7 +53,6 @@ class RunRecord:
 
     t0: float
     x0: FloatArray
-    sigma0: float
     steps: list[StepResult] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
@@ -98,7 +99,7 @@ def integrate(
         With status ``finished``; or ``failed`` or ``interrupted`` (Ctrl-C), with everything
         computed so far.
     """
-    record = RunRecord(t0, state.copy(), memory.sigma)
+    record = RunRecord(t0, state.copy())
     smallest = SMALLEST_STEP * abs(t_end - t0)
     started = time.perf_counter()
     t, x = t0, state

@@ -244,8 +244,9 @@ def assemble(
     mechanism
         Its q0 is the guess for everything that is not given.
     q
-        Joint name -> position (rad, m, or a list, see :mod:`srm_mbs.coordinates`), held exactly;
-        or a configuration (nq,), of which only the joints in ``hold`` are held.
+        Joint name -> position (rad, m, or a list, see :mod:`srm_mbs.coordinates`), held exactly
+        unless ``hold`` says otherwise; or a
+        configuration (nq,), of which only the joints in ``hold`` are held.
     v
         Joint name -> rate, held exactly; or a velocity (nv,), which is changed as little as
         possible.  Rates not given are the least-norm ones: at a singular configuration, those of
@@ -254,7 +255,8 @@ def assemble(
         Joint name -> position from which assembly starts; chooses the branch (the closing
         nearest to it that was found, in rad and scene diagonals).
     hold
-        Names of the joints whose position is held; by default those named in ``q``.
+        Names of the joints whose position is held; by default those named in ``q``.  If given,
+        the other positions in ``q`` are guesses.
 
     Returns
     -------

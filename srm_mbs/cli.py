@@ -315,7 +315,7 @@ def models() -> None:
 
     folder = models_folder()
     _table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
-    typer.echo("n_four_bar_<N> is made for any N.")
+    typer.echo("n_four_bar_<N> is made for any N up to 300.")
 
 
 def _first_sentence(path: Path) -> str:

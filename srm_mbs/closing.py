@@ -17,6 +17,7 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.mechanism import LoopClosure, Mechanism
 from srm_mbs.systems.loops import LoopKinematics, support, world_jacobian
+from srm_mbs.systems.structure import ROUNDING_ROW
 from srm_mbs.systems.units import coordinate_units, row_units
 
 CLOSED = 1e-12
@@ -40,7 +41,9 @@ class ClosureProblem:
     def __init__(self, mechanism: Mechanism, start: FloatArray) -> None:
         self.mechanism = mechanism
         self.start = start
-        self.model = mechanism.model
+        # Gravity cancels in Gdot v, but its rounding would not at small rates.
+        self.model = mechanism.model.copy()
+        self.model.gravity.linear = np.zeros(3)
         self.data = self.model.createData()
         self.rows = LoopKinematics(self.model, mechanism.loops)
         units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
@@ -62,16 +65,24 @@ class ClosureProblem:
         """
         rng = np.random.default_rng(0)
         squares = np.zeros(len(self.row_unit))
+        uncancelled = np.zeros(2)
         for _ in range(8):
             spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.unit
             _, G = self.closure(pin.integrate(self.model, self.start, spread))
             squares += (G**2).sum(axis=1) / 8
+            # What rows would measure if nothing in them cancelled: their rounding is eps of it.
+            J = world_jacobian(self.data)
+            turn = np.linalg.norm(J[3:], axis=0) * self.unit
+            shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.length + turn
+            uncancelled += np.array([shift @ shift, turn @ turn]) / 8
         at = 0
         for loop in self.mechanism.loops:
             middle, end = at + len(loop.rows.directions), at + loop.rows.count
-            for block in (slice(at, middle), slice(middle, end)):
+            for block, whole in zip((slice(at, middle), slice(middle, end)), uncancelled):
                 if block.stop > block.start:
-                    squares[block] = squares[block].mean()
+                    mean = squares[block].mean()
+                    # Always satisfied: rounding must not be scaled up to a row.
+                    squares[block] = mean if mean > ROUNDING_ROW**2 * whole else whole
             at = end
         return np.sqrt(np.where(squares > 0.0, squares, 1.0))
 

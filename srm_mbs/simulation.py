@@ -46,14 +46,39 @@ LOOSEST_RTOL = 1e-4
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
-SINGULAR_START = 1e-7
-"""sigma below which a start counts as singular."""
+SINGULAR_START = 1e-5
+"""sigma below which a start is refused: round-off in q, over sigma, is an error of the rates."""
 BACKENDS = ("auto", "python")
 
 
-def _checked_rtol(rtol: float) -> float:
-    if not (math.isfinite(rtol) and rtol > 0.0):
-        raise InputError(f"rtol = {rtol!r} is not a positive number", element="rtol")
+def _positive(value: Any, what: str, unit: str = "") -> float:
+    """``value`` as a positive finite float."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(
+            f"{what} = {value!r} is not a positive number{unit}",
+            element=what,
+            remedy="Give a positive number",
+        )
+    return number
+
+
+def _numbers(values: Any, what: str, remedy: str) -> FloatArray:
+    """``values`` as an array of finite numbers."""
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if not np.isfinite(array).all():
+        raise InputError(f"{what} = {values!r} is not finite numbers", element=what, remedy=remedy)
+    return array
+
+
+def _checked_rtol(value: Any) -> float:
+    rtol = _positive(value, "rtol")
     if rtol > LOOSEST_RTOL:
         warnings.warn(
             f"rtol = {rtol:g} is looser than {LOOSEST_RTOL:g}, from where a step may jump to "
@@ -78,13 +103,11 @@ def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatAr
     units = mechanism.structure.units
     if atol is None:
         return rtol * np.concatenate([units.coordinate, units.coordinate * units.rate])
-    array = np.asarray(atol, dtype=float)
+    remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
+    array = _numbers(atol, "atol", remedy)
     if array.shape not in ((), (nv,), (2 * nv,)) or not (array > 0.0).all():
         raise InputError(
-            f"atol has shape {array.shape} or is not positive",
-            element="atol",
-            remedy=f"Give one positive number, {nv} (per coordinate) or {2 * nv} "
-            "(positions, then rates)",
+            f"atol has shape {array.shape} or is not positive", element="atol", remedy=remedy
         )
     if array.shape == (nv,):
         array = np.tile(array, 2)
@@ -106,21 +129,32 @@ def _checked_method(method: str | Method, tableau: str | ButcherTableau | None) 
             element="tableau",
             remedy="Give the tableau to the method: PSRM(tableau=...)",
         )
+    if isinstance(method, type) or not all(
+        hasattr(method, name) for name in ("scheme", "start", "step", "accept")
+    ):
+        raise InputError(
+            f"method = {method!r} is not a method",
+            element="method",
+            remedy='Give "psrm" or an object such as PSRM(tableau="dopr54")',
+        )
     return method
 
 
 def _checked_times(t_eval: Any, t_end: float) -> FloatArray | None:
     if t_eval is None:
         return None
-    times = np.array(t_eval, dtype=float)
-    inside = times.ndim == 1 and np.isfinite(times).all()
-    if not inside or (times.size and (times.min() < 0.0 or times.max() > t_end)):
+    remedy = f"Give increasing times between 0 and t_end = {t_end:g} s"
+    times = _numbers(t_eval, "t_eval", remedy)
+    slack = 1e-12 * t_end  # np.arange(4) * 0.1 ends a rounding error after 0.3
+    if times.ndim != 1 or (times.size and (times.min() < -slack or times.max() > t_end + slack)):
         raise InputError(
-            "t_eval must be one-dimensional and lie within 0 and t_end", element="t_eval"
+            "t_eval must be one-dimensional and lie within 0 and t_end",
+            element="t_eval",
+            remedy=remedy,
         )
     if np.any(np.diff(times) <= 0.0):
-        raise InputError("t_eval must increase", element="t_eval")
-    return times
+        raise InputError("t_eval must increase", element="t_eval", remedy=remedy)
+    return np.clip(times, 0.0, t_end)
 
 
 def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, FloatArray]:
@@ -174,11 +208,6 @@ def _control(
         return inner, None
     placement = SingularityPlacement(inner, scheme)
     return placement, placement
-
-
-def _positive(value: float | None, what: str) -> None:
-    if value is not None and not (math.isfinite(value) and value > 0.0):
-        raise InputError(f"{what} = {value!r} is not a positive number of seconds", element=what)
 
 
 def simulate(
@@ -248,18 +277,30 @@ def simulate(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    _positive(t_end, "t_end")
+    if not isinstance(mechanism, Mechanism):
+        raise InputError(
+            f"{mechanism!r} is not a mechanism",
+            element="mechanism",
+            remedy="Give srm.load(...) or srm.Mechanism(...)",
+        )
+    t_end = _positive(t_end, "t_end", " of seconds")
     for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
-        _positive(value, what)
+        if value is not None:
+            _positive(value, what, " of seconds")
+    if controller is not None and not callable(controller):
+        raise InputError(
+            f"controller = {controller!r} cannot be called",
+            element="controller",
+            remedy="Give a function of (t, q, v) that returns the generalised forces",
+        )
     if backend not in BACKENDS:
         raise InputError(
             f"there is no backend {backend!r}",
             element="backend",
             remedy=f"This version has {', '.join(BACKENDS)}; the compiled kernel is not built yet",
         )
-    t_end = float(t_end)
     method = _checked_method(method, tableau)
-    rtol = _checked_rtol(float(rtol))
+    rtol = _checked_rtol(rtol)
     times = _checked_times(t_eval, t_end)
     mechanism, state = _initial_state(mechanism, q0, v0)
     norm = ErrorNorm(_absolute_tolerance(mechanism, atol, rtol), rtol)
@@ -272,8 +313,10 @@ def simulate(
         memory = method.start(system, 0.0, state, norm)
         if memory.sigma < SINGULAR_START:
             raise EvaluationError(
-                f"the start is a singular configuration (sigma = {memory.sigma:.1e}), from where "
-                "this version cannot tell the branches apart; start a little beside it"
+                "the start is, or almost is, a singular configuration "
+                f"(sigma = {memory.sigma:.1e}), from where "
+                "this version cannot tell the branches apart; start beside it, at sigma "
+                "above 1e-3"
             )
 
         def chosen_first_step() -> float:

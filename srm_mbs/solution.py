@@ -112,6 +112,9 @@ class Solution:
         self.settings = settings
         self._system = system
         self._dense = DenseOutput(system, scheme, steps)
+        # q and v are views: writing to them would change the dense output.
+        steps.states.setflags(write=False)
+        steps.times.setflags(write=False)
         self.t_eval = t_eval
         if t_eval is None:
             self.t = steps.times
@@ -130,9 +133,11 @@ class Solution:
         Raises
         ------
         ValueError
-            If a time lies outside the run.
+            If a time lies outside the run, or t has more than one dimension.
         """
         times = np.asarray(t, dtype=float)
+        if times.ndim > 1:
+            raise ValueError(f"t has shape {times.shape}; give a scalar or a vector of times")
         states = self._dense(np.atleast_1d(times))
         nq = self.mechanism.model.nq
         q, v = states[:, :nq], states[:, nq:]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,18 @@ from srm_mbs.systems.structure import Structure
 from srm_mbs.systems.units import Units
 
 FORMAT = 1
+BROKEN = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading a damaged file may raise."""
 _STEP_ARRAYS = (
     "times",
     "states",
@@ -131,6 +144,24 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
     )
 
 
+def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
+    """Refuse arrays that do not belong together, before anything reads them."""
+    n, s = steps.count, get_tableau(tableau).n_stages
+    nq, m = mechanism.model.nq, 2 * mechanism.model.nv
+    expected = {
+        "states": (n + 1, nq + m // 2),
+        "rates": (n, s + 1, m),
+        "sigmas": (n, s + 1),
+        "ranks": (n,),
+        "error_ratios": (n,),
+    }
+    for name, shape in expected.items():
+        if getattr(steps, name).shape != shape:
+            raise ValueError(f"{name} has shape {getattr(steps, name).shape}, not {shape}")
+    if steps.corrections.shape not in ((n, m), (n, 0)):
+        raise ValueError(f"corrections has shape {steps.corrections.shape}")
+
+
 def load_solution(path: str | Path) -> Solution:
     """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
 
@@ -171,6 +202,7 @@ def load_solution(path: str | Path) -> Solution:
             for k, (index, threshold) in enumerate(meta["zones"])
         }
         steps = StepData(**{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones)
+        _check_shapes(mechanism, meta["settings"]["tableau"], steps)
         settings = Settings(**meta["settings"] | {"atol": tuple(meta["settings"]["atol"])})
         return Solution(
             mechanism,
@@ -188,7 +220,7 @@ def load_solution(path: str | Path) -> Solution:
         raise InputError("there is no such file", file=str(path)) from error
     except InputError as error:
         raise error.located(str(path)) from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except BROKEN as error:
         raise InputError(
             f"it is no saved run: {error}",
             file=str(path),

@@ -732,3 +732,32 @@ def test_assembly_leaves_the_mechanism_and_its_arguments_alone() -> None:
     srm.assemble(mechanism, q, v)
     for old, new in zip(before, (mechanism.q0, mechanism.v0, q, v)):
         np.testing.assert_array_equal(old, new)
+
+
+@pytest.mark.parametrize("closure", ["point", "revolute"])
+@pytest.mark.parametrize("rate", [4.0, 1e-3, 1e-6, 1e-9])
+def test_planar_loops_in_tilted_planes_take_any_rate(
+    closure: str, rate: float, tmp_path: Path
+) -> None:
+    """Rows that are zero up to rounding say nothing about the motion, however slow it is."""
+    source = load("four_bar").source
+    assert source is not None
+    urdf = source.urdf.replace('name="world"', 'name="frame"').replace(
+        'link="world"', 'link="frame"'
+    )
+    tilt = (
+        '<link name="world"/><joint name="tilt" type="fixed"><parent link="world"/>'
+        '<child link="frame"/><origin rpy="0.4 0.5 0.6"/></joint>'
+    )
+    urdf = urdf.replace('<link name="frame">', tilt + '<link name="frame">')
+    (tmp_path / "tilted.urdf").write_text(urdf)
+    text = source.description.replace("../urdf/four_bar.urdf", "tilted.urdf")
+    text = text.replace("crank = 4.0", f"crank = {rate!r}")
+    if closure == "revolute":
+        text = text.replace('type = "point"', 'type = "revolute"\naxis = [0.0, 1.0, 0.0]')
+    assert closure in text
+    (tmp_path / "tilted.toml").write_text(text)
+    tilted = srm.load(tmp_path / "tilted.toml")
+    assert tilted.degrees_of_freedom == 1
+    expected = srm.assemble(load("four_bar"), {"crank": 1.0}, {"crank": rate})
+    np.testing.assert_allclose(tilted.v0, expected.v, rtol=1e-9)

@@ -728,3 +728,17 @@ def test_damaged_urdfs_load_or_are_refused(seed: int, tmp_path: Path) -> None:
         if mechanism is not None:
             M = pin.crba(mechanism.model, mechanism.model.createData(), mechanism.q0)
             assert np.isfinite(M).all()
+
+
+@pytest.mark.parametrize("outer", ["gazebo", "transmission", "gazebo><plugin", "sensor"])
+@pytest.mark.parametrize("inner", ["loop_joint", "loop", "constraint", "coupling", "mimic"])
+def test_loops_inside_ignored_elements_are_refused(outer: str, inner: str, tmp_path: Path) -> None:
+    source = srm.load("four_bar").source
+    assert source is not None
+    end = ">".join(f"</{tag}" for tag in reversed(outer.split("><"))) + ">"
+    block = f'<{outer}><{inner} name="x"/>{end}</robot>'
+    path = tmp_path / "nested.urdf"
+    path.write_text(source.urdf.replace("</robot>", block))
+    with pytest.raises(srm.InputError, match=rf"nested\.urdf: .*<{inner}>.*not read") as caught:
+        srm.load(path)
+    assert caught.value.remedy

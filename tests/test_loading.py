@@ -1038,3 +1038,11 @@ def test_a_legged_robot_floats_and_stands_on_a_loop() -> None:
     standing = srm.Mechanism(model, loops, q0=mechanism.q0)
     state = srm.assemble(standing, guess={"root_joint": [0, 0, -0.05, 0, 0, 0, 1]})
     assert np.abs(state.residuals).max() < 1e-12
+
+
+@pytest.mark.parametrize("n", [301, 9999, 123456789])
+def test_an_n_four_bar_that_would_not_fit_is_refused(n: int) -> None:
+    with pytest.raises(srm.InputError, match=f"N = {n} is too large.*N <= 300"):
+        srm.load(f"n_four_bar_{n}")
+    with pytest.raises(srm.InputError, match="too large"):
+        srm.n_four_bar(n)

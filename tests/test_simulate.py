@@ -202,6 +202,18 @@ def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mech
         ({"q0": np.zeros(3)}, "violates the closures: row pin"),
         ({"v0": np.ones(3)}, "v0.*srm.assemble"),
         ({"v0": np.full(3, np.nan)}, "v0"),
+        ({"atol": np.inf}, "atol"),
+        ({"atol": "tight"}, "atol"),
+        ({"rtol": "tight"}, "rtol"),
+        ({"rtol": None}, "rtol"),
+        ({"step": "small"}, "step"),
+        ({"t_end": "late"}, "t_end"),
+        ({"t_eval": ["now"]}, "t_eval"),
+        ({"t_eval": [[0.0, 0.5]]}, "t_eval"),
+        ({"controller": 3}, "controller"),
+        ({"method": 3}, "method"),
+        ({"method": srm.PSRM}, "method"),
+        ({"mechanism": "four_bar"}, "mechanism"),
     ],
     ids=str,
 )
@@ -209,7 +221,7 @@ def test_invalid_options_raise_before_any_stepping(
     four_bar: srm.Mechanism, options: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(srm.InputError, match=words):
-        srm.simulate(four_bar, **({"t_end": 1.0} | options))
+        srm.simulate(**({"mechanism": four_bar, "t_end": 1.0} | options))
 
 
 @pytest.mark.parametrize(
@@ -275,6 +287,39 @@ def test_default_tolerances_of_rates_follow_gravity_or_else_the_start() -> None:
     faster = weightless.with_state(weightless.q0, 100.0 * weightless.v0)
     assert faster.structure.units.rate == pytest.approx(100.0 * rate)
     assert faster.structure.sigma_ref == weightless.structure.sigma_ref
+
+
+@pytest.mark.parametrize("step", [0.3, 1.0])
+def test_a_fixed_step_so_long_that_the_loops_come_apart_fails(
+    four_bar: srm.Mechanism, step: float
+) -> None:
+    solution = srm.simulate(four_bar, 1.0, step=step)
+    assert solution.status == "failed"
+    assert "smaller step" in solution.message
+    assert solution.drift[:, 0].max() < 0.03
+
+
+@pytest.mark.parametrize("distance", [1e-6, 3e-7, -2e-7])
+def test_a_start_almost_on_a_singular_configuration_is_refused(distance: float) -> None:
+    """There the rates follow from the positions only to round-off over sigma."""
+    mechanism = srm.load("slider_crank")
+    theta = 1.5 * np.pi + distance
+    state = srm.assemble(mechanism, {"crank": theta}, {"crank": 1.0}, guess={"rod": -2 * theta})
+    solution = srm.simulate(mechanism, 1.0, q0=state.q, v0=state.v)
+    assert solution.status == "failed"
+    assert "almost is, a singular configuration" in solution.message
+
+
+def test_states_are_read_only(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 0.1)
+    for array in (solution.q, solution.v, solution.t):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 99.0
+
+
+def test_times_may_miss_the_end_by_rounding(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 0.3, t_eval=np.arange(4) * 0.1)
+    assert len(solution.t) == 4
 
 
 def test_leaving_joint_limits_is_said() -> None:

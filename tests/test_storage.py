@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -140,3 +141,30 @@ def test_another_npz_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         srm.load_solution(tmp_path / "other.npz")
     with pytest.raises(srm.InputError, match="no such file"):
         srm.load_solution(tmp_path / "missing.npz")
+
+
+def test_a_damaged_file_is_refused_whatever_is_wrong_with_it(tmp_path: Path) -> None:
+    srm.simulate(srm.load("four_bar"), 0.2).save(tmp_path / "run.npz")
+    good = (tmp_path / "run.npz").read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(150):
+        data = bytearray(good)
+        for at in rng.integers(0, len(data), 4):
+            data[at] = rng.integers(0, 256)
+        (tmp_path / "damaged.npz").write_bytes(bytes(data))
+        with contextlib.suppress(srm.InputError):
+            srm.load_solution(tmp_path / "damaged.npz")
+            continue  # the damage fell where nothing is
+        refused += 1
+    assert refused > 100
+
+
+def test_arrays_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    srm.simulate(srm.load("four_bar"), 0.2).save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        arrays = dict(file)
+    arrays["rates"] = arrays["rates"][:-1]
+    np.savez(tmp_path / "cut.npz", **arrays)
+    with pytest.raises(srm.InputError, match=r"cut\.npz: it is no saved run: rates has shape"):
+        srm.load_solution(tmp_path / "cut.npz")

@@ -307,7 +307,17 @@ def load(
     )
 
 
+LARGEST_N = 300
+"""Loops of a generated N-four-bar; memory and time of the load-time analysis grow as N^3."""
+
+
 def _generated(n: int, overrides: Mapping[str, Any]) -> Mechanism:
+    if n > LARGEST_N:
+        raise InputError(
+            f"an N-four-bar with N = {n} is too large for the dense load-time analysis",
+            element="n",
+            remedy=f"Take N <= {LARGEST_N}",
+        )
     text, urdf = _n_four_bar_texts(n)
     return _load_text(text, str(models_folder() / f"n_four_bar_{n}.toml"), urdf, overrides)
 
@@ -318,7 +328,7 @@ def n_four_bar(n: int) -> Mechanism:
     Raises
     ------
     InputError
-        If n < 1.
+        If n < 1 or n > 300.
     """
     if not isinstance(n, Integral) or n < 1:
         raise InputError(f"an N-four-bar needs n >= 1, not {n!r}", element="n")

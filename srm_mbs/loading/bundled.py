@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-_GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,2})\Z")
+_GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
 
 
 def models_folder() -> Path:

@@ -132,6 +132,7 @@ class UrdfChecker:
             if tag in read:
                 self.attributes(child, where)
             elif tag in ignored:
+                self.no_loop_inside(child, where)
                 if tag not in DRAWN_ONLY:
                     self._ignore(f"<{tag}> element")
                 node.remove(child)
@@ -157,6 +158,17 @@ class UrdfChecker:
         for tag in set(read) - {"link", "joint"}:
             if len(node.findall(tag)) > 1:
                 raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
+
+    def no_loop_inside(self, node: Element, where: str) -> None:
+        """Refuse loops and couplings inside an element that is ignored as a whole."""
+        for inner in node.iter():
+            if inner.tag in (*LOOP_ELEMENTS, "mimic"):
+                raise self.fault(
+                    ", ".join(part for part in (where, f"<{node.tag}>, <{inner.tag}>") if part),
+                    f"the element <{inner.tag}> (a loop or coupling) inside <{node.tag}> is not "
+                    "read by this version",
+                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                )
 
     def named(self, root: Element, tag: str) -> dict[str, Element]:
         found: dict[str, Element] = {}

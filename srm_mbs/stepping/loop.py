@@ -21,6 +21,12 @@ SMALLEST_STEP = 1e-14
 """Steps shorter than this fraction of the run, or than round-off of t, end it."""
 
 
+LARGE_CORRECTION = 1e-3
+"""Below this an end correction closes the loops to its square: nothing to look at."""
+LOST = 1e-2
+"""Closure error after the correction, in row units, from which a run is meaningless."""
+
+
 @dataclass(frozen=True)
 class Attempt:
     """A step that did not stand: where it started, its length, its error ratio, and why."""
@@ -127,6 +133,9 @@ def integrate(
                     break
                 continue
             trouble = ""
+            if _closures_lost(system, result):
+                _fail(record, t, h, memory, "the step is so long that the loops come apart", False)
+                break
             method.accept(memory, result)
             t, x = proposal.t_new, result.state
             record.times.append(t)
@@ -148,6 +157,13 @@ def integrate(
     record.wall_time = time.perf_counter() - started
     log.info("%s", record.message)
     return record
+
+
+def _closures_lost(system: System, result: StepResult) -> bool:
+    """Whether the end correction was too large to close the loops again."""
+    if not result.correction.size or np.abs(result.correction).max() < LARGE_CORRECTION:
+        return False
+    return not system.closure_gap(result.state) < LOST
 
 
 def _fail(

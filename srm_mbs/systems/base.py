@@ -87,5 +87,8 @@ class System(Protocol):
     def magnitudes(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""
 
+    def closure_gap(self, state: FloatArray) -> float:
+        """Largest closure error at ``state``, in row units (scene diagonals, rad); 0 if open."""
+
     def step_limit(self, state: FloatArray) -> float:
         """Largest step for which the chart stays well inside its domain (s)."""

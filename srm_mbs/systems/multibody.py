@@ -27,6 +27,7 @@ from srm_mbs.systems.charts import (
 )
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import Projection
+from srm_mbs.systems.units import row_units
 
 Controller = Callable[[float, FloatArray, FloatArray], Any]
 """(t, q, v) -> generalised forces tau (nv,), N and N m."""
@@ -171,6 +172,10 @@ class OpenSystem(_Mechanics):
         self._zero = np.zeros(self.nv)
         self._terms = _OpenTerms(self.nv)
 
+    def closure_gap(self, state: FloatArray) -> float:
+        """0: there is no closure."""
+        return 0.0
+
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """v' = aba(q, v, tau); see :class:`~srm_mbs.systems.base.System`."""
         self.evaluations += 1
@@ -250,6 +255,8 @@ class ClosedSystem(_Mechanics):
         self.loops = LoopKinematics(
             self.model, mechanism.loops, structure.row_scale, structure.kept
         )
+        unit = row_units(mechanism.loops, structure.units.length)
+        self._gap_scale = (structure.row_scale / unit)[structure.kept]
         self.projection = Projection(structure.rank, structure.sigma_ref)
         self._terms = _ClosedTerms(self.projection, self.loops)
 
@@ -283,6 +290,11 @@ class ClosedSystem(_Mechanics):
         terms.v = v
         terms.predicted = zone.predict(t) if projection.weak and zone is not None else None
         return terms
+
+    def closure_gap(self, state: FloatArray) -> float:
+        """max |g| over row units; see :class:`~srm_mbs.systems.base.System`."""
+        g, _ = self.residuals(state)
+        return float(np.max(np.abs(g) * self._gap_scale))
 
     def residuals(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scaled closure errors g (m,) and closure rates G v (m,) of the kept rows."""

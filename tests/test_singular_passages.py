@@ -49,6 +49,24 @@ def test_every_passage_is_listed_at_its_time(long_run: srm.Solution) -> None:
     assert np.abs(found - expected).max() < 1e-4
 
 
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+@pytest.mark.parametrize("tol", [1e-4, 1.78e-5, 1e-5, 1e-6])
+def test_coarse_runs_list_every_passage_too(tableau: str, tol: float) -> None:
+    solution = run("slider_crank", 100.0, tableau, tol)
+    expected = PERIOD / 4.0 + PERIOD / 2.0 * np.arange(47)
+    found = np.array([crossing.time for crossing in solution.crossings])
+    assert len(found) == 47
+    assert np.abs(found - expected).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "name", ["four_bar", "five_bar", "slider_crank_regular", "spatial_four_bar"]
+)
+@pytest.mark.parametrize("tableau", ["tvd32", "dopr54", "dop853"])
+def test_regular_motions_list_no_passage(name: str, tableau: str) -> None:
+    assert run(name, 5.0, tableau, 1e-5).crossings == ()
+
+
 def test_slider_crank_is_exact_to_1e_6_after_100_seconds_with_dop853(
     long_run: srm.Solution, exact: dict[str, Any]
 ) -> None:

@@ -19,6 +19,14 @@ import numpy as np
 
 from srm_mbs.errors import InputError, SrmWarning
 from srm_mbs.loading.description import LARGEST
+from srm_mbs.loading.urdf_schema import (
+    ATTRIBUTES,
+    DRAWN_ONLY,
+    IGNORED,
+    INFORMATIVE,
+    LOOP_ELEMENTS,
+    READ,
+)
 from srm_mbs.mechanism import WORLD
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
@@ -32,48 +40,6 @@ ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
 POINT_LIKE = 1e-18
 """m^2: a radius of gyration below a nanometre is the rounding of zero."""
-LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
-IGNORED = {
-    "robot": ("material", "transmission", "gazebo", "sensor", "ros2_control", "verbose"),
-    "link": (
-        "visual",
-        "collision",
-        "contact",
-        "self_filter",
-        "sensor",
-        "self_collision_checking",
-        "collision_checking",
-        "surface",
-        "kinematic",
-        "gravity",
-    ),
-    "joint": ("safety_controller", "calibration"),
-}
-READ = {
-    "robot": ("link", "joint"),
-    "link": ("inertial",),
-    "inertial": ("origin", "mass", "inertia"),
-    "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
-}
-ATTRIBUTES = {
-    "link": ("name", "type"),
-    "joint": ("name", "type", "dont_collapse"),
-    "origin": ("xyz", "rpy"),
-    "mass": ("value",),
-    "inertia": ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
-    "parent": ("link",),
-    "child": ("link",),
-    "axis": ("xyz",),
-    "limit": ("lower", "upper", "effort", "velocity"),
-    "dynamics": ("damping", "friction"),
-}
-INFORMATIVE = {
-    "limit": ("command_effort", "current", "gear_velocity"),
-    "dynamics": ("D", "K", "mu_coulomb", "mu_viscous"),
-}
-"""Attributes of other tools found in published files: ignored, with a note."""
-DRAWN_ONLY = ("material", "visual", "collision")
-"""Elements whose loss needs no note: they do not act."""
 
 
 class UrdfChecker:

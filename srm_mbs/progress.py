@@ -7,8 +7,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 from srm_mbs.arrays import FloatArray
 from srm_mbs.stepping.loop import Tick
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
@@ -44,9 +42,8 @@ def progress_bar(system: OpenSystem | ClosedSystem, t_end: float) -> Iterator[Ti
                 return
             last = now
             detail = f"h = {h:.2e} s"
-            if isinstance(system, ClosedSystem):
-                drift = float(np.max(np.abs(system.residuals(state)[0])))
-                detail += f"  |g| = {drift:.1e}"
+            if system.has_constraints:
+                detail += f"  drift = {system.closure_gap(state):.1e}"
             bar.update(task, completed=t, detail=detail)
 
         yield tick

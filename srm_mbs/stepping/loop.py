@@ -134,7 +134,8 @@ def integrate(
                 continue
             trouble = ""
             if _closures_lost(system, result):
-                _fail(record, t, h, memory, "the step is so long that the loops come apart", False)
+                reason = "the step is so long that the loops come apart"
+                _fail(record, t, h, memory, reason, control.adaptive)
                 break
             method.accept(memory, result)
             t, x = proposal.t_new, result.state

@@ -133,7 +133,7 @@ def integrate(
                     break
                 continue
             trouble = ""
-            if _closures_lost(system, result):
+            if _closures_lost(system, norm, result):
                 reason = "the step is so long that the loops come apart"
                 _fail(record, t, h, memory, reason, control.adaptive)
                 break
@@ -160,9 +160,11 @@ def integrate(
     return record
 
 
-def _closures_lost(system: System, result: StepResult) -> bool:
+def _closures_lost(system: System, norm: ErrorNorm, result: StepResult) -> bool:
     """Whether the end correction was too large to close the loops again."""
-    if not result.correction.size or np.abs(result.correction).max() < LARGE_CORRECTION:
+    # atol over rtol is the size that the tolerances call "one", whatever the unit of length.
+    large = LARGE_CORRECTION * norm.atol / norm.rtol
+    if not result.correction.size or (np.abs(result.correction) < large).all():
         return False
     return not system.closure_gap(result.state) < LOST
 

@@ -127,9 +127,7 @@ class PSRM:
             theta = 1.0 if self.eps is None else -math.expm1(-h / self.eps)
             correction = theta * terms.correction()
             new_state = system.retract(x, -correction)
-            end_rate = rate
-            half = end_rate.size // 2
-            end_rate[:half] -= correction[half:]
+            end_rate = rate - system.rate_change(correction)
             multiplier = None if terms.weak else terms.multiplier().copy()
         else:
             correction = np.zeros(0)
@@ -141,7 +139,7 @@ class PSRM:
                 for j in weak_stages:
                     if j < s:
                         uncertainty = history.uncertainty(t + c[j] * h)
-                        error[error.size // 2 :] += h * abs(scheme.b[j]) * uncertainty
+                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
             weights = norm.weights(np.maximum(memory.magnitude, magnitude))
             error_ratio = norm(error, weights)
         return StepResult(

@@ -121,11 +121,10 @@ class DenseOutput:
         correction = self._steps.corrections[step]
         if not correction.size:
             return None
-        half = correction.size // 2
-        dq, dv = -correction[:half], -correction[half:]
         s = theta**2 * (3.0 - 2.0 * theta)
         r = theta**2 * (theta - 1.0)
-        return np.hstack([np.outer(s, dq) + h * np.outer(r, dv), np.outer(s, dv)])
+        slope = self._system.rate_change(-correction)
+        return -np.outer(s, correction) + h * np.outer(r, slope)
 
     def _all_rates(self, step: int, h: float) -> FloatArray:
         rates: FloatArray = self._steps.rates[step]

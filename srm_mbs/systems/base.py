@@ -61,6 +61,12 @@ class Terms(Protocol):
     def correction(self) -> FloatArray:
         """(E g, E c) (2 nv,): what to subtract from the state to satisfy g = 0 and c = 0."""
 
+    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
+        """Tangent rate and new multiplier of one SRM sweep, given the ``previous`` sweep's.
+
+        Mechanisms, (2.6): (v - E g/eps, M^-1 f - yhat_s), yhat_s = P (yhat_{s-1} + v/eps).
+        """
+
 
 class System(Protocol):
     """What both a mechanism and a DAE offer to the stepping."""
@@ -68,6 +74,8 @@ class System(Protocol):
     has_constraints: bool
     tangent_size: int
     evaluations: int
+    multiplier_part: slice
+    """Where the multiplier yhat acts in a tangent: (nv, 2 nv) for a mechanism."""
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """Factorise at one stage.
@@ -83,6 +91,10 @@ class System(Protocol):
 
     def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
         """Rate of the chart coordinate ``delta`` for the tangent rate at retract(state, delta)."""
+
+    def rate_change(self, delta: FloatArray) -> FloatArray:
+        """Change of the tangent rate that follows from moving the state by ``delta`` alone, the
+        accelerations kept: (dv, 0) for a mechanism, whose q' is v."""
 
     def magnitudes(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""

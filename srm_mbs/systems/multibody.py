@@ -46,6 +46,7 @@ class _Mechanics:
         self.data = self.model.createData()
         self.nq, self.nv = self.model.nq, self.model.nv
         self.tangent_size = 2 * self.nv
+        self.multiplier_part = slice(self.nv, 2 * self.nv)
         self.evaluations = 0
         self._controller = controller
         self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
@@ -114,6 +115,12 @@ class _Mechanics:
             out[own] = dexp_inverse(joint, delta[own], rate[own])
         return out
 
+    def rate_change(self, delta: FloatArray) -> FloatArray:
+        """(dv, 0); see :class:`~srm_mbs.systems.base.System`."""
+        out = np.zeros_like(delta)
+        out[..., : self.nv] = delta[..., self.nv :]
+        return out
+
     def magnitudes(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
 
@@ -159,6 +166,9 @@ class _OpenTerms:
 
     def correction(self) -> FloatArray:
         return np.zeros(2 * self._nv)
+
+    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
+        return self._rate, np.zeros(self._nv)
 
 
 class OpenSystem(_Mechanics):
@@ -242,6 +252,17 @@ class _ClosedTerms:
         right[:, 0] = p.normal(self._loops.g[p.order])
         right[:, 1] = p.white_project(self.v)
         return p.unwhiten(right).ravel(order="F")
+
+    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
+        p = self._p
+        nv = self.v.size
+        right = np.empty((nv, 3), order="F")
+        right[:, 0] = p.normal(self._loops.g[p.order])
+        right[:, 1] = p.white_project(previous + self.v / eps)
+        right[:, 2] = p.white_force - right[:, 1]
+        back = p.unwhiten(right)
+        rate = np.concatenate([self.v - back[:, 0] / eps, back[:, 2]])
+        return rate, back[:, 1]
 
 
 class ClosedSystem(_Mechanics):

@@ -47,6 +47,43 @@ def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     return mechanism.with_state(state.q, state.v)
 
 
+def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mechanism:
+    """The bundled spatial_dead_point with a Pinocchio ball joint: nq != nv.
+
+    ``angle`` (rad) and ``rate`` (rad/s) of the crank count from the guide line, where
+    :func:`tests.reduced.spatial_dead_point` has them.  Axes: x along the line, z along the crank's
+    axis; gravity is tilted instead of the line.  The rod does not spin.
+    """
+    crank, side = 2.0, 1.5
+    model = pin.Model()
+    model.name = "ball_dead_point"
+    model.gravity.linear = 9.81 * np.array([-0.5, -np.sqrt(0.75), 0.0])
+    first = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "crank")
+    model.appendBodyToJoint(first, rod(1.0, crank, 0.0), pin.SE3.Identity())
+    model.addBodyFrame("crank", first, pin.SE3.Identity(), 0)
+    second = model.addJoint(first, pin.JointModelSpherical(), along_x(crank), "rod")
+    model.appendBodyToJoint(second, rod(1.0, 2.5, 0.02), pin.SE3.Identity())
+    model.addBodyFrame("rod", second, pin.SE3.Identity(), 0)
+    loop = srm.LoopClosure(
+        "point_on_line",
+        srm.Anchor("rod", xyz=(2.5, 0.0, 0.0)),
+        srm.Anchor("world", xyz=(0.0, 0.0, side)),
+        (1.0, 0.0, 0.0),
+        "rail",
+    )
+    c, s = np.cos(angle), np.sin(angle)
+    along = np.array([crank * c, -crank * s, side])
+    along_rate = np.array([-crank * s, -crank * c, 0.0]) * rate
+    across = np.cross([0.3, 0.1, 1.0], along)
+    across /= np.linalg.norm(across)
+    x = along / 2.5
+    R = np.column_stack([x, across, np.cross(x, across)])
+    turn = np.cross(along, along_rate) / 2.5**2 - np.array([0.0, 0.0, rate])
+    Rc = pin.exp3(np.array([0.0, 0.0, angle]))
+    q = np.concatenate([[angle], pin.Quaternion(Rc.T @ R).coeffs()])
+    return srm.Mechanism(model, (loop,), q0=q, v0=np.concatenate([[rate], R.T @ turn]))
+
+
 def rescaled(
     mechanism: srm.Mechanism, length: float = 1.0, mass: float = 1.0, time: float = 1.0
 ) -> srm.Mechanism:

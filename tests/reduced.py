@@ -75,6 +75,24 @@ def n_four_bar(n: int) -> Field:
     return lambda t, y: [y[1], -G * weight / inertia * np.cos(y[0])]
 
 
+def spatial_dead_point() -> Field:
+    """(angle of the crank from the guide line, its rate) of the bundled spatial_dead_point.
+
+    With a that angle, crank 2 m and guide 1.5 m to the side, the slider is at 4 cos(a) on the
+    line, the rod's vector (2 cos a, -2 sin a, 1.5) and its centre at (3 cos a, sin a).  Twice the
+    kinetic energy is a'^2 times 4/3 (crank) + 9 sin^2 a + cos^2 a + 1/3 (rod) = 8/3 + 8 sin^2 a,
+    whatever the axial inertia: the rod's spin is constant, and its gyroscopic torque does no work.
+    """
+    rise = np.pi / 6.0
+
+    def field(t: float, y: Any) -> list[float]:
+        s, c = np.sin(y[0]), np.cos(y[0])
+        weight = G * (np.cos(rise) * c - 2.0 * np.sin(rise) * s)
+        return [y[1], (-4.0 * s * c * y[1] ** 2 - weight) / (4.0 / 3.0 + 4.0 * s * s)]
+
+    return field
+
+
 def index_one(mechanism: Mechanism) -> Field:
     """q' = v, M v' + G^T lam = f, G v' = -Gdot v: the unstabilised index-1 equations, flat q.
 

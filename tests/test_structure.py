@@ -35,6 +35,7 @@ KNOWN = {
     "slider_crank_slider": (3, 2, ("pin.y",)),
     "slider_crank_whirl": (2, 1, ()),
     "spatial_four_bar": (5, 3, ()),
+    "spatial_dead_point": (4, 2, ()),
 }
 CLOSED_MODELS = tuple(name for name in KNOWN if KNOWN[name][1])
 

@@ -29,10 +29,14 @@ class ErrorNorm:
         Absolute tolerance per tangent component.
     rtol
         Relative tolerance.
+    negligible
+        Fraction of the tolerance below which an effect is not worth an evaluation; 0 for fixed
+        steps, which have no tolerance.
     """
 
     atol: FloatArray
     rtol: float
+    negligible: float = 1e-3
 
     def weights(self, magnitude: FloatArray) -> FloatArray:
         """atol + rtol |x| (n,)."""

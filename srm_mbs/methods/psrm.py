@@ -23,6 +23,7 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.methods.branch import NEAR, on_branch, rounding_effect
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import get_tableau
@@ -30,7 +31,7 @@ from srm_mbs.systems.base import System, Zone
 
 ZONE_FLOOR = 1e-3
 """Smallest sigma_z; smaller values failed at tight tolerances."""
-ZONE_PER_STEP = 0.05
+ZONE_PER_STEP = 0.0
 """sigma_z as a fraction of the change of sigma over the step."""
 COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_FLOOR
 """h * slope of sigma from which the uncertainty of the predicted multiplier counts as error;
@@ -106,6 +107,9 @@ class PSRM:
         zone = None
         if history is not None:
             zone = Zone(max(ZONE_FLOOR, ZONE_PER_STEP * sigma_change), history.predict)
+        weights = norm.weights(memory.magnitude)
+        moved = None
+        projected = False
         rates = np.empty((s + 1, system.tangent_size))
         sigmas = np.full(s + 1, memory.sigma)
         rates[0] = memory.rate
@@ -116,9 +120,15 @@ class PSRM:
             delta = (h * (scheme.b if end else A[j, :j])) @ rates[:j]
             x = system.retract(state, delta)
             terms = system.evaluate(t + h if end else t + c[j] * h, x, zone)
+            sigmas[j] = terms.sigma
+            if zone is not None and terms.sigma < 1.0:
+                slope = max(sigma_change, abs(terms.sigma - memory.sigma) / (1.0 if end else c[j]))
+                terms, x, moved = on_branch(
+                    system, terms, t + h if end else t + c[j] * h, x, zone, h, slope, norm, weights
+                )
+                projected = projected or moved is not None
             rate = terms.rate()
             rates[j] = system.chart_rate(delta, rate)
-            sigmas[j] = terms.sigma
             rank = min(rank, terms.rank)
             if terms.weak:
                 weak_stages.append(j)
@@ -128,6 +138,8 @@ class PSRM:
             correction = theta * terms.correction()
             new_state = system.retract(x, -correction)
             end_rate = rate - system.rate_change(correction)
+            if moved is not None:
+                correction = correction + moved
             multiplier = None if terms.weak else terms.multiplier().copy()
         else:
             correction = np.zeros(0)
@@ -141,6 +153,11 @@ class PSRM:
                         uncertainty = history.uncertainty(t + c[j] * h)
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
             weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+            lowest = float(sigmas[1:].min())
+            if history is not None and lowest < NEAR * sigma_change:
+                one = norm.atol / norm.rtol
+                noise = rounding_effect(system, one, lowest, sigma_change, h, projected)
+                weights = weights + np.abs(scheme.error).max() * noise
             error_ratio = norm(error, weights)
         return StepResult(
             t=t,

@@ -12,12 +12,14 @@ tolerance of the closures.  The extra stages of dop853 are evaluated only when a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.stepping.hermite import HermiteStep, close_to_singular
 from srm_mbs.systems.base import System, Zone
 
 
@@ -76,6 +78,8 @@ class DenseOutput:
     def __init__(self, system: System, scheme: ButcherTableau, steps: StepData) -> None:
         self._system = system
         self._extension = scheme.dense
+        self._abscissae = np.append(scheme.c, 1.0)
+        self._smooth: dict[int, HermiteStep] = {}
         self._steps = steps
         self._extra: dict[int, FloatArray] = {}
 
@@ -107,6 +111,10 @@ class DenseOutput:
 
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
         data, system = self._steps, self._system
+        if data.count > 1 and close_to_singular(self._abscissae, data.sigmas[step]):
+            if step not in self._smooth:
+                self._smooth[step] = HermiteStep(system, data, step, self._last_rate)
+            return self._smooth[step](theta)
         h = data.times[step + 1] - data.times[step]
         start = data.states[step]
         delta = (h * self._extension.weights(theta)) @ self._all_rates(step, h)
@@ -116,6 +124,12 @@ class DenseOutput:
             x = system.retract(start, delta[k])
             states.append(x if ramps is None else system.retract(x, ramps[k]))
         return np.array(states)
+
+    @cached_property
+    def _last_rate(self) -> FloatArray:
+        """Tangent rate at the end of the last step."""
+        data = self._steps
+        return self._system.evaluate(float(data.times[-1]), data.states[-1]).rate().copy()
 
     def _ramps(self, step: int, theta: FloatArray, h: float) -> FloatArray | None:
         correction = self._steps.corrections[step]

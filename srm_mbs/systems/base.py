@@ -89,12 +89,18 @@ class System(Protocol):
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move along the tangent ``delta`` from ``state``; a new state."""
 
+    def difference(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """The tangent that moves ``start`` to ``end``: the inverse of :meth:`retract`."""
+
     def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
         """Rate of the chart coordinate ``delta`` for the tangent rate at retract(state, delta)."""
 
     def rate_change(self, delta: FloatArray) -> FloatArray:
         """Change of the tangent rate that follows from moving the state by ``delta`` alone, the
         accelerations kept: (dv, 0) for a mechanism, whose q' is v."""
+
+    def size(self, delta: FloatArray) -> float:
+        """Largest motion of the positions in ``delta``, in units (rad, scene diagonals)."""
 
     def magnitudes(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""

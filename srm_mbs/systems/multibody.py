@@ -103,6 +103,19 @@ class _Mechanics:
         out[self.nq :] = state[self.nq :] + delta[self.nv :]
         return out
 
+    def difference(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """(q_end (-) q_start, v_end - v_start); see :class:`~srm_mbs.systems.base.System`."""
+        if self._flat:
+            return end - start
+        nq = self.nq
+        delta = np.concatenate(
+            [pin.difference(self.model, start[:nq], end[:nq]), end[nq:] - start[nq:]]
+        )
+        # The logarithm loses digits at small angles, the exponential does not.
+        moved = self.retract(start, delta)
+        delta[: self.nv] += pin.difference(self.model, moved[:nq], end[:nq])
+        return delta
+
     def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
         """dexp^-1 on the joints that need it; ``rate`` itself otherwise."""
         if not self._groups:
@@ -120,6 +133,10 @@ class _Mechanics:
         out = np.zeros_like(delta)
         out[..., : self.nv] = delta[..., self.nv :]
         return out
+
+    def size(self, delta: FloatArray) -> float:
+        """max |dq| over units; see :class:`~srm_mbs.systems.base.System`."""
+        return float((np.abs(delta[: self.nv]) / self._unit).max())
 
     def magnitudes(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.

@@ -9,6 +9,7 @@ in the chart at the start of the step.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,7 +57,7 @@ class HermiteStep:
         self._last_rate = last_rate
         polynomials = [self._through(count) for count in NODES]
         values = [polynomial(_PROBES) for polynomial in polynomials]
-        changes = [float(np.abs(b - a).max()) for a, b in zip(values, values[1:])]
+        changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
         self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
 
     def _through(self, count: int):  # type: ignore[no-untyped-def]

@@ -81,15 +81,21 @@ def save_solution(solution: Solution, path: Path) -> None:
         "status": solution.status,
         "message": solution.message,
         "zones": [[index, threshold] for index, (threshold, _) in zones.items()],
+        "stop": solution.steps.stop,
+        "events": None if solution.t_events is None else len(solution.t_events),
     }
     arrays: dict[str, Any] = {name: getattr(solution.steps, name) for name in _STEP_ARRAYS}
     for k, (_, history) in enumerate(zones.values()):
         arrays[f"zone_{k}_times"] = history.times
         arrays[f"zone_{k}_values"] = history.values
+    found = (solution.t_events or [], solution.q_events or [], solution.v_events or [])
+    for k, (times, q, v) in enumerate(zip(*found)):
+        arrays[f"event_{k}_times"] = times
+        arrays[f"event_{k}_states"] = np.hstack([q, v])
     if solution.t_eval is not None:
         arrays["t_eval"] = solution.t_eval
     arrays |= {
-        "rejected": solution.rejected,
+        "attempts": solution.attempts,
         "q0": mechanism.q0,
         "v0": mechanism.v0,
         "row_scale": structure.row_scale,
@@ -128,6 +134,15 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         defaults=SimulationDefaults(**entry["defaults"]),
         notes=tuple(entry["notes"]),
     )
+
+
+def _events(
+    count: int | None, arrays: dict[str, FloatArray]
+) -> tuple[list[FloatArray], list[FloatArray]] | None:
+    if count is None:
+        return None
+    times = [arrays[f"event_{k}_times"] for k in range(count)]
+    return times, [arrays[f"event_{k}_states"] for k in range(count)]
 
 
 def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
@@ -187,16 +202,20 @@ def load_solution(path: str | Path) -> Solution:
             )
             for k, (index, threshold) in enumerate(meta["zones"])
         }
-        steps = StepData(**{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones)
+        steps = StepData(
+            **{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones, stop=meta["stop"]
+        )
         _check_shapes(mechanism, meta["settings"]["tableau"], steps)
-        settings = Settings(**meta["settings"] | {"atol": tuple(meta["settings"]["atol"])})
+        tuples = {key: tuple(meta["settings"][key]) for key in ("atol", "singular_times")}
+        settings = Settings(**meta["settings"] | tuples)
         return Solution(
             mechanism,
             make_system(mechanism),
             get_tableau(settings.tableau),
             steps,
             t_eval=arrays.get("t_eval"),
-            rejected=arrays["rejected"],
+            attempts=arrays["attempts"],
+            events=_events(meta["events"], arrays),
             status=meta["status"],
             message=meta["message"],
             stats=Statistics(**meta["stats"]),

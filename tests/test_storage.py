@@ -27,6 +27,8 @@ def test_a_saved_run_interpolates_to_the_last_bit(name: str, tmp_path: Path) -> 
     assert np.array_equal(loaded.drift, solution.drift)
     assert np.array_equal(loaded.energy, solution.energy)
     assert loaded.crossings == solution.crossings
+    assert np.array_equal(loaded.attempts, solution.attempts)
+    assert loaded.t_events is None
     assert loaded.mechanism.source == solution.mechanism.source
 
 
@@ -37,6 +39,32 @@ def test_a_run_through_the_zone_interpolates_to_the_last_bit(tmp_path: Path) -> 
     loaded = srm.load_solution(tmp_path / "run")
     t = np.linspace(0.0, 2.0, 1001)
     assert np.array_equal(solution(t)[0], loaded(t)[0])
+
+
+def test_events_and_where_they_ended_the_run_are_saved(tmp_path: Path) -> None:
+    def upwards(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        return float(np.cos(q[0]))
+
+    def never(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        return 1.0
+
+    upwards.terminal = 2  # type: ignore[attr-defined]
+    solution = srm.simulate(
+        srm.load("slider_crank"), 5.0, events=[upwards, never], singular_times=[1.0, 2.0]
+    )
+    assert solution.status == "event"
+    solution.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    assert loaded.success
+    assert loaded.settings == solution.settings
+    assert np.array_equal(loaded.t, solution.t)
+    assert np.array_equal(loaded.q, solution.q)
+    for name in ("t_events", "q_events", "v_events"):
+        for ours, theirs in zip(getattr(loaded, name), getattr(solution, name)):
+            assert np.array_equal(ours, theirs)
+            assert ours.shape == theirs.shape
+    with pytest.raises(ValueError, match="dense output covers"):
+        loaded(solution.t[-1] + 1e-3)
 
 
 def test_a_mechanism_built_in_python_is_saved_with_its_model(tmp_path: Path) -> None:

@@ -28,8 +28,7 @@ from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
 from srm_mbs.stepping.dense import DenseOutput, step_data
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
-from srm_mbs.stepping.placement import SingularityPlacement
-from srm_mbs.stepping.singular_times import AvoidTimes, HalvedStep, SlopeOfSigma
+from srm_mbs.stepping.singular_times import PLACEMENTS, Placing, placed
 from srm_mbs.stepping.stepsize import (
     FixedStep,
     PIControl,
@@ -51,13 +50,10 @@ CONSISTENT = 1e-8
 SINGULAR_START = 1e-5
 """sigma below which a start is refused: round-off in q, over sigma, is an error of the rates."""
 BACKENDS = ("auto", "python")
-PLACEMENTS = ("automatic", "halved", "off")
 ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
 AVOIDABLE = 1e-9
 """Fraction of the run within which of its ends a given singular time cannot be avoided."""
-
-_Wrapper = SingularityPlacement | SlopeOfSigma | AvoidTimes
 
 
 def _positive(value: Any, what: str, unit: str = "") -> float:
@@ -236,7 +232,7 @@ def _control(
     t_end: float,
     placement: str,
     singular_times: FloatArray,
-) -> tuple[StepSizeControl, Sequence[_Wrapper]]:
+) -> tuple[StepSizeControl, Sequence[Placing]]:
     """The step-size control of a run, and the wrappers in it that count what they did."""
     scheme = method.scheme
     control: StepSizeControl
@@ -250,22 +246,9 @@ def _control(
                 remedy="Give step=, or use tvd32, dopr54 or dop853",
             )
         control = PIControl(t_end, first_step(), scheme.controller_order)
-    wrappers: list[_Wrapper] = []
-    if system.has_constraints:
-        around: _Wrapper
-        if placement == "automatic":
-            around = SingularityPlacement(control, scheme)
-        elif placement == "halved":
-            around = HalvedStep(control, scheme, t_end)
-        else:
-            around = SlopeOfSigma(control, scheme)
-        control = around
-        wrappers.append(around)
-    if len(singular_times):
-        # Outermost: nothing may change a step that was made to avoid these times.
-        control = AvoidTimes(control, scheme, singular_times, t_end, step)
-        wrappers.append(control)
-    return control, wrappers
+    return placed(
+        control, scheme, placement if system.has_constraints else None, singular_times, t_end, step
+    )
 
 
 def simulate(
@@ -391,7 +374,7 @@ def simulate(
         _check_consistent(mechanism)
 
     watch = _event_watch(events, system, method, state)
-    wrappers: Sequence[_Wrapper] = ()
+    wrappers: Sequence[Placing] = ()
     try:
         memory = method.start(system, 0.0, state, norm)
         if memory.sigma < SINGULAR_START:
@@ -459,7 +442,7 @@ def _collect(
     system: OpenSystem | ClosedSystem,
     method: Method,
     record: RunRecord,
-    wrappers: Sequence[_Wrapper],
+    wrappers: Sequence[Placing],
     watch: EventWatch | None,
     t_eval: FloatArray | None,
     settings: Settings,

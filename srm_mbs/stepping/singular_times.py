@@ -8,7 +8,8 @@ Further wrappers of step-size control, beside the automatic
   one whole step over the point (thesis, 2.4.1 (1));
 * :class:`SlopeOfSigma`: neither, only the slope of sigma that the zone needs.
 
-With a fixed step all of them split a step, and the run returns to its grid.
+With a fixed step all of them split a step, and the run returns to its grid.  :func:`placed` puts
+together what a user chose, for mechanisms and DAEs alike.
 """
 
 from __future__ import annotations
@@ -18,9 +19,16 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import Memory, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.stepping.placement import FAR_ENOUGH, TOO_CLOSE, sigma_slope
+from srm_mbs.stepping.placement import (
+    FAR_ENOUGH,
+    TOO_CLOSE,
+    SingularityPlacement,
+    sigma_slope,
+)
 from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
 
+PLACEMENTS = ("automatic", "halved", "off")
+"""What is done around singular configurations that sigma shows."""
 CLEARANCE = 0.05
 """Smallest distance of a stage from a given time, as a fraction of the step."""
 AHEAD = 0.15
@@ -198,3 +206,44 @@ class HalvedStep(SlopeOfSigma):
         sigmas = result.sigmas
         reach = h * max(self._slope, sigma_slope(self._abscissae, sigmas, h))
         return bool(sigmas[-1] < TOO_CLOSE * reach and sigmas[0] > FAR_ENOUGH * reach)
+
+
+Placing = SingularityPlacement | SlopeOfSigma | AvoidTimes
+"""A control that counts, in ``placed`` and ``replaced``, what it did."""
+
+
+def placed(
+    control: StepSizeControl,
+    scheme: ButcherTableau,
+    placement: str | None,
+    times: FloatArray,
+    t_end: float,
+    step: float | None = None,
+) -> tuple[StepSizeControl, tuple[Placing, ...]]:
+    """``control`` with its steps placed, and the wrappers that do it.
+
+    Parameters
+    ----------
+    control, scheme
+        What is wrapped; the tableau of the run.
+    placement
+        One of :data:`PLACEMENTS`; None for a system without constraints, which has no sigma.
+    times : (k,) s
+        Times to be avoided, within the run; often none.
+    t_end
+        End of the run (s).
+    step
+        The step (s) if it is fixed.
+    """
+    wrappers: list[Placing] = []
+    if placement == "automatic":
+        wrappers.append(SingularityPlacement(control, scheme))
+    elif placement == "halved":
+        wrappers.append(HalvedStep(control, scheme, t_end))
+    elif placement == "off":
+        wrappers.append(SlopeOfSigma(control, scheme))
+    if len(times):
+        # Outermost: nothing may change a step that was made to avoid these times.
+        inner = wrappers[-1] if wrappers else control
+        wrappers.append(AvoidTimes(inner, scheme, times, t_end, step))
+    return (wrappers[-1] if wrappers else control), tuple(wrappers)

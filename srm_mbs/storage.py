@@ -20,13 +20,13 @@ from srm_mbs.loading import rebuild
 from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism, SimulationDefaults, Source
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
-from srm_mbs.solution import Settings, Solution, Statistics
+from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure
 from srm_mbs.systems.units import Units
 
-FORMAT = 1
+FORMAT = 2
 _STEP_ARRAYS = (
     "times",
     "states",
@@ -142,7 +142,12 @@ def _events(
     if count is None:
         return None
     times = [arrays[f"event_{k}_times"] for k in range(count)]
-    return times, [arrays[f"event_{k}_states"] for k in range(count)]
+    states = [arrays[f"event_{k}_states"] for k in range(count)]
+    for k in range(count):
+        expected = (len(times[k]), arrays["states"].shape[1])
+        if times[k].ndim != 1 or states[k].shape != expected:
+            raise ValueError(f"event_{k}_states has shape {states[k].shape}, not {expected}")
+    return times, states
 
 
 def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
@@ -161,6 +166,8 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
             raise ValueError(f"{name} has shape {getattr(steps, name).shape}, not {shape}")
     if steps.corrections.shape not in ((n, m), (n, 0)):
         raise ValueError(f"corrections has shape {steps.corrections.shape}")
+    if steps.stop is not None and not (n and steps.times[-2] <= steps.stop <= steps.times[-1]):
+        raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 
 
 def load_solution(path: str | Path) -> Solution:
@@ -202,6 +209,8 @@ def load_solution(path: str | Path) -> Solution:
             )
             for k, (index, threshold) in enumerate(meta["zones"])
         }
+        if arrays["attempts"].dtype != ATTEMPT:
+            raise ValueError(f"attempts has the fields {arrays['attempts'].dtype}")
         steps = StepData(
             **{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones, stop=meta["stop"]
         )

@@ -29,6 +29,7 @@ from srm_mbs.stepping.dense import DenseOutput, step_data
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.singular_times import PLACEMENTS, Placing, placed
+from srm_mbs.stepping.starting import start
 from srm_mbs.stepping.stepsize import (
     FixedStep,
     PIControl,
@@ -47,8 +48,6 @@ LOOSEST_RTOL = 1e-4
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
-SINGULAR_START = 1e-5
-"""sigma below which a start is refused: round-off in q, over sigma, is an error of the rates."""
 BACKENDS = ("auto", "python")
 ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
@@ -376,14 +375,7 @@ def simulate(
     watch = _event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()
     try:
-        memory = method.start(system, 0.0, state, norm)
-        if memory.sigma < SINGULAR_START:
-            raise EvaluationError(
-                "the start is, or almost is, a singular configuration "
-                f"(sigma = {memory.sigma:.1e}), from where "
-                "this version cannot tell the branches apart; start beside it, at sigma "
-                "above 1e-3"
-            )
+        memory = start(system, method, 0.0, state, norm, t_end)
 
         def chosen_first_step() -> float:
             if first_step is not None:

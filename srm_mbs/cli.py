@@ -231,6 +231,10 @@ def simulate(
         Path | None,
         typer.Option(metavar="FILE", help="Plot the run; the suffix is .png, .pdf or .svg."),
     ] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="Write the motion at the steps as a table."),
+    ] = None,
     html: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Write the animation as one page."),
@@ -250,6 +254,8 @@ def simulate(
         from srm_mbs.plots import FORMATS
 
         _check_output(plot, "--plot", FORMATS)
+    if csv is not None:
+        _check_output(csv, "--csv", (".csv",))
     if html is not None:
         _check_output(html, "--html", (".html", ".htm"))
 
@@ -267,7 +273,12 @@ def simulate(
         backend=backend,
     )
     written, failed = _write(
-        [(out, solution.save), (plot, solution.plot), (html, solution.export_html)]
+        [
+            (out, solution.save),
+            (plot, solution.plot),
+            (csv, solution.to_csv),
+            (html, solution.export_html),
+        ]
     )
     _table([*run_rows(solution), *(("written", str(path)) for path in written)])
     typer.echo(solution.message, err=not solution.success)

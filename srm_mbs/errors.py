@@ -94,6 +94,10 @@ class ControllerError(SrmError):
     """The user's controller raised, or returned something that is not a finite (nv,) vector."""
 
 
+class EventError(SrmError):
+    """An event function raised, or returned something that is not one finite number."""
+
+
 class SimulationError(SrmError, RuntimeError):
     """A run failed and the caller asked for an exception; ``solution`` holds what was computed."""
 

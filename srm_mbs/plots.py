@@ -94,7 +94,7 @@ def plot_run(solution: Solution, path: Path | None = None) -> Figure:
             title = draw(axes, solution)
             axes.set_title(f"({letter}) {title}", loc="left", fontsize=FONT_SIZE + 0.5)
             _legend(axes)
-    start, end = solution.steps.times[0], solution.steps.times[-1]
+    start, end = solution.steps.times[0], solution.steps.end
     margin = 0.01 * (end - start) or 1.0
     panels[-1].set_xlim(start - margin, end + margin)
     panels[-1].set_xlabel("time (s)", fontsize=FONT_SIZE)
@@ -114,7 +114,7 @@ def _title(solution: Solution) -> str:
     parts = [solution.mechanism.name, settings.method, settings.tableau, control]
     title = ", ".join(part for part in parts if part)
     if not solution.success:
-        title += f"\n{solution.status} at t = {solution.steps.times[-1]:.6g} s"
+        title += f"\n{solution.status} at t = {solution.steps.end:.6g} s"
     return title
 
 
@@ -235,17 +235,20 @@ def _step_sizes(axes: Axes, solution: Solution) -> str:
         label="accepted",
         **_dots(steps.count),
     )
-    if len(solution.rejected):
-        axes.plot(
-            solution.rejected[:, 0],
-            solution.rejected[:, 1],
-            color=VERMILION,
-            marker="x",
-            markersize=4.0,
-            markeredgewidth=0.9,
-            linestyle="none",
-            label="rejected or redone",
-        )
+    crosses = {"rejected": (solution.rejected, VERMILION, "x")}
+    crosses["redone"] = (solution.replaced, BLACK, "+")
+    for label, (attempts, colour, marker) in crosses.items():
+        if len(attempts):
+            axes.plot(
+                attempts[:, 0],
+                attempts[:, 1],
+                color=colour,
+                marker=marker,
+                markersize=4.0,
+                markeredgewidth=0.9,
+                linestyle="none",
+                label=label,
+            )
     _log_axis(axes)
     axes.set_ylabel("step size (s)", fontsize=FONT_SIZE)
     return "steps"

@@ -83,7 +83,7 @@ def sample_motion(solution: Solution, joints: tuple[int, ...], fps: float) -> Mo
         Wanted key frames per second.  There are fewer if otherwise all bodies together had more
         than :data:`MAX_BODY_FRAMES`, but at least :data:`MIN_FPS` or ``fps``, the smaller one.
     """
-    start, end = (float(t) for t in solution.steps.times[[0, -1]])
+    start, end = float(solution.steps.times[0]), solution.steps.end
     duration = end - start
     wanted = duration * fps * (1.0 - 1e-12)  # rounding must not add one to a whole number
     allowed = max(MAX_BODY_FRAMES // max(1, len(joints)), math.ceil(MIN_FPS * duration))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -24,10 +24,12 @@ from srm_mbs.methods.base import ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.psrm import PSRM
 from srm_mbs.progress import progress_bar
-from srm_mbs.solution import Settings, Solution, Statistics
-from srm_mbs.stepping.dense import StepData
+from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
+from srm_mbs.stepping.dense import DenseOutput, step_data
+from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
-from srm_mbs.stepping.placement import SingularityPlacement
+from srm_mbs.stepping.singular_times import PLACEMENTS, Placing, placed
+from srm_mbs.stepping.starting import start
 from srm_mbs.stepping.stepsize import (
     FixedStep,
     PIControl,
@@ -46,9 +48,11 @@ LOOSEST_RTOL = 1e-4
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
-SINGULAR_START = 1e-5
-"""sigma below which a start is refused: round-off in q, over sigma, is an error of the rates."""
 BACKENDS = ("auto", "python")
+ROUND_OFF = 1e-12
+"""Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
+AVOIDABLE = 1e-9
+"""Fraction of the run within which of its ends a given singular time cannot be avoided."""
 
 
 def _positive(value: Any, what: str, unit: str = "") -> float:
@@ -157,6 +161,40 @@ def _checked_times(t_eval: Any, t_end: float) -> FloatArray | None:
     return np.clip(times, 0.0, t_end)
 
 
+def _checked_singular_times(singular_times: Any, t_end: float) -> FloatArray:
+    """The given times within the run, in order."""
+    remedy = "Give times (s) between the start and the end of the run"
+    times = _numbers(singular_times, "singular_times", remedy)
+    if times.ndim != 1:
+        raise InputError(
+            f"singular_times has shape {times.shape}", element="singular_times", remedy=remedy
+        )
+    times = np.unique(times)
+    slack = AVOIDABLE * t_end
+    for end in (0.0, t_end):
+        if np.any(np.abs(times - end) <= slack):
+            raise InputError(
+                f"the run starts or ends at {end:g} s, where a step must begin or end",
+                element="singular_times",
+                remedy=remedy,
+            )
+    inside: FloatArray = times[(times > 0.0) & (times < t_end)]
+    return inside
+
+
+def _event_watch(
+    events: Any, system: OpenSystem | ClosedSystem, method: Method, state: FloatArray
+) -> EventWatch | None:
+    """What looks for the events (t, q, v) -> float; None if none are given."""
+    if events is None:
+        return None
+
+    def adapt(event: Callable[..., Any]) -> StateFunction:
+        return lambda t, x: event(t, *system.split(x))
+
+    return EventWatch(system, method.scheme, prepare_events(events, adapt), state.size)
+
+
 def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, FloatArray]:
     """The mechanism with the requested start, and the state (q, v)."""
     if q0 is not None or v0 is not None:
@@ -191,11 +229,14 @@ def _control(
     step: float | None,
     first_step: Callable[[], float],
     t_end: float,
-) -> tuple[StepSizeControl, SingularityPlacement | None]:
+    placement: str,
+    singular_times: FloatArray,
+) -> tuple[StepSizeControl, Sequence[Placing]]:
+    """The step-size control of a run, and the wrappers in it that count what they did."""
     scheme = method.scheme
-    inner: StepSizeControl
+    control: StepSizeControl
     if step is not None:
-        inner = FixedStep(0.0, t_end, step)
+        control = FixedStep(0.0, t_end, step)
     else:
         if scheme.controller_order is None:
             raise InputError(
@@ -203,11 +244,10 @@ def _control(
                 element="tableau",
                 remedy="Give step=, or use tvd32, dopr54 or dop853",
             )
-        inner = PIControl(t_end, first_step(), scheme.controller_order)
-    if not system.has_constraints:
-        return inner, None
-    placement = SingularityPlacement(inner, scheme)
-    return placement, placement
+        control = PIControl(t_end, first_step(), scheme.controller_order)
+    return placed(
+        control, scheme, placement if system.has_constraints else None, singular_times, t_end, step
+    )
 
 
 def simulate(
@@ -224,7 +264,10 @@ def simulate(
     first_step: float | None = None,
     max_step: float | None = None,
     t_eval: Any = None,
+    events: Any = None,
     controller: Controller | None = None,
+    placement: str = "automatic",
+    singular_times: Any = (),
     progress: bool | Tick = False,
     backend: str = "auto",
     raise_on_failure: bool = False,
@@ -256,8 +299,21 @@ def simulate(
         First and longest step (s) of the step-size control.
     t_eval : (n,)
         Times (s) at which the solution is given; by default the ends of the steps.
+    events
+        A function (t, q, v) -> float or a list of them; an event is where it passes zero.  As in
+        ``scipy.integrate.solve_ivp``, the attribute ``terminal`` of the function (a bool, or a
+        number of occurrences) ends the run there with status ``event``, and ``direction`` (> 0
+        or < 0) counts only zeros passed upwards or downwards.  Zeros at t = 0 are no events.
+        Located on the dense output (:mod:`srm_mbs.stepping.events`).
     controller
         (t, q, v) -> generalised forces (nv,), N and N m, called at every stage.
+    placement
+        How steps are placed around singular configurations: ``"automatic"``, from sigma;
+        ``"halved"``, the thesis' rule 2.4.1 (1): a step h that ends on one is replaced by h/2
+        (h/4 where the tableau has inner stages) and then h; or ``"off"``.
+    singular_times : (k,)
+        Times (s) on which no stage or end of a step may lie, beside what ``placement`` does
+        (thesis, 2.4.1 (2)); those outside the run are ignored.
     progress
         True for a progress bar (on a terminal only), or a callable (t, h, state).
     backend
@@ -268,7 +324,8 @@ def simulate(
     Returns
     -------
     Solution
-        With ``success`` False and everything computed so far if the run could not go on.
+        With ``success`` False and everything computed so far if the run could not go on, an
+        event function that raises or returns no finite number included.
 
     Raises
     ------
@@ -299,6 +356,13 @@ def simulate(
             element="backend",
             remedy=f"This version has {', '.join(BACKENDS)}; the compiled kernel is not built yet",
         )
+    if placement not in PLACEMENTS:
+        raise InputError(
+            f"there is no placement {placement!r}",
+            element="placement",
+            remedy=f"Give one of {', '.join(repr(name) for name in PLACEMENTS)}",
+        )
+    avoided = _checked_singular_times(singular_times, t_end)
     method = _checked_method(method, tableau)
     rtol = _checked_rtol(rtol)
     times = _checked_times(t_eval, t_end)
@@ -308,16 +372,10 @@ def simulate(
     if mechanism.loops:
         _check_consistent(mechanism)
 
-    placement: SingularityPlacement | None = None
+    watch = _event_watch(events, system, method, state)
+    wrappers: Sequence[Placing] = ()
     try:
-        memory = method.start(system, 0.0, state, norm)
-        if memory.sigma < SINGULAR_START:
-            raise EvaluationError(
-                "the start is, or almost is, a singular configuration "
-                f"(sigma = {memory.sigma:.1e}), from where "
-                "this version cannot tell the branches apart; start beside it, at sigma "
-                "above 1e-3"
-            )
+        memory = start(system, method, 0.0, state, norm, t_end)
 
         def chosen_first_step() -> float:
             if first_step is not None:
@@ -325,7 +383,9 @@ def simulate(
             order = method.scheme.controller_order or 1
             return initial_step(system, state, memory, norm, t_end, order)
 
-        control, placement = _control(system, method, step, chosen_first_step, t_end)
+        control, wrappers = _control(
+            system, method, step, chosen_first_step, t_end, placement, avoided
+        )
         with _progress(progress, system, t_end) as tick:
             record = integrate(
                 system,
@@ -338,6 +398,7 @@ def simulate(
                 t_end,
                 max_step=np.inf if max_step is None else max_step,
                 tick=tick,
+                events=watch,
             )
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(0.0, state.copy())
@@ -349,8 +410,10 @@ def simulate(
         tuple(norm.atol.tolist()),
         step,
         controller is not None,
+        placement,
+        tuple(avoided.tolist()),
     )
-    solution = _collect(mechanism, system, method, record, placement, times, settings)
+    solution = _collect(mechanism, system, method, record, wrappers, watch, times, settings)
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)
     return solution
@@ -371,34 +434,28 @@ def _collect(
     system: OpenSystem | ClosedSystem,
     method: Method,
     record: RunRecord,
-    placement: SingularityPlacement | None,
+    wrappers: Sequence[Placing],
+    watch: EventWatch | None,
     t_eval: FloatArray | None,
     settings: Settings,
 ) -> Solution:
     """Arrays and statistics from a run record."""
-    steps, scheme = record.steps, method.scheme
-    stages, m = scheme.n_stages + 1, system.tangent_size
-    n = len(steps)
-    data = StepData(
-        times=np.array([record.t0, *record.times]),
-        states=np.array([record.x0, *(s.state for s in steps)]),
-        rates=np.array([s.rates for s in steps]).reshape(n, stages, m),
-        corrections=np.array([s.correction for s in steps]).reshape(n, -1 if n else 0),
-        sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
-        ranks=np.array([s.rank for s in steps], dtype=float),
-        error_ratios=np.array([s.error_ratio for s in steps]),
-        zones={
-            i: (s.zone.threshold, s.history)
-            for i, s in enumerate(steps)
-            if s.zone is not None and s.history is not None
-        },
+    scheme = method.scheme
+    data = step_data(
+        record.t0,
+        record.x0,
+        record.times,
+        record.steps,
+        scheme,
+        system.tangent_size,
+        record.stop,
     )
     rejected = [a for a in record.attempts if a.verdict is Verdict.REJECTED]
     stats = Statistics(
-        steps=n,
+        steps=data.count,
         rejected=len(rejected),
-        placements=0 if placement is None else placement.placed,
-        replaced=0 if placement is None else placement.replaced,
+        placements=sum(wrapper.placed for wrapper in wrappers),
+        replaced=sum(wrapper.replaced for wrapper in wrappers),
         zone_steps=len(data.zones),
         evaluations=system.evaluations,
         factorisations=system.factorisations,
@@ -410,17 +467,21 @@ def _collect(
         scheme,
         data,
         t_eval=t_eval,
-        rejected=np.array([[a.t, a.h] for a in record.attempts]).reshape(-1, 2),
+        attempts=np.array(
+            [(a.t, a.h, a.error_ratio, a.verdict.value) for a in record.attempts], dtype=ATTEMPT
+        ),
+        events=None if watch is None else watch.found(),
         status=record.status,
-        message=record.message + _limits_left(mechanism, data.states),
+        message=record.message + _limits_left(mechanism, DenseOutput(system, scheme, data)),
         stats=stats,
         settings=settings,
     )
 
 
-def _limits_left(mechanism: Mechanism, states: FloatArray) -> str:
+def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
     """A sentence naming the one-degree joints that left their limits, which do not act."""
     model = mechanism.model
+    _, states = dense.nodes()
     left = []
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
@@ -429,6 +490,8 @@ def _limits_left(mechanism: Mechanism, states: FloatArray) -> str:
         low = model.lowerPositionLimit[joint.idx_q]
         high = model.upperPositionLimit[joint.idx_q]
         q = states[:, joint.idx_q]
-        if low < high and (q.min() < low or q.max() > high):
+        # A run that a terminal event ends at a limit has not left it.
+        slack = ROUND_OFF * max(1.0, float(np.abs(q).max()))
+        if low < high and max(low - q.min(), q.max() - high) > slack:
             left.append(name)
     return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
@@ -64,6 +65,13 @@ class Settings:
     atol: tuple[float, ...]
     step: float | None
     controlled: bool
+    placement: str = "automatic"
+    singular_times: tuple[float, ...] = ()
+
+
+ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
+"""A step that did not stand: its start and length (s), error estimate over tolerance, and whether
+it was ``"rejected"`` for its error or ``"replaced"`` because of a singular configuration."""
 
 
 class Solution:
@@ -74,17 +82,21 @@ class Solution:
     mechanism
         What was simulated.
     t : (n,) s
-        ``t_eval``, or the ends of the accepted steps, the start first.
+        ``t_eval``, or the ends of the accepted steps, the start first and a terminal event last.
     q : (n, nq), v : (n, nv)
         Configurations and velocities there.
     status, message, success
-        ``finished``, ``failed`` or ``interrupted``; when and why; whether the end was reached.
+        ``finished``, ``event``, ``failed`` or ``interrupted``; when and why; whether the end, or
+        a terminal event, was reached.
     stats
         :class:`Statistics`.
     settings
         :class:`Settings`.
-    rejected : (k, 2)
-        Start time and length of the steps that did not stand.
+    attempts : (k,)
+        The steps that did not stand, a structured array of :data:`ATTEMPT`.
+    t_events, q_events, v_events
+        For each event in turn its times (k,) s, and the states (k, nq), (k, nv) there; None if
+        no events were given.
     """
 
     def __init__(
@@ -95,7 +107,8 @@ class Solution:
         steps: StepData,
         *,
         t_eval: FloatArray | None,
-        rejected: FloatArray,
+        attempts: NDArray[np.void],
+        events: tuple[list[FloatArray], list[FloatArray]] | None = None,
         status: str,
         message: str,
         stats: Statistics,
@@ -104,10 +117,10 @@ class Solution:
         self.mechanism = mechanism
         self.steps = steps
         self.scheme = scheme
-        self.rejected = rejected
+        self.attempts = attempts
         self.status = status
         self.message = message
-        self.success = status == "finished"
+        self.success = status in ("finished", "event")
         self.stats = stats
         self.settings = settings
         self._system = system
@@ -117,13 +130,22 @@ class Solution:
         steps.times.setflags(write=False)
         self.t_eval = t_eval
         if t_eval is None:
-            self.t = steps.times
-            states = steps.states
+            self.t, states = self._dense.nodes()
+            states.setflags(write=False)
+            self.t.setflags(write=False)
         else:
-            self.t = t_eval[t_eval <= steps.times[-1]]
+            self.t = t_eval[t_eval <= steps.end]
             states = self._dense(self.t)
         nq = mechanism.model.nq
         self.q, self.v = states[:, :nq], states[:, nq:]
+        self._events = events
+        self.t_events: list[FloatArray] | None = None
+        self.q_events: list[FloatArray] | None = None
+        self.v_events: list[FloatArray] | None = None
+        if events is not None:
+            self.t_events, found = events
+            self.q_events = [states[:, :nq] for states in found]
+            self.v_events = [states[:, nq:] for states in found]
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output: q and v at time ``t`` (s), a scalar or an array of any order.
@@ -142,6 +164,51 @@ class Solution:
         nq = self.mechanism.model.nq
         q, v = states[:, :nq], states[:, nq:]
         return (q[0], v[0]) if times.ndim == 0 else (q, v)
+
+    def at(self, t: Any) -> Solution:
+        """The same run read at other times: q, v, drift, energy, reactions, joints.
+
+        Parameters
+        ----------
+        t : (k,) s
+            Times within the run, in any order.
+
+        Raises
+        ------
+        ValueError
+            If a time lies outside the run, or ``t`` has not one dimension.
+        """
+        times = np.array(t, dtype=float)
+        if times.ndim != 1:
+            raise ValueError(f"t has shape {times.shape}; give a vector of times")
+        self._dense.check(times)
+        return Solution(
+            self.mechanism,
+            self._system,
+            self.scheme,
+            self.steps,
+            t_eval=np.clip(times, self.steps.times[0], self.steps.end),
+            attempts=self.attempts,
+            events=self._events,
+            status=self.status,
+            message=self.message,
+            stats=self.stats,
+            settings=self.settings,
+        )
+
+    @property
+    def rejected(self) -> FloatArray:
+        """Start and length (k, 2) s of the steps rejected for their error."""
+        return self._attempts("rejected")
+
+    @property
+    def replaced(self) -> FloatArray:
+        """Start and length (k, 2) s of the steps redone because of a singular configuration."""
+        return self._attempts("replaced")
+
+    def _attempts(self, verdict: str) -> FloatArray:
+        chosen = self.attempts[self.attempts["verdict"] == verdict]
+        return np.column_stack([chosen["t"], chosen["h"]])
 
     def joint(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Position and rate (n,), (n,) of a one-degree joint at ``t``; angles are unwrapped.
@@ -186,7 +253,8 @@ class Solution:
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
-        return find_crossings(self.scheme, self.steps)
+        found = find_crossings(self.scheme, self.steps)
+        return tuple(crossing for crossing in found if crossing.time <= self.steps.end)
 
     @cached_property
     def drift(self) -> FloatArray:
@@ -219,6 +287,20 @@ class Solution:
     def reaction_multipliers(self) -> Mapping[str, FloatArray]:
         """Per loop (n, rows): the multipliers lam of M v' = f - G^T lam, rows unscaled."""
         return self._reactions[1]
+
+    def to_csv(self, path: str | Path, t: Any = None) -> None:
+        """Write the motion as a table; see :func:`srm_mbs.export.write_csv`.
+
+        Parameters
+        ----------
+        path
+            File name; ``.csv`` is usual and is not added.
+        t : (k,) s
+            Times of its rows, in any order; by default ``solution.t``.
+        """
+        from srm_mbs.export import write_csv
+
+        write_csv(self if t is None else self.at(t), Path(path))
 
     def save(self, path: str | Path) -> None:
         """Write everything needed to replay and interpolate the run, description included.

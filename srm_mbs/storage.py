@@ -20,13 +20,13 @@ from srm_mbs.loading import rebuild
 from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism, SimulationDefaults, Source
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
-from srm_mbs.solution import Settings, Solution, Statistics
+from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure
 from srm_mbs.systems.units import Units
 
-FORMAT = 1
+FORMAT = 2
 _STEP_ARRAYS = (
     "times",
     "states",
@@ -81,15 +81,21 @@ def save_solution(solution: Solution, path: Path) -> None:
         "status": solution.status,
         "message": solution.message,
         "zones": [[index, threshold] for index, (threshold, _) in zones.items()],
+        "stop": solution.steps.stop,
+        "events": None if solution.t_events is None else len(solution.t_events),
     }
     arrays: dict[str, Any] = {name: getattr(solution.steps, name) for name in _STEP_ARRAYS}
     for k, (_, history) in enumerate(zones.values()):
         arrays[f"zone_{k}_times"] = history.times
         arrays[f"zone_{k}_values"] = history.values
+    found = (solution.t_events or [], solution.q_events or [], solution.v_events or [])
+    for k, (times, q, v) in enumerate(zip(*found)):
+        arrays[f"event_{k}_times"] = times
+        arrays[f"event_{k}_states"] = np.hstack([q, v])
     if solution.t_eval is not None:
         arrays["t_eval"] = solution.t_eval
     arrays |= {
-        "rejected": solution.rejected,
+        "attempts": solution.attempts,
         "q0": mechanism.q0,
         "v0": mechanism.v0,
         "row_scale": structure.row_scale,
@@ -130,6 +136,20 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
     )
 
 
+def _events(
+    count: int | None, arrays: dict[str, FloatArray]
+) -> tuple[list[FloatArray], list[FloatArray]] | None:
+    if count is None:
+        return None
+    times = [arrays[f"event_{k}_times"] for k in range(count)]
+    states = [arrays[f"event_{k}_states"] for k in range(count)]
+    for k in range(count):
+        expected = (len(times[k]), arrays["states"].shape[1])
+        if times[k].ndim != 1 or states[k].shape != expected:
+            raise ValueError(f"event_{k}_states has shape {states[k].shape}, not {expected}")
+    return times, states
+
+
 def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
     """Refuse arrays that do not belong together, before anything reads them."""
     n, s = steps.count, get_tableau(tableau).n_stages
@@ -146,6 +166,8 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
             raise ValueError(f"{name} has shape {getattr(steps, name).shape}, not {shape}")
     if steps.corrections.shape not in ((n, m), (n, 0)):
         raise ValueError(f"corrections has shape {steps.corrections.shape}")
+    if steps.stop is not None and not (n and steps.times[-2] <= steps.stop <= steps.times[-1]):
+        raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 
 
 def load_solution(path: str | Path) -> Solution:
@@ -187,16 +209,22 @@ def load_solution(path: str | Path) -> Solution:
             )
             for k, (index, threshold) in enumerate(meta["zones"])
         }
-        steps = StepData(**{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones)
+        if arrays["attempts"].dtype != ATTEMPT:
+            raise ValueError(f"attempts has the fields {arrays['attempts'].dtype}")
+        steps = StepData(
+            **{name: arrays[name] for name in _STEP_ARRAYS}, zones=zones, stop=meta["stop"]
+        )
         _check_shapes(mechanism, meta["settings"]["tableau"], steps)
-        settings = Settings(**meta["settings"] | {"atol": tuple(meta["settings"]["atol"])})
+        tuples = {key: tuple(meta["settings"][key]) for key in ("atol", "singular_times")}
+        settings = Settings(**meta["settings"] | tuples)
         return Solution(
             mechanism,
             make_system(mechanism),
             get_tableau(settings.tableau),
             steps,
             t_eval=arrays.get("t_eval"),
-            rejected=arrays["rejected"],
+            attempts=arrays["attempts"],
+            events=_events(meta["events"], arrays),
             status=meta["status"],
             message=meta["message"],
             stats=Statistics(**meta["stats"]),

@@ -26,7 +26,7 @@ LAYERS = (
     ("loading",),
     ("storage",),
     ("progress", "simulation"),
-    ("plots", "visuals", "scene", "playback", "summary"),
+    ("plots", "visuals", "scene", "playback", "summary", "export"),
     ("cli",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -742,3 +742,35 @@ def test_loops_inside_ignored_elements_are_refused(outer: str, inner: str, tmp_p
     with pytest.raises(srm.InputError, match=rf"nested\.urdf: .*<{inner}>.*not read") as caught:
         srm.load(path)
     assert caught.value.remedy
+
+
+@pytest.mark.parametrize("drawn", ["visual", "collision"])
+def test_inertia_inside_what_is_only_drawn_is_refused(drawn: str, tmp_path: Path) -> None:
+    """Otherwise a renamed <inertial> would leave a massless link behind, without a word."""
+    urdf = URDF.replace("<inertial>", f"<{drawn}>", 1).replace("</inertial>", f"</{drawn}>", 1)
+    path = write(tmp_path, urdf=urdf).with_suffix(".urdf")
+    refusal(path, "'crank'", f"<mass> inside <{drawn}>", "<inertial> of the link")
+
+
+def test_a_start_in_gimbal_lock_of_massless_links_is_bad_input(tmp_path: Path) -> None:
+    """Three axes of one ball, the outer two in line: the mass matrix is singular there."""
+    inertial = POINT_MASS.replace("<inertial>", '<inertial><origin xyz="1 0.2 0.1"/>')
+    inertial = inertial.replace('ixx="0" iyy="0" izz="0"', 'ixx="1" iyy="1" izz="1"')
+    links = '<link name="base"/><link name="u"/><link name="w"/>'
+    links += f'<link name="rod">{inertial}</inertial></link>'
+    joints = "".join(
+        f'<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="{axis}"/></joint>'
+        for name, parent, child, axis in (
+            ("z", "base", "u", "0 0 1"),
+            ("y", "u", "w", "0 1 0"),
+            ("x", "w", "rod", "1 0 0"),
+        )
+    )
+    toml = (
+        'format = 1\nurdf = "two_bars.urdf"\n[[loop]]\nname = "hook"\ntype = "point"\n'
+        'a = { link = "rod", xyz = [1.0, 0.0, 0.0] }\nb = { link = "world", xyz = [0, 0, -1.0] }\n'
+        "[initial]\nq = { y = 1.5707963267948966 }\n"
+    )
+    path = write(tmp_path, toml, f'<robot name="ball">{links}{joints}</robot>')
+    refusal(path, "initial", "'z' moves no inertia", "gimbal lock")

@@ -94,7 +94,7 @@ def describe(tmp_path: Path) -> Any:
     ("name", "words"),
     [
         ("simulate", "--t-end --method --tableau --rtol --atol --step --backend --out --plot"),
-        ("simulate", "--html --play MODEL psrm dop853 auto|python|kernel"),
+        ("simulate", "--csv --html --play MODEL psrm dop853 auto|python|kernel"),
         ("info", "MODEL degrees of freedom rank redundant"),
         ("models", "package"),
         ("play", "RUN browser"),
@@ -191,10 +191,9 @@ def test_brackets_in_names_are_printed_as_they_are(describe: Any) -> None:
 
 
 def test_simulate_prints_a_summary_and_writes_every_file(tmp_path: Path) -> None:
-    out, plot, html = (tmp_path / name for name in ("run.npz", "run.png", "run.html"))
-    output = run(
-        "simulate", "slider_crank", "--t-end", 5, "--out", out, "--plot", plot, "--html", html
-    )
+    out, plot, csv, html = (tmp_path / f"run.{suffix}" for suffix in ("npz", "png", "csv", "html"))
+    files = ("--out", out, "--plot", plot, "--csv", csv, "--html", html)
+    output = run("simulate", "slider_crank", "--t-end", 5, *files)
     solution = srm.load_solution(out)
     assert row(output, "status") == "finished"
     assert row(output, "end time") == "5 s"
@@ -204,7 +203,7 @@ def test_simulate_prints_a_summary_and_writes_every_file(tmp_path: Path) -> None
     assert row(output, "largest ||g||") == f"{solution.drift[:, 0].max():.2e} (m, rad)"
     for name in ("rejected steps", "placements", "zone steps", "energy change", "wall time"):
         assert row(output, name)
-    for path in (out, plot, html):
+    for path in (out, plot, csv, html):
         assert f"written            {path}" in output
         assert path.stat().st_size > 5000
     assert "The run reached t = 5 s." in output
@@ -408,6 +407,7 @@ def test_something_else_than_a_saved_run_is_refused(tmp_path: Path) -> None:
         ("--out", "run.txt", "the suffix '.txt' is not known here. Use .npz"),
         ("--plot", "run.gif", "the suffix '.gif' is not known here. Use .png or .pdf or .svg"),
         ("--plot", "run", "the suffix '' is not known here"),
+        ("--csv", "run.xls", "the suffix '.xls' is not known here. Use .csv"),
         ("--html", "run.js", "the suffix '.js' is not known here. Use .html or .htm"),
         ("--out", "none/run.npz", "there is no folder"),
         ("--plot", "none/run.png", "there is no folder"),

@@ -153,10 +153,24 @@ def test_accepted_steps_are_dots_and_those_that_did_not_stand_are_crosses(
     axes = four_bar.plot().axes[3]
     accepted, rejected = line(axes, "accepted"), line(axes, "rejected")
     np.testing.assert_array_equal(accepted.get_ydata(), np.diff(four_bar.steps.times))
-    assert len(four_bar.rejected) > 0
+    assert len(four_bar.rejected) == four_bar.stats.rejected > 0
     np.testing.assert_array_equal(rejected.get_xydata(), four_bar.rejected)
     assert (accepted.get_marker(), rejected.get_marker()) == (".", "x")
     assert accepted.get_color() != rejected.get_color()
+    assert "redone" not in legend(axes)
+
+
+def test_steps_redone_because_of_a_singular_configuration_have_marks_of_their_own() -> None:
+    quarter = 4.29657624142677449 / 4.0  # a grid point is singular
+    solution = srm.simulate(
+        srm.load("slider_crank"), 2.0, step=quarter / 20, tableau="dopr54", placement="halved"
+    )
+    axes = solution.plot().axes[3]
+    redone = line(axes, "redone")
+    assert len(solution.replaced) == solution.stats.replaced > 0
+    np.testing.assert_array_equal(redone.get_xydata(), solution.replaced)
+    assert redone.get_marker() == "+"
+    assert "rejected" not in legend(axes)
 
 
 @pytest.mark.parametrize("step", [None, 0.01])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ def test_a_saved_run_interpolates_to_the_last_bit(name: str, tmp_path: Path) -> 
     assert np.array_equal(loaded.drift, solution.drift)
     assert np.array_equal(loaded.energy, solution.energy)
     assert loaded.crossings == solution.crossings
+    assert np.array_equal(loaded.attempts, solution.attempts)
+    assert loaded.t_events is None
     assert loaded.mechanism.source == solution.mechanism.source
 
 
@@ -37,6 +40,32 @@ def test_a_run_through_the_zone_interpolates_to_the_last_bit(tmp_path: Path) -> 
     loaded = srm.load_solution(tmp_path / "run")
     t = np.linspace(0.0, 2.0, 1001)
     assert np.array_equal(solution(t)[0], loaded(t)[0])
+
+
+def test_events_and_where_they_ended_the_run_are_saved(tmp_path: Path) -> None:
+    def upwards(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        return float(np.cos(q[0]))
+
+    def never(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        return 1.0
+
+    upwards.terminal = 2  # type: ignore[attr-defined]
+    solution = srm.simulate(
+        srm.load("slider_crank"), 5.0, events=[upwards, never], singular_times=[1.0, 2.0]
+    )
+    assert solution.status == "event"
+    solution.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    assert loaded.success
+    assert loaded.settings == solution.settings
+    assert np.array_equal(loaded.t, solution.t)
+    assert np.array_equal(loaded.q, solution.q)
+    for name in ("t_events", "q_events", "v_events"):
+        for ours, theirs in zip(getattr(loaded, name), getattr(solution, name)):
+            assert np.array_equal(ours, theirs)
+            assert ours.shape == theirs.shape
+    with pytest.raises(ValueError, match="dense output covers"):
+        loaded(solution.t[-1] + 1e-3)
 
 
 def test_a_mechanism_built_in_python_is_saved_with_its_model(tmp_path: Path) -> None:
@@ -160,11 +189,36 @@ def test_a_damaged_file_is_refused_whatever_is_wrong_with_it(tmp_path: Path) -> 
     assert refused > 100
 
 
-def test_arrays_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
-    srm.simulate(srm.load("four_bar"), 0.2).save(tmp_path / "run.npz")
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("rates", lambda array: array[:-1], "rates has shape"),
+        ("event_0_states", lambda array: array[:, 1:], "event_0_states has shape"),
+        ("attempts", lambda array: np.zeros((2, 2)), "attempts has the fields"),
+        ("times", lambda array: array + 1.0, "cannot have stopped at"),
+    ],
+)
+def test_arrays_that_do_not_belong_together_are_refused(
+    name: str, change: Callable[[np.ndarray], np.ndarray], words: str, tmp_path: Path
+) -> None:
+    def stop(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        return t - 0.1
+
+    stop.terminal = True  # type: ignore[attr-defined]
+    srm.simulate(srm.load("four_bar"), 0.2, events=stop).save(tmp_path / "run.npz")
     with np.load(tmp_path / "run.npz") as file:
         arrays = dict(file)
-    arrays["rates"] = arrays["rates"][:-1]
+    arrays[name] = change(arrays[name])
     np.savez(tmp_path / "cut.npz", **arrays)
-    with pytest.raises(srm.InputError, match=r"cut\.npz: it is no saved run: rates has shape"):
+    with pytest.raises(srm.InputError, match=rf"cut\.npz: it is no saved run: .*{words}"):
         srm.load_solution(tmp_path / "cut.npz")
+
+
+def test_a_run_of_another_format_is_refused_as_such(tmp_path: Path) -> None:
+    srm.simulate(srm.load("four_bar"), 0.1).save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        arrays = dict(file)
+    arrays["meta"] = np.array(str(arrays["meta"]).replace('{"format": 2,', '{"format": 1,'))
+    np.savez(tmp_path / "old.npz", **arrays)
+    with pytest.raises(srm.InputError, match=r"old\.npz: it has format 1, this version reads 2"):
+        srm.load_solution(tmp_path / "old.npz")

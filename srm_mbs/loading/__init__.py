@@ -16,11 +16,17 @@ import pinocchio as pin
 
 from srm_mbs.assembly import assemble
 from srm_mbs.coordinates import set_position, set_rate
-from srm_mbs.errors import AssemblyError, InputError
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.loading.bundled import bundled_models, generated_size, models_folder
 from srm_mbs.loading.description import LARGEST, Description, parse_description
 from srm_mbs.loading.generated import n_four_bar as _n_four_bar_texts
-from srm_mbs.loading.urdf import ROOT_JOINTS, build_urdf, check_inertia, lock_joints
+from srm_mbs.loading.urdf import (
+    ROOT_JOINTS,
+    build_urdf,
+    check_inertia,
+    lock_joints,
+    undetermined_joint,
+)
 from srm_mbs.mechanism import Mechanism, SimulationDefaults, Source
 
 __all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]
@@ -174,18 +180,36 @@ def rebuild(source: Source) -> Mechanism:
     return _unassembled(parse_description(source.description, source.path), source)[0]
 
 
+def _in_gimbal_lock(source: Source, why: str) -> InputError:
+    return InputError(
+        f"where the loops are closed the accelerations are not determined: {why}",
+        file=source.path,
+        element="initial",
+        remedy="Axes of massless links may be in line there (gimbal lock): give another guess, or "
+        "these links inertia",
+    )
+
+
 def _assembled(description: Description, source: Source) -> Mechanism:
     mechanism, q, v = _unassembled(description, source)
     try:
         state = assemble(mechanism, q, v)
+        # A fresh mechanism: its structure is analysed from the assembled state.
+        mechanism = replace(mechanism, q0=state.q, v0=state.v)
+        _ = mechanism.structure
     except AssemblyError as error:
         if description.lock:
             error.remedy = f"{error.remedy}. Locked, so that they cannot help: " + ", ".join(
                 map(repr, description.lock)
             )
         raise
-    # A fresh mechanism: its structure is analysed from the assembled state.
-    mechanism = replace(mechanism, q0=state.q, v0=state.v)
+    except EvaluationError as error:
+        raise _in_gimbal_lock(source, str(error)) from error
+    joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
+    if joint is not None:
+        raise _in_gimbal_lock(
+            source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"
+        )
     log.info(
         "%s: %d degrees of freedom, rank %d",
         mechanism.name,

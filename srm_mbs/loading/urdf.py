@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg.lapack import dpotrf
 
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.loading.safe_xml import parse_urdf
 from srm_mbs.loading.urdf_check import UrdfChecker
@@ -81,10 +82,30 @@ def check_inertia(model: pin.Model, file: str) -> None:
                 element=f"joint {model.names[joint]!r}",
                 remedy="Give the moving end of the chain an <inertial>",
             )
-    # A joint may move mass and yet no inertia, as one whose axis runs through a point mass.  The
-    # pivots of M, tips first, show it; they are those of the articulated inertias over M_ii.
     rng = np.random.default_rng(0)
     q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
+    at = undetermined_joint(model, q, file)
+    if at is not None:
+        raise InputError(
+            f"the joint moves mass ({links(at)} and what is behind it) but no inertia in one "
+            "of its directions: its acceleration is not determined",
+            file=file,
+            element=f"joint {model.names[at]!r}",
+            remedy="Give a moment of inertia, or a centre of mass off the axis",
+        )
+
+
+def undetermined_joint(model: pin.Model, q: FloatArray, file: str) -> int | None:
+    """A joint with a direction in which it moves no inertia at q (nq,); None if there is none.
+
+    As one whose axis runs through a point mass, or the outer axes of massless links in line.  The
+    pivots of M, tips first, show it; they are those of the articulated inertias over M_ii.
+
+    Raises
+    ------
+    InputError
+        If the mass matrix is not finite.
+    """
     with np.errstate(all="ignore"):
         M = pin.crba(model, model.createData(), q)
         M = (np.triu(M) + np.triu(M, 1).T)[::-1, ::-1]
@@ -103,17 +124,10 @@ def check_inertia(model: pin.Model, file: str) -> None:
         factor, info = dpotrf(scaled, lower=1)
         small = np.flatnonzero(np.diag(factor)[: info - 1 if info else None] ** 2 < NO_INERTIA)
         if not small.size and not info:
-            return
+            return None
         failed = int(small[0]) if small.size else info - 1
     component = model.nv - 1 - failed
-    joint = next(i for i in range(1, model.njoints) if component < _velocity_end(model, i))
-    raise InputError(
-        f"the joint moves mass ({links(joint)} and what is behind it) but no inertia in one of "
-        "its directions: its acceleration is not determined",
-        file=file,
-        element=f"joint {model.names[joint]!r}",
-        remedy="Give a moment of inertia, or a centre of mass off the axis",
-    )
+    return next(i for i in range(1, model.njoints) if component < _velocity_end(model, i))
 
 
 def _velocity_end(model: pin.Model, joint: int) -> int:

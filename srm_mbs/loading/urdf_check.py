@@ -99,6 +99,7 @@ class UrdfChecker:
                 self.attributes(child, where)
             elif tag in ignored:
                 self.no_loop_inside(child, where)
+                self.no_inertia_inside(child, where)
                 if tag not in DRAWN_ONLY:
                     self._ignore(f"<{tag}> element")
                 node.remove(child)
@@ -134,6 +135,18 @@ class UrdfChecker:
                     f"the element <{inner.tag}> (a loop or coupling) inside <{node.tag}> is not "
                     "read by this version",
                     "Describe the loop as [[loop]] in a TOML description and remove the element",
+                )
+
+    def no_inertia_inside(self, node: Element, where: str) -> None:
+        """Refuse inertia inside an element that is only drawn: the link would lose it."""
+        if node.tag not in DRAWN_ONLY:
+            return
+        for inner in node.iter():
+            if inner.tag in ("inertial", "mass", "inertia"):
+                raise self.fault(
+                    where or f"<{node.tag}>",
+                    f"<{inner.tag}> inside <{node.tag}> would not act",
+                    "Put <mass> and <inertia> into the <inertial> of the link",
                 )
 
     def named(self, root: Element, tag: str) -> dict[str, Element]:

@@ -33,10 +33,15 @@ class MultiplierHistory:
     ----------
     times : (k,) s
     values : (k, nv)
+    known_until, known_below
+        Of a start on a singular configuration, whose nodes lie ahead: until that time (s), and
+        where sigma is smaller, they are more accurate than the direct solve.
     """
 
     times: FloatArray
     values: FloatArray
+    known_until: float = -np.inf
+    known_below: float = 0.0
 
     @classmethod
     def begin(cls, t: float, value: FloatArray) -> MultiplierHistory:
@@ -44,9 +49,14 @@ class MultiplierHistory:
         return cls(np.array([t]), value[None].copy())
 
     def extended(self, t: float, value: FloatArray) -> MultiplierHistory:
-        """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``POINTS`` nodes."""
-        times = np.concatenate([self.times, [t]])[-POINTS:]
-        return MultiplierHistory(times, np.concatenate([self.values, value[None]])[-POINTS:])
+        """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``POINTS`` nodes.
+
+        Nodes ahead of ``t`` are dropped.
+        """
+        before = self.times < t
+        times = np.concatenate([self.times[before], [t]])[-POINTS:]
+        values = np.concatenate([self.values[before], value[None]])[-POINTS:]
+        return MultiplierHistory(times, values)
 
     def predict(self, t: float) -> FloatArray:
         """yhat (nv,) extrapolated to ``t``."""

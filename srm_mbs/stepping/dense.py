@@ -11,12 +11,14 @@ tolerance of the closures.  The extra stages of dop853 are evaluated only when a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.methods.base import StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.stepping.hermite import HermiteStep, close_to_singular
@@ -45,6 +47,8 @@ class StepData:
         Error estimate over tolerance.
     zones
         Step index -> (threshold, history) of the steps with a stage in the zone.
+    stop
+        Where a terminal event ended the run within the last step (s); None at the step's end.
     """
 
     times: FloatArray
@@ -55,11 +59,45 @@ class StepData:
     ranks: FloatArray
     error_ratios: FloatArray
     zones: dict[int, tuple[float, MultiplierHistory]]
+    stop: float | None = None
+
+    @property
+    def end(self) -> float:
+        """End of the run (s)."""
+        return float(self.times[-1]) if self.stop is None else self.stop
 
     @property
     def count(self) -> int:
         """Number of steps."""
         return len(self.times) - 1
+
+
+def step_data(
+    t0: float,
+    x0: FloatArray,
+    times: Sequence[float],
+    steps: Sequence[StepResult],
+    scheme: ButcherTableau,
+    tangent_size: int,
+    stop: float | None = None,
+) -> StepData:
+    """The ``steps`` from (``t0``, ``x0``), which end at ``times``, as arrays."""
+    n, stages = len(steps), scheme.n_stages + 1
+    return StepData(
+        times=np.array([t0, *times]),
+        states=np.array([x0, *(s.state for s in steps)]),
+        rates=np.array([s.rates for s in steps]).reshape(n, stages, tangent_size),
+        corrections=np.array([s.correction for s in steps]).reshape(n, -1 if n else 0),
+        sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
+        ranks=np.array([s.rank for s in steps], dtype=float),
+        error_ratios=np.array([s.error_ratio for s in steps]),
+        zones={
+            i: (s.zone.threshold, s.history)
+            for i, s in enumerate(steps)
+            if s.zone is not None and s.history is not None
+        },
+        stop=stop,
+    )
 
 
 class DenseOutput:
@@ -91,13 +129,8 @@ class DenseOutput:
         ValueError
             If a time lies outside the run.
         """
+        self.check(t)
         times = self._steps.times
-        slack = 1e-12 * max(abs(times[0]), abs(times[-1]))
-        if len(t) and not (np.min(t) >= times[0] - slack and np.max(t) <= times[-1] + slack):
-            raise ValueError(
-                f"dense output covers t = {times[0]:.9g} to {times[-1]:.9g} s, "
-                f"asked for {np.min(t):.9g} to {np.max(t):.9g} s"
-            )
         out = np.empty((len(t), self._steps.states.shape[1]))
         if self._steps.count == 0:
             out[:] = self._steps.states[0]
@@ -108,6 +141,26 @@ class DenseOutput:
             h = times[step + 1] - times[step]
             out[here] = self._in_step(int(step), (t[here] - times[step]) / h)
         return out
+
+    def check(self, t: FloatArray) -> None:
+        """Raise ValueError if a time of ``t`` (k,) lies outside the run."""
+        start, end = self._steps.times[0], self._steps.end
+        slack = 1e-12 * max(abs(start), abs(end))
+        if len(t) and not (np.min(t) >= start - slack and np.max(t) <= end + slack):
+            raise ValueError(
+                f"dense output covers t = {start:.9g} to {end:.9g} s, "
+                f"asked for {np.min(t):.9g} to {np.max(t):.9g} s"
+            )
+
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        """Times (n + 1,) and states (n + 1, nx) at the ends of the steps, the start first; the
+        last ones at the end of the run."""
+        data = self._steps
+        if data.stop is None:
+            return data.times, data.states
+        times, states = data.times.copy(), data.states.copy()
+        times[-1], states[-1] = data.stop, self(np.array([data.stop]))[0]
+        return times, states
 
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
         data, system = self._steps, self._system

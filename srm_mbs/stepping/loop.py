@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
-from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
+from srm_mbs.stepping.events import EventWatch
 from srm_mbs.stepping.stepsize import StepSizeControl, Verdict
 from srm_mbs.systems.base import System
 
@@ -52,9 +53,11 @@ class RunRecord:
     attempts
         Steps that were rejected or redone.
     status
-        ``running``, ``finished``, ``interrupted`` or ``failed``.
+        ``running``, ``finished``, ``event``, ``interrupted`` or ``failed``.
     message
         When, why, and what to try.
+    stop
+        Where a terminal event ended the run (s), within the last step; None without one.
     """
 
     t0: float
@@ -64,6 +67,7 @@ class RunRecord:
     attempts: list[Attempt] = field(default_factory=list)
     status: str = "running"
     message: str = ""
+    stop: float | None = None
     wall_time: float = 0.0
 
 
@@ -83,6 +87,7 @@ def integrate(
     *,
     max_step: float = np.inf,
     tick: Tick | None = None,
+    events: EventWatch | None = None,
 ) -> RunRecord:
     """Integrate from ``t0`` to ``t_end``; never raises for what happens on the way.
 
@@ -98,12 +103,14 @@ def integrate(
         Longest step (s).
     tick
         Called after every accepted step.
+    events
+        Looks for events in every accepted step.
 
     Returns
     -------
     RunRecord
-        With status ``finished``; or ``failed`` or ``interrupted`` (Ctrl-C), with everything
-        computed so far.
+        With status ``finished``, or ``event`` after a terminal event; or ``failed`` or
+        ``interrupted`` (Ctrl-C), with everything computed so far.
     """
     record = RunRecord(t0, state.copy())
     smallest = SMALLEST_STEP * abs(t_end - t0)
@@ -111,6 +118,8 @@ def integrate(
     t, x = t0, state
     trouble = ""
     try:
+        if events is not None:
+            events.begin(t, x)
         while t < t_end:
             limit = min(max_step, system.step_limit(x))
             proposal = control.propose(t, limit, memory)
@@ -138,9 +147,13 @@ def integrate(
                 _fail(record, t, h, memory, reason, control.adaptive)
                 break
             method.accept(memory, result)
-            t, x = proposal.t_new, result.state
+            start, t, x = x, proposal.t_new, result.state
             record.times.append(t)
             record.steps.append(result)
+            stop = None if events is None else events.after_step(start, result, t)
+            if stop is not None:
+                record.status, record.stop, record.message = "event", stop.time, stop.message
+                break
             if tick is not None:
                 tick(t, h, x)
         else:
@@ -149,7 +162,7 @@ def integrate(
     except KeyboardInterrupt:
         record.status = "interrupted"
         record.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
-    except ControllerError as error:
+    except (ControllerError, EventError) as error:
         record.status = "failed"
         record.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
     # An interrupt between the two appends would leave one list longer.

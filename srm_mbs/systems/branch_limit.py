@@ -1,0 +1,197 @@
+r"""The constraint algebra on a branch, at and next to a singular configuration.
+
+On a branch the projector P and the vector z = E Gdot v, which make up the multiplier
+yhat = P M^-1 f + z, are smooth functions of the configuration, also where the closures are
+singular.  There, however, the direct solve errs by round-off over sigma^2.  So P and z are taken
+
+* at the singular configuration from the limit formula (:mod:`srm_mbs.systems.singular`),
+* at regular configurations on both sides of it from the direct solve,
+
+all on one curve in the branch, and interpolated to the configuration that is asked for.  The
+curve, q (+) tau w (+) a normal part, is kinematic: no forces, no time, and any w that leads away
+from the singular configurations.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import BarycentricInterpolator
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.systems.projection import cholesky, unwhiten, whiten
+from srm_mbs.systems.singular import SingularConfiguration, analyse_singular, sharpened
+
+NODES = np.array([-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0])
+CENTRE = 4
+SPACINGS = (0.03, 0.015, 0.0075, 0.06)
+"""Distances of the nodes, in units; the first that is accurate enough is used, else the best."""
+ACCURATE = 1e-11
+CLOSING_ITERATIONS = 15
+CLOSED = 1e-12
+NEAR = 1e-2
+"""Largest distance (units) of the asked configuration from the singular one."""
+
+
+class BranchLimit:
+    """P and z = E Gdot v on one branch at q.
+
+    Parameters
+    ----------
+    centre
+        The singular configuration on the curve, or q itself.
+    q : (nq,)
+        A configuration on the branch.
+    frame : (nv, d)
+        Velocities in units, close to the branch's tangents, along which the curve goes straight.
+    tangent : (nv, d)
+        Tangent space of the branch at the centre, orthonormal, in units.
+    direction : (nv,)
+        w: a velocity in that space that leads away from the singular configurations, in units.
+
+    Attributes
+    ----------
+    projector : (nv, nv)
+        P in the model's coordinates.
+    accuracy
+        Estimated error of ``projector``; infinite if the branch could not be followed.
+    """
+
+    def __init__(
+        self,
+        centre: SingularConfiguration,
+        q: FloatArray,
+        frame: FloatArray,
+        tangent: FloatArray,
+        direction: FloatArray,
+    ) -> None:
+        self._centre = centre
+        self._geometry = centre.geometry
+        self._frame, self._tangent = frame, tangent
+        direction = direction / np.abs(direction).max()
+        nv = len(self._geometry.unit)
+        self.accuracy = np.inf
+        self.projector = np.full((nv, nv), np.nan)
+        gap = self._geometry.difference(q, centre.q)
+        start = float(gap @ direction) / float(direction @ direction)
+        for spacing in SPACINGS:
+            times = start + spacing * NODES
+            nodes = [self._follow(q, time * direction) for time in times]
+            nodes[CENTRE] = centre.q
+            found = [node for node in nodes if node is not None]
+            if len(found) < len(nodes):
+                continue
+            values = np.array([self._projector(k, node) for k, node in enumerate(found)])
+            projector = self._at_zero(times, values)
+            accuracy = float(np.abs(projector - self._at_zero(times[1:-1], values[1:-1])).max())
+            if accuracy < self.accuracy:
+                self.accuracy, self.projector = accuracy, projector
+                self._times, self._nodes, self._projectors = times, found, values
+            if accuracy < ACCURATE:
+                break
+
+    @staticmethod
+    def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
+        return BarycentricInterpolator(times, values)(0.0)  # type: ignore[no-any-return]
+
+    def _follow(self, q: FloatArray, move: FloatArray) -> FloatArray | None:
+        """The configuration of the branch near q (+) move, moved off it along the normals only."""
+        geometry, frame = self._geometry, self._frame
+        x = geometry.move(q, move)
+        moved = np.zeros(len(move))
+        for _ in range(CLOSING_ITERATIONS):
+            g, G = geometry.closure(x)
+            rows = np.concatenate([G, frame.T])
+            right = np.concatenate([g, frame.T @ moved])
+            step = -np.linalg.lstsq(rows, right, rcond=1e-10)[0]
+            x, moved = geometry.move(x, step), moved + step
+            if np.abs(step).max() < 1e-14:
+                break
+        g, _ = geometry.closure(x)
+        if not (np.abs(g).max() < CLOSED and np.abs(moved).max() < 0.5 * np.abs(move).max()):
+            return None
+        return x
+
+    def _white(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Cholesky factor U of M in units, and W = L^-1 G^T = X diag(s) Y^T of structural rank."""
+        rank = self._centre.structural_rank
+        G = self._geometry.normalised(q)
+        U = cholesky(self._geometry.mass())
+        left, size, right = np.linalg.svd(whiten(U, np.asfortranarray(G.T)), full_matrices=False)
+        return U, left[:, :rank], size[:rank], right[:rank]
+
+    def _projector(self, k: int, node: FloatArray) -> FloatArray:
+        """P (nv, nv) at node k, model coordinates."""
+        unit = self._geometry.unit
+        if k == CENTRE:
+            tangent = self._tangent
+            self._geometry.closure(node)
+            M = self._geometry.mass()
+            onto = np.linalg.solve(tangent.T @ M @ tangent, tangent.T @ M)
+            P = np.eye(len(unit)) - tangent @ onto
+        else:
+            U, X, _, _ = self._white(node)
+            P = unwhiten(U, np.asfortranarray(X @ (X.T @ U)))
+        out: FloatArray = P * unit[:, None] / unit
+        return out
+
+    def _bend(self, k: int, node: FloatArray, v: FloatArray) -> FloatArray:
+        """E Gdot v (nv,) at node k for the velocity v (nv,) of the branch there."""
+        if k == CENTRE:
+            acceleration = self._centre.limit_acceleration(v, np.zeros(len(v)))
+            return -acceleration if acceleration is not None else np.zeros(len(v))
+        unit = self._geometry.unit
+        bias = self._geometry.bias(node, v / unit)
+        U, X, size, Y = self._white(node)
+        return unwhiten(U, X @ ((Y @ bias) / size)) * unit
+
+    def quadratic(self, v: FloatArray) -> FloatArray:
+        """z = E Gdot v (nv,) at q for the velocity v (nv,), model coordinates."""
+        values = [
+            self._bend(k, node, v - P @ v)
+            for k, (node, P) in enumerate(zip(self._nodes, self._projectors))
+        ]
+        return self._at_zero(self._times, np.array(values))
+
+    def multiplier(self, v: FloatArray, free: FloatArray) -> FloatArray:
+        """yhat (nv,) at q for the velocity v and the acceleration ``free`` = M^-1 f without
+        closures, both (nv,)."""
+        return self.projector @ free + self.quadratic(v)
+
+
+def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray) -> FloatArray:
+    """The shortest velocity (nv,) in the branch that leaves the singular configurations as u does.
+
+    ``tangent`` (nv, d) is the branch's tangent space, u (nv,) a velocity in it, all in units.
+    What no closure notices, such as the motion of a free base, is left out.
+    """
+    null = singular.null
+    normal = null - tangent @ (tangent.T @ null)
+    effects = np.array([(singular.hessians(t) @ normal).ravel() for t in tangent.T]).T
+    wanted = effects @ (tangent.T @ u)
+    out: FloatArray = tangent @ np.linalg.lstsq(effects, wanted, rcond=1e-9)[0]
+    return out
+
+
+def branch_limit(
+    singular: SingularConfiguration, q: FloatArray, u: FloatArray
+) -> BranchLimit | None:
+    """The algebra at q on the branch that u (nv,), in units, is a velocity of.
+
+    None if u does not single out one branch (see :meth:`SingularConfiguration.branch`), or if
+    there is no singular configuration on the curve through q.
+    """
+    frame = singular.branch(u)
+    if frame is None:
+        return None
+    direction = steepest(singular, frame, frame @ (frame.T @ u))
+    along = direction / np.linalg.norm(direction)
+    # The singular configuration on the curve: from q along w and the normals only.
+    others = frame - np.outer(along, along @ frame)
+    basis, size, _ = np.linalg.svd(others, full_matrices=False)
+    geometry = singular.geometry
+    found = sharpened(geometry, q, singular.rank, NEAR, closed=1e-14, fixed=basis[:, size > 0.5])
+    if found is None:
+        return None
+    centre = analyse_singular(geometry, found, singular.structural_rank)
+    tangent = centre.branch(direction)
+    return None if tangent is None else BranchLimit(centre, q, frame, tangent, direction)

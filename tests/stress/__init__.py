@@ -1,0 +1,1 @@
+"""Longer tests (marker ``stress``): random mechanisms and starts, long runs, faults, mutations."""

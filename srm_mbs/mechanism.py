@@ -217,6 +217,19 @@ def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
     return array
 
 
+def _check_order(model: pin.Model) -> None:
+    """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
+    for joint in range(2, model.njoints):
+        if model.parents[joint] not in list(model.supports[joint - 1]):
+            raise InputError(
+                f"the joint {model.names[joint]!r} continues a branch that another joint, "
+                f"{model.names[joint - 1]!r}, has interrupted",
+                element="model",
+                remedy="Add the joints depth first, every branch to its tip; Pinocchio's mass "
+                "matrix is wrong otherwise",
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """A mechanism: a Pinocchio tree, the closures of its loops, and an initial state.
@@ -240,8 +253,9 @@ class Mechanism:
     Raises
     ------
     InputError
-        If loop names repeat, an anchor is unknown, a shape does not fit, or the model has
-        joint friction or mimic joints, which this version does not simulate.
+        If loop names repeat, an anchor is unknown, a shape does not fit, the joints of the model
+        are not in depth-first order, or it has joint friction or mimic joints, which this version
+        does not simulate.
     """
 
     model: pin.Model
@@ -262,6 +276,7 @@ class Mechanism:
                 element="model",
                 remedy="Give it at least one joint that is neither fixed nor locked",
             )
+        _check_order(model)
         set_(self, "loops", tuple(self.loops))
         set_(self, "name", self.name or model.name)
         q0 = pin.neutral(model) if self.q0 is None else self.q0

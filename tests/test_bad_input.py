@@ -774,3 +774,14 @@ def test_a_start_in_gimbal_lock_of_massless_links_is_bad_input(tmp_path: Path) -
     )
     path = write(tmp_path, toml, f'<robot name="ball">{links}{joints}</robot>')
     refusal(path, "initial", "'z' moves no inertia", "gimbal lock")
+
+
+def test_joints_out_of_depth_first_order_are_refused() -> None:
+    """Pinocchio's crba takes them without a word and returns a wrong mass matrix."""
+    model = pin.Model()
+    body = pin.Inertia(1.0, np.array([0.5, 0.0, 0.0]), 0.1 * np.eye(3))
+    for name, parent in (("a", 0), ("b", 1), ("c", 1), ("d", 2)):  # d continues b after c
+        joint = model.addJoint(parent, pin.JointModelRY(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    with pytest.raises(srm.InputError, match=r"'d' continues a branch.*'c'.*depth first"):
+        srm.Mechanism(model)

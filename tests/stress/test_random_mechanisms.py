@@ -1,0 +1,100 @@
+"""Any mechanism whose loops can close is assembled and keeps its energy and its closures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import event, given, settings
+from scipy.integrate import trapezoid
+
+import srm_mbs as srm
+from srm_mbs.arrays import FloatArray
+from srm_mbs.systems.loops import LoopKinematics, closure_errors
+from srm_mbs.systems.units import row_units
+from tests.stress.random_mechanisms import Spec, build, specs
+
+pytestmark = [pytest.mark.stress, pytest.mark.timeout(900)]
+
+T_END = 2.0
+RTOL = 1e-8
+MOST_STEPS = 5000
+"""Light links of a centimetre beside heavy ones may turn thousands of times in 2 s: such a run is
+judged by what it did in that many steps."""
+MANY_TURNS = 100.0
+"""Energy errors add up, step by step: beyond this many turns of the fastest coordinate the bound
+grows with their number."""
+
+deterministic = settings(derandomize=True, database=None, deadline=None, print_blob=True)
+
+
+class Patience:
+    """Interrupts a run after ``MOST_STEPS`` steps, as Ctrl-C does."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def __call__(self, t: float, h: float, state: FloatArray) -> None:
+        self.steps += 1
+        if self.steps >= MOST_STEPS:
+            raise KeyboardInterrupt
+
+
+def rank_at_start(mechanism: srm.Mechanism) -> int:
+    """Rank of the closures at q0 by a dense SVD; random configurations are regular."""
+    model = mechanism.model
+    data = model.createData()
+    rows = LoopKinematics(model, mechanism.loops)
+    pin.crba(model, data, mechanism.q0, pin.Convention.WORLD)
+    rows.update(data, with_bias=False)
+    units = mechanism.structure.units
+    G = rows.G / row_units(mechanism.loops, units.length)[:, None] * units.coordinate
+    return int(np.linalg.matrix_rank(G, tol=1e-9))
+
+
+def assembled(spec: Spec) -> srm.Mechanism:
+    """The mechanism of ``spec``, assembled from a guess beside its closed configuration."""
+    mechanism, rates = build(spec)
+    model, units = mechanism.model, mechanism.structure.units
+    beside = 0.02 * units.coordinate * np.random.default_rng(spec.seed).standard_normal(model.nv)
+    state = srm.assemble(mechanism, pin.integrate(model, mechanism.q0, beside), rates)
+    size = row_units(mechanism.loops, units.length)
+    speed = max(1.0, float(np.abs(state.v / units.coordinate).max()))
+    assert np.abs(state.residuals / size).max() <= 1e-12
+    assert np.abs(state.rate_residuals / size).max() <= 1e-11 * speed
+    return mechanism.with_state(state.q, state.v)
+
+
+def check(spec: Spec) -> None:
+    mechanism = assembled(spec)
+    model, units = mechanism.model, mechanism.structure.units
+    assert mechanism.degrees_of_freedom == model.nv - rank_at_start(mechanism) >= 1
+    solution = srm.simulate(mechanism, T_END, rtol=RTOL, progress=Patience())
+    event(f"{solution.status}, {len(solution.crossings)} passages")
+    assert solution.status in ("finished", "interrupted"), solution.message
+
+    data = model.createData()
+    kinetic = [pin.computeKineticEnergy(model, data, q, v) for q, v in zip(solution.q, solution.v)]
+    rates = np.abs(solution.v / units.coordinate).max(axis=1)
+    turns = float(trapezoid(rates, solution.t)) / (2.0 * np.pi)
+    energy = solution.energy
+    bound = 1e-6 * max(1.0, turns / MANY_TURNS)
+    assert np.abs(energy - energy[0]).max() <= bound * max(kinetic)
+
+    size = row_units(mechanism.loops, units.length)
+    g, c = closure_errors(model, mechanism.loops, solution.q, solution.v)
+    assert np.abs(g / size).max() <= 1e-9
+    # Rates are projected with the Jacobian just before the positions are corrected.
+    assert np.abs(c / size).max() <= 10.0 * RTOL * max(units.rate, float(rates.max()))
+
+
+@settings(deterministic, max_examples=200)
+@given(specs(planar=True))
+def test_random_planar_mechanisms_keep_energy_and_closures(spec: Spec) -> None:
+    check(spec)
+
+
+@settings(deterministic, max_examples=50)
+@given(specs(planar=False))
+def test_random_spatial_mechanisms_keep_energy_and_closures(spec: Spec) -> None:
+    check(spec)

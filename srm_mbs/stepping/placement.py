@@ -24,6 +24,8 @@ SIGMA_CHANGE = 0.5
 """Largest change of sigma in one step, by the slope of the last steps."""
 TOO_CLOSE = 0.05
 """A stage is too close if sigma < TOO_CLOSE * slope * h, and nearer to zero than the start."""
+FAR_ENOUGH = 0.15
+"""A step that starts nearer to the zero than this fraction of its reach is leaving it."""
 CLEARANCE = 0.6
 """Distance of the zero from the abscissae that is good enough, over half the widest gap."""
 MAX_REDONE = 3
@@ -35,43 +37,64 @@ def sigma_slope(abscissae: FloatArray, sigmas: FloatArray, h: float) -> float:
 
 
 class Gaps:
-    """Where, in units of the step, a zero of sigma does no harm."""
+    """Where, as a fraction of the step, a zero of sigma does no harm."""
 
     def __init__(self, scheme: ButcherTableau) -> None:
-        centre, half_width = scheme.gaps[0]
-        self.centre = centre
-        clearance = CLEARANCE * half_width
+        self._centre, half_width = scheme.gaps[0]
+        self._clearance = CLEARANCE * half_width
         self._first = min((x for x in scheme.c.tolist() if x > 0.0), default=1.0)
         self._wide = sorted(
-            (middle, middle + half - clearance) for middle, half in scheme.gaps if half > clearance
+            (middle, middle + half - self._clearance)
+            for middle, half in scheme.gaps
+            if half > self._clearance
         )
 
     def longest_step(self, distance: float, h: float) -> float:
-        """The longest step up to ``h`` for a zero of sigma at ``distance`` ahead."""
-        if distance >= (1.0 + self.centre) * h:
-            return h
-        if distance > h:
-            return distance / (1.0 + self.centre)
+        """The longest step up to ``h`` (s) for a zero of sigma at ``distance`` (s) ahead.
+
+        The zero comes to lie in a wide gap between the abscissae, or so far behind the end that
+        an equal step would put it there.
+        """
         position = distance / h
+        if position >= 1.0 + self._centre:
+            return h
         if position <= 0.5 * self._first:
             return h  # the first stage is no nearer to the zero than the start
         for centre, end in self._wide:
             if position <= end:
                 return distance / max(position, centre)
-        return distance / (1.0 + self.centre)
+        return distance / (1.0 + self._centre)
+
+    def ends_on(self, distance: float, h: float) -> bool:
+        """Whether a step ``h`` ends on a zero at ``distance``."""
+        return abs(distance / h - 1.0) < self._clearance
+
+    def step_over(self, distance: float) -> float:
+        """The shortest step that has a zero at ``distance`` well inside one of its gaps."""
+        return distance / self._wide[-1][1]
 
 
 class SingularityPlacement:
     """Wraps ``inner`` step-size control around singular configurations.
 
+    Parameters
+    ----------
+    inner, scheme
+        What is wrapped; the tableau of the run.
+    t_end
+        End of the run (s).
+
     Attributes
     ----------
     placed, replaced
-        How many steps were shortened a priori, and redone a posteriori.
+        How many steps were changed a priori, and redone a posteriori.
     """
 
-    def __init__(self, inner: StepSizeControl, scheme: ButcherTableau) -> None:
+    def __init__(
+        self, inner: StepSizeControl, scheme: ButcherTableau, t_end: float = np.inf
+    ) -> None:
         self._inner = inner
+        self._t_end = t_end
         self._gaps = Gaps(scheme)
         self._abscissae = np.append(scheme.c, 1.0)
         self.adaptive = inner.adaptive
@@ -91,11 +114,20 @@ class SingularityPlacement:
         memory.sigma_slope = self._slope
         proposal = self._inner.propose(t, limit, memory)
         if self._redo is None and self._zero is not None and self._zero > t:
-            h = self._gaps.longest_step(self._zero - t, proposal.h)
-            if h < proposal.h:
+            h = self._placed(self._zero - t, proposal.h, t)
+            if h != proposal.h:
                 self.placed += 1
                 return Proposal(h, t + h)
         return proposal
+
+    def _placed(self, distance: float, h: float, t: float) -> float:
+        if self.adaptive:
+            return self._gaps.longest_step(distance, h)
+        # A fixed step may cross its grid point where that is singular: it could only creep up.
+        if not self._gaps.ends_on(distance, h):
+            return self._gaps.longest_step(distance, h) if distance < h else h
+        over = self._gaps.step_over(distance)
+        return over if t + over <= self._t_end else h
 
     def _better_step(self, h: float, sigmas: FloatArray) -> float | None:
         """A better step length if a stage or the end came too close, else None."""

@@ -237,7 +237,7 @@ def placed(
     """
     wrappers: list[Placing] = []
     if placement == "automatic":
-        wrappers.append(SingularityPlacement(control, scheme))
+        wrappers.append(SingularityPlacement(control, scheme, t_end))
     elif placement == "halved":
         wrappers.append(HalvedStep(control, scheme, t_end))
     elif placement == "off":

@@ -141,7 +141,7 @@ class FixedStep:
         """Accept every step that could be evaluated."""
         if result is None or not np.isfinite(result.state).all():
             return Verdict.REJECTED
-        if proposal.t_new >= self._t0 + self._index * self._step * (1.0 - 1e-14):
+        while proposal.t_new >= self._t0 + self._index * self._step * (1.0 - 1e-14):
             self._index += 1
         return Verdict.ACCEPTED
 

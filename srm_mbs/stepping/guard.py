@@ -1,0 +1,80 @@
+r"""Passages checked after the fact: the motion must leave a singular configuration the way it came.
+
+Velocities are continuous through a passage.  A step too long for its error estimate may end on
+another branch; its velocity then differs from
+
+    v_0 + h (a_0 + a_1) / 2
+
+by a large part of itself, while on the same branch the difference is h^3 v''' / 12.  Such a step is
+redone with half its length; what does not help in the end is kept, and reported.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from srm_mbs.methods.base import Memory, StepResult
+from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
+from srm_mbs.systems.base import System
+
+TURNED = 0.3
+"""Part of the velocity by which it may differ from the trapezoidal rule."""
+MAX_REDONE = 8
+
+
+def turned(system: System, result: StepResult) -> bool:
+    """Whether the velocity of a step next to a singular configuration took another direction."""
+    sigmas, k = result.sigmas, system.multiplier_part.start
+    if not sigmas.min() < sigmas.max() - sigmas.min():
+        return False
+    start, end = result.rates[0], result.end_rate
+    halfway = 0.5 * result.h * (start[k:] + end[k:])
+    still = np.zeros(k)
+    jump, *sizes = (
+        system.size(np.concatenate([v, still]))
+        for v in (end[:k] - start[:k] - halfway, start[:k], end[:k], halfway)
+    )
+    return jump > TURNED * max(sizes)
+
+
+class BranchGuard:
+    """Wraps ``inner`` step-size control: a passage that changes the branch is redone.
+
+    For second-order systems; a DAE of first order has no velocity to compare.
+
+    Attributes
+    ----------
+    redone
+        Steps redone.
+    suspects
+        Times (s) of the steps that were kept although the velocity turned.
+    """
+
+    def __init__(self, inner: StepSizeControl, system: System) -> None:
+        self._inner = inner
+        self._system = system
+        self.adaptive = inner.adaptive
+        self.redone = 0
+        self.suspects: list[float] = []
+        self._limit = np.inf
+        self._tries = 0
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """The inner proposal, halved after a passage that has to be redone."""
+        return self._inner.propose(t, min(limit, self._limit), memory)
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Redo a step whose velocity turned; otherwise the inner control's verdict."""
+        suspect = result is not None and turned(self._system, result)
+        if suspect and self._tries < MAX_REDONE:
+            self._limit = 0.5 * proposal.h
+            self._tries += 1
+            self.redone += 1
+            return Verdict.REPLACED
+        verdict = self._inner.judge(proposal, result)
+        if verdict is Verdict.ACCEPTED:
+            if suspect:
+                self.suspects.append(proposal.t_new)
+            self._limit = np.inf
+            self._tries = 0
+        return verdict

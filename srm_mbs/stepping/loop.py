@@ -179,7 +179,7 @@ def _closures_lost(system: System, norm: ErrorNorm, result: StepResult) -> bool:
     large = LARGE_CORRECTION * norm.atol / norm.rtol
     if not result.correction.size or (np.abs(result.correction) < large).all():
         return False
-    return not system.closure_gap(result.state) < LOST
+    return not system.closure_gap(result.t + result.h, result.state) < LOST
 
 
 def _fail(

@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
+    from srm_mbs.dae import DaeSolution, solve_dae
     from srm_mbs.errors import (
         AssemblyError,
         InputError,
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
     from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
     from srm_mbs.methods.butcher import ButcherTableau
     from srm_mbs.methods.psrm import PSRM
+    from srm_mbs.methods.srm import SRM
     from srm_mbs.methods.tableaus import TABLEAUS
+    from srm_mbs.semi_explicit import SemiExplicitDAE
     from srm_mbs.simulation import simulate
     from srm_mbs.solution import Solution
     from srm_mbs.storage import load_solution
@@ -35,10 +38,13 @@ _HOME = {
     "AssemblyError": "errors",
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
+    "DaeSolution": "dae",
     "InputError": "errors",
     "LoopClosure": "mechanism",
     "Mechanism": "mechanism",
     "PSRM": "methods.psrm",
+    "SRM": "methods.srm",
+    "SemiExplicitDAE": "semi_explicit",
     "SimulationError": "errors",
     "Solution": "solution",
     "SrmError": "errors",
@@ -50,19 +56,23 @@ _HOME = {
     "load_solution": "storage",
     "n_four_bar": "loading",
     "simulate": "simulation",
+    "solve_dae": "dae",
 }
 
 __all__ = [
     "CLOSURE_TYPES",
     "PSRM",
+    "SRM",
     "TABLEAUS",
     "Anchor",
     "Assembly",
     "AssemblyError",
     "ButcherTableau",
+    "DaeSolution",
     "InputError",
     "LoopClosure",
     "Mechanism",
+    "SemiExplicitDAE",
     "SimulationError",
     "Solution",
     "SrmError",
@@ -73,6 +83,7 @@ __all__ = [
     "load_solution",
     "n_four_bar",
     "simulate",
+    "solve_dae",
 ]
 
 

@@ -19,11 +19,20 @@ from srm_mbs.closing import ClosureProblem, close_loops
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, InputError
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
+from srm_mbs.systems.singular import (
+    SINGULAR,
+    SingularConfiguration,
+    analyse_singular,
+    nearest_singular,
+)
 
 RATE_TOLERANCE = 1e-12
-SINGULAR = 1e-7
-"""Singular value of G, rows over their usual size, that counts as zero: the square root of
-round-off, because a singular closing is known no better where it could not be sharpened."""
+ROUNDING, LOOSEST = 1e-14, 1e-8
+"""Closure error of q, which over the distance from a singular configuration is an error of G v, and
+the largest such error: the square root of round-off."""
+EXACTLY, NEARLY = 1e-12, 1e-3
+"""Singular values of G, rows over their usual size, between which rates come from the branch."""
 CURVATURE = 1e-7
 """Largest u^T (Gdot v) of consistent rates, over the square of the rates."""
 
@@ -119,6 +128,43 @@ def _positions(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Conditions:
+    """What the rates u (nv,), in units, of a motion satisfy: rows u = 0 and curvature(u) = 0."""
+
+    rows: FloatArray
+    curvature: Callable[[FloatArray], FloatArray]
+
+
+def _on_branch(limit: BranchLimit, unit: FloatArray) -> _Conditions:
+    """Those on one branch next to a singular configuration: the normal part vanishes."""
+    return _Conditions(limit.projector * unit / unit[:, None], lambda u: np.zeros(0))
+
+
+def _conditions(
+    mechanism: Mechanism, problem: ClosureProblem, q: FloatArray
+) -> tuple[_Conditions, SingularConfiguration | None]:
+    """The conditions at q, and the singular configuration so close to q that rates choose the
+    branch and not q."""
+    normalised = problem.normalised(q)
+    left, singular, _ = np.linalg.svd(normalised)
+    left = left[:, int(np.sum(singular > SINGULAR)) :]
+    here = _Conditions(normalised, lambda u: left.T @ problem.bias(q, u))
+    if not np.any((singular > EXACTLY) & (singular < NEARLY)):
+        return here, None
+    # G determines the rates to round-off over the square of the distance: use the branch.
+    rank = mechanism.structure.rank
+    found = nearest_singular(problem, q, rank, reach=10.0 * NEARLY)
+    if found is None:
+        return here, None
+    close = analyse_singular(problem, found, rank)
+    away = problem.difference(found, q)
+    if np.linalg.norm(away) > TELLS_THE_BRANCH:
+        limit = branch_limit(close, q, away)
+        return (here if limit is None else _on_branch(limit, problem.unit)), None
+    return _Conditions(problem.normalised(found), close.curvature), close
+
+
 def _rates(
     mechanism: Mechanism,
     problem: ClosureProblem,
@@ -127,27 +173,37 @@ def _rates(
     held: tuple[str, ...],
 ) -> FloatArray:
     _, G = problem.closure(q)
-    normalised = G / problem.row_size[:, None]
-    left, singular, _ = np.linalg.svd(normalised)
-    left = left[:, int(np.sum(singular > SINGULAR)) :]
+    singular = np.linalg.svd(G / problem.row_size[:, None], compute_uv=False)
+    conditions, close = _conditions(mechanism, problem, q)
 
-    def curvature(u: FloatArray) -> FloatArray:
-        return left.T @ problem.bias(q, u)
+    def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
+        """The rates nearest to u that satisfy the conditions; None if there are none."""
+        _, s, right = np.linalg.svd(to.rows[:, free])
+        rank = int(np.sum(s > SINGULAR))
+        inverse = np.linalg.pinv(to.rows[:, free], rcond=SINGULAR / max(s[:1].sum(), SINGULAR))
+        u = u.copy()
+        for _ in range(2):  # the second pass removes the rounding of the first
+            u[free] -= inverse @ (to.rows @ u)
+        return _onto_tangent(u, free, right[rank:].T, to.curvature)
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
         """Rates in units, the largest G v left, and whether a motion has these rates."""
         free = _free_coordinates(mechanism, names)
-        _, s, right = np.linalg.svd(normalised[:, free])
-        rank = int(np.sum(s > SINGULAR))
-        inverse = np.linalg.pinv(normalised[:, free], rcond=SINGULAR / max(s[:1].sum(), SINGULAR))
-        u = v / problem.unit
-        for _ in range(2):  # the second pass removes the rounding of the first
-            u[free] -= inverse @ (normalised @ u)
-        error = float(np.abs(G @ u).max())
-        bent = _onto_tangent(u, free, right[rank:].T, curvature)
-        return (u, error, False) if bent is None else (bent, error, True)
+        u = fit(v / problem.unit, free, conditions)
+        if u is not None and close is not None:
+            limit = branch_limit(close, q, u)
+            u = u if limit is None else fit(u, free, _on_branch(limit, problem.unit))
+        if u is None:
+            start = v / problem.unit
+            linear = _Conditions(conditions.rows, lambda u: np.zeros(0))
+            nearest = fit(start, free, linear)
+            return start, float(np.abs(G @ (start if nearest is None else nearest)).max()), False
+        return u, float(np.abs(G @ u).max()), True
 
-    tolerance = RATE_TOLERANCE * max(1.0, float(np.abs(v / problem.unit).max()))
+    # Next to a singular configuration q lies off its branch by round-off over the distance.
+    smallest = float(singular[singular > EXACTLY].min(initial=1.0))
+    tolerance = max(RATE_TOLERANCE, min(ROUNDING / smallest, LOOSEST))
+    tolerance *= max(1.0, float(np.abs(v / problem.unit).max()))
 
     def consistent(error: float, moves: bool) -> bool:
         return error <= tolerance and moves
@@ -261,7 +317,9 @@ def assemble(
     Returns
     -------
     Assembly
-        With |g| <= 1e-12 in rad and scene diagonals, |G v| <= 1e-12 in those per second.
+        With |g| <= 1e-12 in rad and scene diagonals, |G v| <= 1e-12 in those per second.  Next to
+        a singular configuration, at distance d, the rates are those of the branch, exact to
+        round-off over d; |G v| may be as large.
 
     Raises
     ------

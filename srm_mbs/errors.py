@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from srm_mbs.dae import DaeSolution
     from srm_mbs.solution import Solution
 
 
@@ -94,6 +95,10 @@ class ControllerError(SrmError):
     """The user's controller raised, or returned something that is not a finite (nv,) vector."""
 
 
+class CallbackError(ControllerError):
+    """A function of a DAE raised, or returned another shape."""
+
+
 class EventError(SrmError):
     """An event function raised, or returned something that is not one finite number."""
 
@@ -101,7 +106,7 @@ class EventError(SrmError):
 class SimulationError(SrmError, RuntimeError):
     """A run failed and the caller asked for an exception; ``solution`` holds what was computed."""
 
-    def __init__(self, message: str, solution: Solution) -> None:
+    def __init__(self, message: str, solution: Solution | DaeSolution) -> None:
         super().__init__(message)
         self.solution = solution
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
-import warnings
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -17,13 +14,19 @@ from srm_mbs.errors import (
     EvaluationError,
     InputError,
     SimulationError,
-    SrmWarning,
 )
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.methods.base import ErrorNorm, Method
+from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.methods.psrm import PSRM
-from srm_mbs.progress import progress_bar
+from srm_mbs.options import (
+    checked_method,
+    checked_rtol,
+    checked_times,
+    numbers,
+    positive,
+    step_size_control,
+)
+from srm_mbs.progress import progress_of
 from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
 from srm_mbs.stepping.dense import DenseOutput, step_data
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
@@ -31,8 +34,6 @@ from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.singular_times import PLACEMENTS, Placing, placed
 from srm_mbs.stepping.starting import start
 from srm_mbs.stepping.stepsize import (
-    FixedStep,
-    PIControl,
     StepSizeControl,
     Verdict,
     initial_step,
@@ -43,9 +44,6 @@ from srm_mbs.systems.units import row_units
 
 log = logging.getLogger(__name__)
 
-LOOSEST_RTOL = 1e-4
-"""Looser tolerances let a step jump to another branch at a change point."""
-TIGHTEST_RTOL = 100 * np.finfo(float).eps
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
 BACKENDS = ("auto", "python")
@@ -55,52 +53,6 @@ AVOIDABLE = 1e-9
 """Fraction of the run within which of its ends a given singular time cannot be avoided."""
 
 
-def _positive(value: Any, what: str, unit: str = "") -> float:
-    """``value`` as a positive finite float."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
-        raise InputError(
-            f"{what} = {value!r} is not a positive number{unit}",
-            element=what,
-            remedy="Give a positive number",
-        )
-    return number
-
-
-def _numbers(values: Any, what: str, remedy: str) -> FloatArray:
-    """``values`` as an array of finite numbers."""
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if not np.isfinite(array).all():
-        raise InputError(f"{what} = {values!r} is not finite numbers", element=what, remedy=remedy)
-    return array
-
-
-def _checked_rtol(value: Any) -> float:
-    rtol = _positive(value, "rtol")
-    if rtol > LOOSEST_RTOL:
-        warnings.warn(
-            f"rtol = {rtol:g} is looser than {LOOSEST_RTOL:g}, from where a step may jump to "
-            f"another branch at a singular configuration: using {LOOSEST_RTOL:g}",
-            SrmWarning,
-            stacklevel=3,
-        )
-        return LOOSEST_RTOL
-    if rtol < TIGHTEST_RTOL:
-        warnings.warn(
-            f"rtol = {rtol:g} is below round-off: using {TIGHTEST_RTOL:.1e}",
-            SrmWarning,
-            stacklevel=3,
-        )
-        return float(TIGHTEST_RTOL)
-    return rtol
-
-
 def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
     nv = mechanism.model.nv
@@ -108,7 +60,7 @@ def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatAr
     if atol is None:
         return rtol * np.concatenate([units.coordinate, units.coordinate * units.rate])
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
-    array = _numbers(atol, "atol", remedy)
+    array = numbers(atol, "atol", remedy)
     if array.shape not in ((), (nv,), (2 * nv,)) or not (array > 0.0).all():
         raise InputError(
             f"atol has shape {array.shape} or is not positive", element="atol", remedy=remedy
@@ -119,52 +71,20 @@ def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatAr
 
 
 def _checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
-    if isinstance(method, str):
-        if method.lower() != "psrm":
-            raise InputError(
-                f"there is no method {method!r}",
-                element="method",
-                remedy='This version has "psrm"',
-            )
-        return PSRM() if tableau is None else PSRM(tableau)
-    if tableau is not None:
+    checked = checked_method(method, tableau)
+    if getattr(checked, "T", "identity") != "identity":
         raise InputError(
-            "tableau is given beside a method object",
-            element="tableau",
-            remedy="Give the tableau to the method: PSRM(tableau=...)",
-        )
-    if isinstance(method, type) or not all(
-        hasattr(method, name) for name in ("scheme", "start", "step", "accept")
-    ):
-        raise InputError(
-            f"method = {method!r} is not a method",
+            "T is given, but the sweeps of mechanisms (2.6) have no such matrix",
             element="method",
-            remedy='Give "psrm" or an object such as PSRM(tableau="dopr54")',
+            remedy="Leave T out; it is for srm.solve_dae",
         )
-    return method
-
-
-def _checked_times(t_eval: Any, t_end: float) -> FloatArray | None:
-    if t_eval is None:
-        return None
-    remedy = f"Give increasing times between 0 and t_end = {t_end:g} s"
-    times = _numbers(t_eval, "t_eval", remedy)
-    slack = 1e-12 * t_end  # np.arange(4) * 0.1 ends a rounding error after 0.3
-    if times.ndim != 1 or (times.size and (times.min() < -slack or times.max() > t_end + slack)):
-        raise InputError(
-            "t_eval must be one-dimensional and lie within 0 and t_end",
-            element="t_eval",
-            remedy=remedy,
-        )
-    if np.any(np.diff(times) <= 0.0):
-        raise InputError("t_eval must increase", element="t_eval", remedy=remedy)
-    return np.clip(times, 0.0, t_end)
+    return checked
 
 
 def _checked_singular_times(singular_times: Any, t_end: float) -> FloatArray:
     """The given times within the run, in order."""
     remedy = "Give times (s) between the start and the end of the run"
-    times = _numbers(singular_times, "singular_times", remedy)
+    times = numbers(singular_times, "singular_times", remedy)
     if times.ndim != 1:
         raise InputError(
             f"singular_times has shape {times.shape}", element="singular_times", remedy=remedy
@@ -234,17 +154,7 @@ def _control(
 ) -> tuple[StepSizeControl, Sequence[Placing]]:
     """The step-size control of a run, and the wrappers in it that count what they did."""
     scheme = method.scheme
-    control: StepSizeControl
-    if step is not None:
-        control = FixedStep(0.0, t_end, step)
-    else:
-        if scheme.controller_order is None:
-            raise InputError(
-                f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
-                element="tableau",
-                remedy="Give step=, or use tvd32, dopr54 or dop853",
-            )
-        control = PIControl(t_end, first_step(), scheme.controller_order)
+    control = step_size_control(scheme, 0.0, t_end, step, first_step)
     return placed(
         control, scheme, placement if system.has_constraints else None, singular_times, t_end, step
     )
@@ -283,9 +193,10 @@ def simulate(
     q0 : (nq,), v0 : (nv,)
         Initial state instead of the mechanism's own; must satisfy the closures.
     method
-        ``"psrm"`` or a method object such as :class:`srm_mbs.PSRM`.
+        ``"psrm"``, ``"srm"`` or a method object: :class:`srm_mbs.PSRM`, :class:`srm_mbs.SRM`.
     tableau
-        Runge-Kutta scheme for a method given by name; ``"dop853"`` by default.
+        Runge-Kutta scheme for a method given by name; by default ``"dop853"`` for psrm,
+        ``"tvd32"`` for srm.
     rtol
         Relative tolerance, at most 1e-4; looser values are replaced with a warning.
     atol
@@ -340,10 +251,10 @@ def simulate(
             element="mechanism",
             remedy="Give srm.load(...) or srm.Mechanism(...)",
         )
-    t_end = _positive(t_end, "t_end", " of seconds")
+    t_end = positive(t_end, "t_end", " of seconds")
     for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
         if value is not None:
-            _positive(value, what, " of seconds")
+            positive(value, what, " of seconds")
     if controller is not None and not callable(controller):
         raise InputError(
             f"controller = {controller!r} cannot be called",
@@ -364,10 +275,12 @@ def simulate(
         )
     avoided = _checked_singular_times(singular_times, t_end)
     method = _checked_method(method, tableau)
-    rtol = _checked_rtol(rtol)
-    times = _checked_times(t_eval, t_end)
+    rtol = checked_rtol(rtol)
+    times = checked_times(t_eval, 0.0, t_end)
     mechanism, state = _initial_state(mechanism, q0, v0)
-    norm = ErrorNorm(_absolute_tolerance(mechanism, atol, rtol), rtol)
+    norm = ErrorNorm(
+        _absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
+    )
     system = make_system(mechanism, controller)
     if mechanism.loops:
         _check_consistent(mechanism)
@@ -386,7 +299,7 @@ def simulate(
         control, wrappers = _control(
             system, method, step, chosen_first_step, t_end, placement, avoided
         )
-        with _progress(progress, system, t_end) as tick:
+        with progress_of(progress, system, t_end) as tick:
             record = integrate(
                 system,
                 method,
@@ -417,16 +330,6 @@ def simulate(
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)
     return solution
-
-
-def _progress(
-    progress: bool | Tick, system: OpenSystem | ClosedSystem, t_end: float
-) -> AbstractContextManager[Tick | None]:
-    if callable(progress):
-        return nullcontext(progress)
-    if progress:
-        return progress_bar(system, t_end)
-    return nullcontext(None)
 
 
 def _collect(

@@ -15,7 +15,7 @@ PACKAGE = Path(srm_mbs.__file__).parent
 
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
-    ("arrays", "errors"),
+    ("arrays", "errors", "semi_explicit"),
     ("closures",),
     ("mechanism",),
     ("coordinates", "systems"),
@@ -25,7 +25,8 @@ LAYERS = (
     ("assembly", "solution"),
     ("loading",),
     ("storage",),
-    ("progress", "simulation"),
+    ("options", "progress"),
+    ("dae", "simulation"),
     ("plots", "visuals", "scene", "playback", "summary", "export"),
     ("cli",),
 )

@@ -191,7 +191,8 @@ def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mech
         ({"rtol": -1e-6}, "rtol"),
         ({"atol": [1e-6, 1e-6]}, "atol"),
         ({"atol": 0.0}, "atol"),
-        ({"method": "newmark"}, 'This version has "psrm"'),
+        ({"method": "newmark"}, "This version has 'psrm', 'srm'"),
+        ({"method": srm.SRM(T="inverse")}, "no such matrix"),
         ({"tableau": "rk45"}, "dopr54"),
         ({"tableau": "erk4"}, "step="),
         ({"method": srm.PSRM(), "tableau": "dopr54"}, r"PSRM\(tableau"),
@@ -227,8 +228,9 @@ def test_invalid_options_raise_before_any_stepping(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"prediction": "simple"}, "not in this version"),
-        ({"correction": "sweep"}, "not in this version"),
+        ({"prediction": "simple", "correction": "split"}, "there is no PSRM with"),
+        ({"prediction": "extrapolated"}, "there is no PSRM with"),
+        ({"correction": "late"}, "there is no PSRM with"),
         ({"eps": -1.0}, "eps"),
         ({"tableau": "nonsense"}, "unknown tableau"),
     ],

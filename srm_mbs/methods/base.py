@@ -17,6 +17,10 @@ from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.systems.base import System, Zone
 
 
+NEGLIGIBLE = 1e-3
+"""Fraction of the tolerance that is not worth an evaluation."""
+
+
 @dataclass(frozen=True)
 class ErrorNorm:
     """Weighted root mean square of the thesis, (B.4).
@@ -36,7 +40,12 @@ class ErrorNorm:
 
     atol: FloatArray
     rtol: float
-    negligible: float = 1e-3
+    negligible: float = NEGLIGIBLE
+
+    @property
+    def one(self) -> FloatArray:
+        """What the tolerances call "one" (n,), a unit for each component."""
+        return self.atol / self.rtol
 
     def weights(self, magnitude: FloatArray) -> FloatArray:
         """atol + rtol |x| (n,)."""
@@ -46,6 +55,31 @@ class ErrorNorm:
         """The norm of ``error`` (n,) for ``weights`` (n,)."""
         scaled = error / weights
         return float(np.sqrt(scaled @ scaled / scaled.size))
+
+
+@dataclass(frozen=True, eq=False)
+class SweepNode:
+    """Where one sweep stands at the end of a step.
+
+    Attributes
+    ----------
+    state : (nx,)
+        The sweep's own state.
+    multiplier
+        Its multiplier there, in the form that the system's sweeps carry.
+    rate : (n,) or None
+        Its tangent rate there; None if the next step has to evaluate it.
+    eps
+        The regularisation (s) of that rate.
+    history
+        Its multipliers at recent step ends outside the zone; None where sweeps need no zone.
+    """
+
+    state: FloatArray
+    multiplier: FloatArray
+    rate: FloatArray | None
+    eps: float
+    history: MultiplierHistory | None
 
 
 @dataclass
@@ -64,6 +98,8 @@ class Memory:
         Multipliers at recent step ends outside the zone; None without closures.
     sigma_slope
         |d sigma / dt| (1/s) seen by step-size control; it widens the zone for fast passages.
+    sweeps
+        For methods with sweeps: where each one stands, the last one last.
     """
 
     rate: FloatArray
@@ -71,6 +107,7 @@ class Memory:
     magnitude: FloatArray
     history: MultiplierHistory | None = None
     sigma_slope: float = 0.0
+    sweeps: tuple[SweepNode, ...] = ()
 
 
 @dataclass(slots=True)
@@ -81,8 +118,9 @@ class StepResult:
     ----------
     state
         State at the end, corrected.
-    rates : (s + 1, n)
-        Chart rates of the stages and of the end point; what the dense output is made of.
+    rates : (s + 1, n) or (s + 1 + e, n)
+        Chart rates of the stages and of the end point; what the dense output is made of.  Methods
+        with sweeps add those of the e extra stages of the tableau's extension.
     end_rate : (n,)
         Tangent rate at the corrected end point.
     correction : (n,)
@@ -101,6 +139,8 @@ class StepResult:
         yhat at the end point; None if the end point lies in the zone.
     magnitude : (n,)
         |x| of the error weights at the end.
+    sweeps
+        For methods with sweeps: where each one stands at the end.
     """
 
     t: float
@@ -116,6 +156,7 @@ class StepResult:
     history: MultiplierHistory | None
     multiplier: FloatArray | None
     magnitude: FloatArray
+    sweeps: tuple[SweepNode, ...] = ()
 
 
 class Method(Protocol):

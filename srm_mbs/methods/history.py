@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
 
+STALE = 4.0
+"""A multiplier is predicted at most this many spans of the nodes beyond the last one."""
 POINTS = 5
 """Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
 
@@ -61,6 +64,22 @@ class MultiplierHistory:
     def predict(self, t: float) -> FloatArray:
         """yhat (nv,) extrapolated to ``t``."""
         return lagrange_weights(self.times, t) @ self.values
+
+    def predict_near(self, t: float) -> FloatArray:
+        """yhat (nv,) extrapolated to ``t``, as long as that makes sense.
+
+        Raises
+        ------
+        EvaluationError
+            If ``t`` lies too far beyond the nodes.
+        """
+        span = float(self.times[-1] - self.times[0])
+        if t > max(self.times[-1] + STALE * span, self.known_until):
+            raise EvaluationError(
+                "the motion stays next to a singular configuration for longer than its multiplier "
+                "can be predicted: it has too little momentum to pass"
+            )
+        return self.predict(t)
 
     def uncertainty(self, t: float) -> FloatArray:
         """|yhat_pred - the prediction without the oldest node| (nv,); 0 with a single node."""

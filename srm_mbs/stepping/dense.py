@@ -35,8 +35,9 @@ class StepData:
         Ends of the steps, the start first.
     states : (n + 1, nx)
         States there.
-    rates : (n, s + 1, m)
-        Chart rates of the stages and the end point.
+    rates : (n, s + 1, m) or (n, s + 1 + e, m)
+        Chart rates of the stages and the end point; of the extra stages as well for methods that
+        evaluate them in every step.
     corrections : (n, m)
         What was subtracted at each step end; (n, 0) without closures.
     sigmas : (n, s + 1)
@@ -86,7 +87,7 @@ def step_data(
     return StepData(
         times=np.array([t0, *times]),
         states=np.array([x0, *(s.state for s in steps)]),
-        rates=np.array([s.rates for s in steps]).reshape(n, stages, tangent_size),
+        rates=np.array([s.rates for s in steps]).reshape(n, -1 if n else stages, tangent_size),
         corrections=np.array([s.correction for s in steps]).reshape(n, -1 if n else 0),
         sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
         ranks=np.array([s.rank for s in steps], dtype=float),
@@ -196,7 +197,7 @@ class DenseOutput:
     def _all_rates(self, step: int, h: float) -> FloatArray:
         rates: FloatArray = self._steps.rates[step]
         A, c = self._extension.extra_A, self._extension.extra_c
-        if not len(c):
+        if len(rates) == self._extension.n_rates:  # no extra stages, or evaluated by the method
             return rates
         if step not in self._extra:
             start, t = self._steps.states[step], self._steps.times[step]

@@ -176,10 +176,10 @@ def integrate(
 def _closures_lost(system: System, norm: ErrorNorm, result: StepResult) -> bool:
     """Whether the end correction was too large to close the loops again."""
     # atol over rtol is the size that the tolerances call "one", whatever the unit of length.
-    large = LARGE_CORRECTION * norm.atol / norm.rtol
+    large = LARGE_CORRECTION * norm.one
     if not result.correction.size or (np.abs(result.correction) < large).all():
         return False
-    return not system.closure_gap(result.state) < LOST
+    return not system.closure_gap(result.t + result.h, result.state) < LOST
 
 
 def _fail(

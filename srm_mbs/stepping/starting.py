@@ -21,7 +21,7 @@ from srm_mbs.methods.base import ErrorNorm, Memory, Method
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.psrm import PSRM
 from srm_mbs.systems.base import Zone
-from srm_mbs.systems.branch_limit import BranchLimit, branch_limit
+from srm_mbs.systems.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
 from srm_mbs.systems.branches import branch_tangents
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
@@ -33,8 +33,6 @@ DIRECT_FROM = 1e-3
 """Distance (units) from the singular configuration from which the direct solve is accurate."""
 UNDECIDED = 1e-5
 """sigma below which a start is refused if no singular configuration explains it."""
-TELLS_THE_BRANCH = 1e-6
-"""Distance (units) from which the configuration itself tells on which branch it lies."""
 TANGENT = 1e-6
 """Largest part of the initial velocity off the branch's tangents, relative to it."""
 FOLLOWED = 1e-7
@@ -73,7 +71,10 @@ def describe_branches(singular: SingularConfiguration, u: FloatArray) -> str:
         return "its branches cannot be listed"
     listed = [_rates(geometry.mechanism, tangent * geometry.unit) for tangent in tangents[:SHOWN]]
     more = f" and {len(tangents) - SHOWN} more" if len(tangents) > SHOWN else ""
-    return f"{len(tangents)} branches cross there, with rates in the ratios ({'), ('.join(listed)}){more}"
+    return (
+        f"{len(tangents)} branches cross there, with rates in the ratios "
+        f"({'), ('.join(listed)}){more}"
+    )
 
 
 def _refuse(singular: SingularConfiguration, u: FloatArray, why: str) -> InputError:
@@ -153,12 +154,13 @@ def _history(
     step = _span(rate, unit, longest) / AHEAD
     method = PSRM("dop853")
     history = MultiplierHistory(
-        t + step * np.arange(AHEAD + 1), np.tile(multiplier, (AHEAD + 1, 1))
+        np.linspace(t, t + AHEAD * step, AHEAD + 1), np.tile(multiplier, (AHEAD + 1, 1))
     )
     change = np.inf
     for _ in range(ROUNDS):
-        # sigma_slope without bound: every stage of every step takes the interpolated multiplier.
-        memory = Memory(rate, 0.0, system.magnitudes(state), history, sigma_slope=np.inf)
+        # Known everywhere: every stage of every step takes the interpolated multiplier.
+        known = replace(history, known_until=np.inf, known_below=np.inf)
+        memory = Memory(rate, 0.0, system.magnitudes(state), known)
         x = state
         values, sigmas = [multiplier], []
         for time in history.times[1:]:

@@ -162,7 +162,7 @@ def initial_step(
     """
     weights = norm.weights(memory.magnitude)
     # |x| itself may vanish; atol over rtol is the size that the tolerances call "one".
-    d0 = norm(np.maximum(memory.magnitude, norm.atol / norm.rtol), weights)
+    d0 = norm(np.maximum(memory.magnitude, norm.one), weights)
     d1 = norm(memory.rate, weights)
     if not d1 > 0.0:
         return 0.01 * span

@@ -61,10 +61,14 @@ class Terms(Protocol):
     def correction(self) -> FloatArray:
         """(E g, E c) (2 nv,): what to subtract from the state to satisfy g = 0 and c = 0."""
 
+    def prediction(self) -> FloatArray:
+        """The exact multiplier in the form that sweeps carry: yhat, or y of some DAEs."""
+
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         """Tangent rate and new multiplier of one SRM sweep, given the ``previous`` sweep's.
 
         Mechanisms, (2.6): (v - E g/eps, M^-1 f - yhat_s), yhat_s = P (yhat_{s-1} + v/eps).
+        DAEs, (2.2): (f - B y_s,), y_s = y_{s-1} + T g/eps, or (2.4), which carries B y.
         """
 
 
@@ -76,6 +80,12 @@ class System(Protocol):
     evaluations: int
     multiplier_part: slice
     """Where the multiplier yhat acts in a tangent: (nv, 2 nv) for a mechanism."""
+    multiplier_size: int
+    """Length of what sweeps carry: nv for a mechanism; nx or ny for a DAE."""
+    carries_yhat: bool
+    """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
+    predicts: bool
+    """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """Factorise at one stage.
@@ -105,7 +115,7 @@ class System(Protocol):
     def magnitudes(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""
 
-    def closure_gap(self, state: FloatArray) -> float:
+    def closure_gap(self, t: float, state: FloatArray) -> float:
         """Largest closure error at ``state``, in row units (scene diagonals, rad); 0 if open."""
 
     def step_limit(self, state: FloatArray) -> float:

@@ -28,6 +28,9 @@ SPACINGS = (0.03, 0.015, 0.0075, 0.06)
 ACCURATE = 1e-11
 CLOSING_ITERATIONS = 15
 CLOSED = 1e-12
+TELLS_THE_BRANCH = 5e-8
+"""Distance (units) from a singular configuration from which a configuration tells its branch:
+there round-off over the distance is a twentieth of it."""
 NEAR = 1e-2
 """Largest distance (units) of the asked configuration from the singular one."""
 

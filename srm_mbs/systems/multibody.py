@@ -40,6 +40,9 @@ _OVERFLOW = 1e100
 class _Mechanics:
     """What open and closed mechanisms share: state, manifold, forces."""
 
+    carries_yhat = True
+    predicts = True
+
     def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
         self.mechanism = mechanism
         self.model = mechanism.model
@@ -47,6 +50,7 @@ class _Mechanics:
         self.nq, self.nv = self.model.nq, self.model.nv
         self.tangent_size = 2 * self.nv
         self.multiplier_part = slice(self.nv, 2 * self.nv)
+        self.multiplier_size = self.nv
         self.evaluations = 0
         self._controller = controller
         self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
@@ -184,6 +188,9 @@ class _OpenTerms:
     def correction(self) -> FloatArray:
         return np.zeros(2 * self._nv)
 
+    def prediction(self) -> FloatArray:
+        return np.zeros(self._nv)
+
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         return self._rate, np.zeros(self._nv)
 
@@ -199,7 +206,7 @@ class OpenSystem(_Mechanics):
         self._zero = np.zeros(self.nv)
         self._terms = _OpenTerms(self.nv)
 
-    def closure_gap(self, state: FloatArray) -> float:
+    def closure_gap(self, t: float, state: FloatArray) -> float:
         """0: there is no closure."""
         return 0.0
 
@@ -239,14 +246,16 @@ class _ClosedTerms:
     def weak(self) -> bool:
         return self._p.weak
 
-    def _white_multiplier(self) -> FloatArray:
+    def _completed(self, white: FloatArray) -> FloatArray:
+        """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
+        if self.predicted is None:
+            return white
         p = self._p
-        white = p.white_multiplier
-        if self.predicted is not None:
-            # yhat = E_s gamma_s + (1 - P_s) yhat_pred, in L^T coordinates
-            prediction = p.U @ self.predicted
-            white = white + prediction - p.Q @ (p.Q.T @ prediction)
-        return white
+        prediction = p.U @ self.predicted
+        return white + prediction - p.Q @ (p.Q.T @ prediction)
+
+    def _white_multiplier(self) -> FloatArray:
+        return self._completed(self._p.white_multiplier)
 
     def rate(self) -> FloatArray:
         p = self._p
@@ -258,6 +267,9 @@ class _ClosedTerms:
 
     def multiplier(self) -> FloatArray:
         return self._p.unwhiten(self._white_multiplier())
+
+    def prediction(self) -> FloatArray:
+        return self.multiplier()
 
     def project(self, w: FloatArray) -> FloatArray:
         return self._p.project(w)
@@ -275,7 +287,7 @@ class _ClosedTerms:
         nv = self.v.size
         right = np.empty((nv, 3), order="F")
         right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = p.white_project(previous + self.v / eps)
+        right[:, 1] = self._completed(p.white_project(previous + self.v / eps))
         right[:, 2] = p.white_force - right[:, 1]
         back = p.unwhiten(right)
         rate = np.concatenate([self.v - back[:, 0] / eps, back[:, 2]])
@@ -329,7 +341,7 @@ class ClosedSystem(_Mechanics):
         terms.predicted = zone.predict(t) if projection.weak and zone is not None else None
         return terms
 
-    def closure_gap(self, state: FloatArray) -> float:
+    def closure_gap(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.systems.base.System`."""
         g, _ = self.residuals(state)
         return float(np.max(np.abs(g) * self._gap_scale))

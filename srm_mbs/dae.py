@@ -1,0 +1,322 @@
+"""``solve_dae``: index-2 DAEs with the methods and the stepping of mechanisms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
+from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.methods.history import lagrange_weights
+from srm_mbs.options import (
+    checked_method,
+    checked_rtol,
+    checked_times,
+    numbers,
+    positive,
+    step_size_control,
+)
+from srm_mbs.progress import progress_of
+from srm_mbs.semi_explicit import SemiExplicitDAE
+from srm_mbs.solution import Statistics
+from srm_mbs.stepping.dense import DenseOutput, StepData, step_data
+from srm_mbs.stepping.loop import RunRecord, Tick, integrate
+from srm_mbs.stepping.placement import SingularityPlacement
+from srm_mbs.stepping.stepsize import Verdict, initial_step
+from srm_mbs.systems.dae import DaeSystem
+
+CONSISTENT = 1e-8
+"""Largest constraint error of an accepted start, as a relative error of x0."""
+SINGULAR_START = 1e-5
+"""sigma below which a start is refused: round-off in x, over sigma, is an error of x'."""
+MULTIPLIER_POINTS = 5
+"""Ends of steps through which the multiplier of sweeps is interpolated."""
+
+
+class DaeSolution:
+    """Result of :func:`srm_mbs.solve_dae`.
+
+    Attributes
+    ----------
+    t : (n,)
+        ``t_eval``, or the ends of the accepted steps, the start first.
+    x : (n, nx), y : (n, ny)
+        States and multipliers there.  y is that of the last sweep; for the split form, which has
+        no sweep, the exact one at x.
+    status, message, success
+        ``finished``, ``failed`` or ``interrupted``; when and why; whether the end was reached.
+    stats
+        :class:`~srm_mbs.solution.Statistics`.
+    steps
+        :class:`~srm_mbs.stepping.dense.StepData`: what the stepping recorded, sigma included.
+    """
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        method: Method,
+        steps: StepData,
+        carried: Sequence[FloatArray],
+        *,
+        t_eval: FloatArray | None,
+        status: str,
+        message: str,
+        stats: Statistics,
+    ) -> None:
+        self.steps = steps
+        self.status = status
+        self.message = message
+        self.success = status == "finished"
+        self.stats = stats
+        self._system = system
+        self._dense = DenseOutput(system, method.scheme, steps)
+        # x and y at the nodes are what the dense output is made of.
+        steps.states.setflags(write=False)
+        steps.times.setflags(write=False)
+        self._nodes: FloatArray | None = None
+        if carried:
+            self._nodes = np.array(
+                [system.uncarried(*node) for node in zip(steps.times, steps.states, carried)]
+            )
+        self.t = steps.times if t_eval is None else t_eval[t_eval <= steps.times[-1]]
+        if t_eval is None:
+            self.x = steps.states
+            self.y = self._multipliers(self.t, self.x) if self._nodes is None else self._nodes
+        else:
+            self.x, self.y = self._at(self.t)
+
+    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
+        """Dense output: x and y at time ``t``, a scalar or an array of any order.
+
+        Returns shapes (nx,), (ny,) for a scalar, (k, nx), (k, ny) for an array.  Between the ends
+        of steps the y of sweeps is interpolated by polynomials through five of them.
+
+        Raises
+        ------
+        ValueError
+            If a time lies outside the run, or t has more than one dimension.
+        """
+        times = np.asarray(t, dtype=float)
+        if times.ndim > 1:
+            raise ValueError(f"t has shape {times.shape}; give a scalar or a vector of times")
+        x, y = self._at(np.atleast_1d(times))
+        return (x[0], y[0]) if times.ndim == 0 else (x, y)
+
+    def _at(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x = self._dense(times)
+        return x, self._multipliers(times, x)
+
+    def _multipliers(self, times: FloatArray, x: FloatArray) -> FloatArray:
+        out = np.empty((len(times), self._system.ny))
+        nodes, known = self.steps.times, self._nodes
+        for k, t in enumerate(times.tolist()):
+            if known is None:
+                out[k] = self._system.multiplier_at(t, x[k])
+                continue
+            width = min(MULTIPLIER_POINTS, len(nodes))
+            first = int(np.searchsorted(nodes, t)) - width // 2
+            near = slice(max(0, min(first, len(nodes) - width)), None)
+            weights = lagrange_weights(nodes[near][:width], t)
+            out[k] = weights @ known[near][:width]
+        return out
+
+    def __repr__(self) -> str:
+        return (
+            f"DaeSolution(t={self.steps.times[0]:.6g}..{self.steps.times[-1]:.6g}, "
+            f"{len(self.t)} points, {self.stats.steps} steps, {self.status})"
+        )
+
+
+def _interval(t_span: Any) -> tuple[float, float]:
+    remedy = "Give (t0, t1) with t0 < t1"
+    ends = numbers(t_span, "t_span", remedy)
+    if ends.shape != (2,) or not ends[0] < ends[1]:
+        raise InputError(f"t_span = {t_span!r} is not an interval", element="t_span", remedy=remedy)
+    return float(ends[0]), float(ends[1])
+
+
+def _start(x0: Any) -> FloatArray:
+    remedy = "Give a vector of finite numbers"
+    state = numbers(x0, "x0", remedy)
+    if state.ndim != 1 or state.size == 0:
+        raise InputError(f"x0 has shape {state.shape}", element="x0", remedy=remedy)
+    return state
+
+
+def _absolute_tolerance(atol: Any, rtol: float, nx: int) -> FloatArray:
+    if atol is None:
+        return np.full(nx, rtol)
+    remedy = f"Give one positive number or {nx}"
+    array = numbers(atol, "atol", remedy)
+    if array.shape not in ((), (nx,)) or not (array > 0.0).all():
+        raise InputError(
+            f"atol has shape {array.shape} or is not positive", element="atol", remedy=remedy
+        )
+    return np.broadcast_to(array, (nx,)).copy()
+
+
+def _check_start(system: DaeSystem, method: Method, t0: float, x0: FloatArray) -> None:
+    gap = system.closure_gap(t0, x0)
+    if not gap <= CONSISTENT:
+        raise InputError(
+            f"x0 violates g(t0, x0) = 0 by {gap:.1e} (relative error of x)",
+            element="x0",
+            remedy="Move x0 onto the constraints",
+        )
+    if not system.predicts and getattr(method, "prediction", "") == "exact":
+        raise InputError(
+            "g depends on t, and its derivative is not given",
+            element="g_t",
+            remedy='Give g_t, or use SRM or PSRM(prediction="simple"), which do not need it',
+        )
+
+
+def solve_dae(
+    problem: SemiExplicitDAE,
+    t_span: tuple[float, float],
+    x0: Any,
+    *,
+    method: str | Method = "psrm",
+    tableau: str | ButcherTableau | None = None,
+    rtol: float = 1e-6,
+    atol: Any = None,
+    step: float | None = None,
+    first_step: float | None = None,
+    max_step: float | None = None,
+    t_eval: Any = None,
+    progress: bool | Tick = False,
+    raise_on_failure: bool = False,
+) -> DaeSolution:
+    """Solve x' = f(t, x) - B(t, x) y, 0 = g(t, x) over ``t_span``.
+
+    The driver, the step-size control and the placement around isolated singularities of G B are
+    those of :func:`srm_mbs.simulate`.
+
+    Parameters
+    ----------
+    problem
+        The equations.
+    t_span : (t0, t1)
+        Start and end.
+    x0 : (nx,)
+        Initial state, with g(t0, x0) = 0.
+    method
+        ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
+        (GB)^-1; the last one carries B y, form (2.4) of the thesis, and with the split form is
+        the one to use where G B has isolated singularities.
+    tableau
+        Runge-Kutta scheme for a method given by name.
+    rtol
+        Relative tolerance, at most 1e-4.
+    atol
+        Absolute tolerance, a number or (nx,); rtol by default, for states of order one.
+    step
+        Fixed step instead of step-size control.
+    first_step, max_step
+        First and longest step of the step-size control.
+    t_eval : (n,)
+        Times at which the solution is given; by default the ends of the steps.
+    progress
+        True for a progress bar (on a terminal only), or a callable (t, h, x).
+    raise_on_failure
+        Raise :class:`SimulationError` instead of returning a partial solution.
+
+    Returns
+    -------
+    DaeSolution
+        With ``success`` False and everything computed so far if the run could not go on: a
+        function of the problem that raises, or returns what is not finite, included.
+
+    Raises
+    ------
+    InputError
+        For invalid input, before any stepping.
+    SimulationError
+        Only with ``raise_on_failure``.
+    """
+    if not isinstance(problem, SemiExplicitDAE):
+        raise InputError(
+            f"{problem!r} is not a DAE",
+            element="problem",
+            remedy="Give srm.SemiExplicitDAE(f=..., B=..., g=..., G=...)",
+        )
+    t0, t_end = _interval(t_span)
+    for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
+        if value is not None:
+            positive(value, what)
+    method = checked_method(method, tableau)
+    rtol = checked_rtol(rtol)
+    times = checked_times(t_eval, t0, t_end)
+    state = _start(x0)
+    norm = ErrorNorm(
+        _absolute_tolerance(atol, rtol, state.size), rtol, NEGLIGIBLE if step is None else 0.0
+    )
+    system = DaeSystem(problem, t0, state, t_end, getattr(method, "T", "identity"))
+    _check_start(system, method, t0, state)
+
+    placement: SingularityPlacement | None = None
+    carried: list[FloatArray] = []
+    try:
+        memory = method.start(system, t0, state, norm)
+        if memory.sigma < SINGULAR_START:
+            raise InputError(
+                f"G B is singular at the start, or almost (sigma = {memory.sigma:.1e})",
+                element="x0",
+                remedy="Start beside that point",
+            )
+        if memory.sweeps:
+            carried.append(memory.sweeps[-1].multiplier)
+
+        def chosen_first_step() -> float:
+            if first_step is not None:
+                return first_step
+            order = method.scheme.controller_order or 1
+            return initial_step(system, state, memory, norm, t_end - t0, order, t0)
+
+        control = step_size_control(method.scheme, t0, t_end, step, chosen_first_step)
+        placement = SingularityPlacement(control, method.scheme)
+        with progress_of(progress, system, t_end) as tick:
+            record = integrate(
+                system,
+                method,
+                placement,
+                norm,
+                memory,
+                state,
+                t0,
+                t_end,
+                max_step=np.inf if max_step is None else max_step,
+                tick=tick,
+            )
+    except (EvaluationError, ControllerError) as error:
+        record = RunRecord(t0, state.copy())
+        record.status, record.message = "failed", f"Stopped at t = {t0:.6g}: {error}."
+    carried += [result.sweeps[-1].multiplier for result in record.steps if result.sweeps]
+    data = step_data(t0, state, record.times, record.steps, method.scheme, system.tangent_size)
+    stats = Statistics(
+        steps=data.count,
+        rejected=sum(a.verdict is Verdict.REJECTED for a in record.attempts),
+        placements=0 if placement is None else placement.placed,
+        replaced=0 if placement is None else placement.replaced,
+        zone_steps=len(data.zones),
+        evaluations=system.evaluations,
+        factorisations=system.factorisations,
+        wall_time=record.wall_time,
+    )
+    solution = DaeSolution(
+        system,
+        method,
+        data,
+        carried,
+        t_eval=times,
+        status=record.status,
+        message=record.message,
+        stats=stats,
+    )
+    if raise_on_failure and not solution.success:
+        raise SimulationError(solution.message, solution)
+    return solution

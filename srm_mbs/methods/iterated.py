@@ -1,0 +1,263 @@
+r"""Steps made of sweeps: SRM, and the forms of PSRM whose corrector is a sweep.
+
+A step is a first multiplier yhat_0(t) and ``iterations`` corrector sweeps, sweep s with the
+multiplier of sweep s - 1 (docs/notation.md, "Sweeps").  Sweeps either keep their own trajectories
+for the whole run, as in the thesis, or all start from the accepted state of the last one.
+
+The error estimate is the embedded pair of the last sweep.  It is never the difference of two
+sweeps' trajectories: these drift apart, and their gap does not fall with the step (the impasse of
+the thesis, section 5.7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
+from srm_mbs.methods.base import ErrorNorm, Memory, StepResult, SweepNode
+from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.regularisation import Regularisation, real_stability_limit
+from srm_mbs.methods.sweeps import Answer, Start, Sweep, multipliers_between, nodes_of, sweep_over
+from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE, zone_of
+from srm_mbs.systems.base import System, Terms, Zone
+
+APART = 0.1
+"""Constraint error after a step, in row units, from which its sweeps are said to have come apart.
+Looser than for corrected steps: the sweeps of a coarse step leave errors of order eps^m."""
+EPS_SHRINKS = 0.7
+"""eps falls at most by this factor from one accepted step to the next.  With eps proportional to
+the trial step, shorter steps would not make a step's change small (v h/eps stays), and an error
+estimate above the tolerance would stay there."""
+_MANY = int(np.iinfo(np.int64).max)
+
+
+class First(Enum):
+    """The multiplier that the first corrector sweep is given."""
+
+    ZERO = "0"
+    HELD = "that of the last sweep at the start of the step"
+    EXACT = "the exact one, on a predictor sweep's own trajectory"
+    FUSED = "the exact one, at the corrector's own stages"
+
+
+def _corrector(previous: FloatArray, eps: float) -> Answer:
+    return lambda terms, j: terms.sweep(previous[j], eps)
+
+
+def _predictor(terms: Terms, j: int) -> tuple[FloatArray, FloatArray]:
+    return terms.rate(), terms.prediction()
+
+
+@dataclass(frozen=True, eq=False)
+class IteratedSweeps:
+    """The common engine; users see :class:`~srm_mbs.methods.srm.SRM` and PSRM.
+
+    Parameters
+    ----------
+    scheme
+        Runge-Kutta data.
+    first
+        Multiplier of the first sweep.
+    iterations
+        Number m of corrector sweeps.
+    own_history
+        Whether every sweep keeps its own trajectory.
+    eps
+        Regularisation as a function of the step.
+    interpolant
+        From :func:`~srm_mbs.methods.sweeps.interpolant`.
+    """
+
+    scheme: ButcherTableau
+    first: First
+    iterations: int
+    own_history: bool
+    eps: Regularisation
+    interpolant: DenseExtension | str
+
+    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+        """All sweeps at ``state``; own histories with multiplier 0, as in the thesis."""
+        terms = system.evaluate(t, state)
+        memory = Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+        multiplier = np.zeros(system.multiplier_size)
+        if self.first is not First.ZERO and system.predicts:
+            multiplier = terms.prediction().copy()
+        history = None
+        if self._keeps_history(system):
+            history = MultiplierHistory.begin(t, terms.multiplier())
+        node = SweepNode(state, multiplier, None, 0.0, history)
+        memory.sweeps = (node,) * (self.iterations if self.own_history else 1)
+        return memory
+
+    def _keeps_history(self, system: System) -> bool:
+        """Whether the zone can replace what the sweeps lose next to a singular configuration."""
+        exact = self.first in (First.EXACT, First.FUSED)
+        return system.has_constraints and system.predicts and (exact or system.carries_yhat)
+
+    def step(
+        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.methods.base.Method`."""
+        scheme, s = self.scheme, self.scheme.n_stages
+        eps = max(self.eps(h), EPS_SHRINKS * memory.sweeps[-1].eps)
+        if not (math.isfinite(eps) and eps > 0.0):
+            raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
+        zones = [zone_of(node.history, h * memory.sigma_slope, t + h) for node in memory.sweeps]
+        make = self._own_sweeps if self.own_history else self._restarted_sweeps
+        runs = make(system, t, h, eps, memory, zones)
+        last, zone, kept = runs[-1], zones[-1], memory.sweeps[-1].history
+        self._check_closed(system, t + h, last.state, h, eps)
+
+        magnitude = system.magnitudes(last.state)
+        error_ratio = 0.0
+        if scheme.error is not None:
+            error = h * np.abs(scheme.error @ last.rates[: s + 1])
+            if kept is not None and h * memory.sigma_slope > COUNT_UNCERTAINTY_ABOVE:
+                for j in last.weak:
+                    if j < s:
+                        uncertainty = kept.uncertainty(t + scheme.c[j] * h)
+                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
+            error_ratio = norm(error, norm.weights(np.maximum(memory.magnitude, magnitude)))
+        ends = runs if self.own_history else runs[-1:]
+        sweeps = tuple(
+            self._end(node, run, t + h, eps, s) for node, run in zip(memory.sweeps, ends)
+        )
+        weak = any(run.weak for run in runs)
+        return StepResult(
+            t=t,
+            h=h,
+            state=last.state,
+            rates=last.rates,
+            end_rate=last.end_rate,
+            correction=np.zeros(0),
+            error_ratio=error_ratio,
+            sigmas=np.min([run.sigmas for run in runs], axis=0),
+            rank=min(run.rank for run in runs),
+            zone=zone if weak else None,
+            history=kept if weak else None,
+            multiplier=None,
+            magnitude=magnitude,
+            sweeps=sweeps,
+        )
+
+    def accept(self, memory: Memory, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        memory.rate = result.end_rate
+        memory.sigma = float(result.sigmas[-1])
+        memory.magnitude = result.magnitude
+        memory.sweeps = result.sweeps
+
+    def _own_sweeps(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        eps: float,
+        memory: Memory,
+        zones: Sequence[Zone | None],
+    ) -> list[Sweep]:
+        """Every sweep from its own state; the fused form is its one sweep with another equation."""
+        fused = self.first is First.FUSED
+        previous = np.zeros((len(nodes_of(self.scheme).c), system.multiplier_size))
+        runs: list[Sweep] = []
+        for k, (node, zone) in enumerate(zip(memory.sweeps, zones)):
+            answer = _corrector(previous, eps)
+            if fused:
+
+                def answer(terms: Terms, j: int) -> tuple[FloatArray, FloatArray]:
+                    return terms.sweep(terms.prediction(), eps)
+
+            if node.rate is not None and math.isclose(eps, node.eps, rel_tol=1e-12):
+                start = Start(node.rate, node.multiplier, memory.sigma, _MANY)
+            else:
+                terms = system.evaluate(t, node.state, zone)
+                rate, _ = answer(terms, 0)
+                start = Start(rate.copy(), node.multiplier, terms.sigma, terms.rank, terms.weak)
+            run = sweep_over(
+                system, self.scheme, t, h, node.state, answer, start, zone, exact=fused
+            )
+            runs.append(run)
+            if k + 1 < self.iterations:
+                previous = multipliers_between(
+                    system, self.scheme, self.interpolant, t, h, run, answer, zone
+                )
+        return runs
+
+    def _restarted_sweeps(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        eps: float,
+        memory: Memory,
+        zones: Sequence[Zone | None],
+    ) -> list[Sweep]:
+        """All sweeps from the accepted state, whose evaluation they share."""
+        node, zone = memory.sweeps[-1], zones[-1]
+        terms = system.evaluate(t, node.state, zone)
+        starts: list[Start] = []
+        multiplier = np.zeros(system.multiplier_size)
+        if self.first is First.HELD:
+            multiplier = node.multiplier
+        exact = self.first is First.EXACT
+        if exact:
+            multiplier = terms.prediction().copy()
+            starts.append(
+                Start(terms.rate().copy(), multiplier, terms.sigma, terms.rank, terms.weak)
+            )
+        previous = np.tile(multiplier, (len(nodes_of(self.scheme).c), 1))
+        for _ in range(self.iterations):
+            rate, multiplier = (part.copy() for part in terms.sweep(multiplier, eps))
+            starts.append(Start(rate, multiplier, terms.sigma, terms.rank, terms.weak))
+        runs: list[Sweep] = []
+        for k, start in enumerate(starts):
+            answer = _predictor if exact and k == 0 else _corrector(previous, eps)
+            runs.append(
+                sweep_over(system, self.scheme, t, h, node.state, answer, start, zone, exact=exact)
+            )
+            if k + 1 < len(starts):
+                previous = multipliers_between(
+                    system, self.scheme, self.interpolant, t, h, runs[-1], answer, zone
+                )
+        return runs
+
+    def _end(self, node: SweepNode, run: Sweep, t: float, eps: float, s: int) -> SweepNode:
+        multiplier = run.multipliers[s]
+        known = run.exact if self.first in (First.EXACT, First.FUSED) else multiplier
+        history = node.history
+        if history is not None and known is not None and s not in run.weak:
+            history = history.extended(t, known)
+        return SweepNode(
+            run.state, multiplier, run.end_rate if self.own_history else None, eps, history
+        )
+
+    def _check_closed(
+        self, system: System, t: float, state: FloatArray, h: float, eps: float
+    ) -> None:
+        """Refuse a step whose end lies far off the constraints.
+
+        Raises
+        ------
+        EvaluationError
+            With the stability limit, where the ratio h/eps is beyond it.
+        """
+        if not system.has_constraints:
+            return
+        finite = bool(np.isfinite(state).all())
+        if finite and system.closure_gap(t, state) < APART:
+            return
+        limit = real_stability_limit(self.scheme)
+        reason = (
+            f"; h/eps = {h / eps:.3g} is beyond {limit:.3g}, up to which {self.scheme.name} is "
+            "stable: use a larger eps or a smaller step"
+            if h / eps > limit
+            else f" with h/eps = {h / eps:.3g}; use fewer sweeps or a smaller step"
+        )
+        raise EvaluationError(f"the sweeps leave the constraints{reason}")

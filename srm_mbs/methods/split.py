@@ -1,0 +1,141 @@
+r"""One step of the split PSRM.
+
+Exact prediction, and the corrector as a splitting at the step end (docs/notation.md): the
+stages integrate
+
+    q' = v,   v' = M^{-1} f - E gamma,
+
+and at the end point x^- = (q^-, v^-), with the same factorisation as the stage evaluated there,
+
+    q = q^- (+) (-theta E g),   v = v^- - theta P v^-,   theta = 1 - exp(-h / eps).
+
+The end stage serves as the next step's first stage with q' = corrected v, so that a step costs as
+many evaluations as the tableau has stages, and a few more next to singular configurations
+(:mod:`srm_mbs.methods.branch`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.methods.branch import NEAR, BranchStages
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE, ZONE_FLOOR, zone_from
+from srm_mbs.systems.base import System
+
+WATCHED = 0.05
+"""sigma below which, or within NEAR steps of which, a step looks out for singular
+configurations."""
+
+
+def split_start(system: System, t: float, state: FloatArray) -> Memory:
+    """First stage, and the first node of the multiplier history."""
+    terms = system.evaluate(t, state)
+    memory = Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    if system.has_constraints:
+        memory.history = MultiplierHistory.begin(t, terms.multiplier())
+    return memory
+
+
+def split_step(
+    system: System,
+    scheme: ButcherTableau,
+    t: float,
+    h: float,
+    state: FloatArray,
+    memory: Memory,
+    norm: ErrorNorm,
+    theta: float,
+) -> StepResult:
+    """One step; see :class:`~srm_mbs.methods.base.Method`.
+
+    Raises
+    ------
+    EvaluationError
+        If a stage cannot be evaluated.
+    """
+    s, A, c = scheme.n_stages, scheme.A, scheme.c
+    history = memory.history
+    sigma_change = h * memory.sigma_slope
+    branch: BranchStages | None = None
+    zone = None
+    if history is not None:
+        weights = norm.weights(memory.magnitude)
+        branch = BranchStages(system, memory, norm, weights, h, sigma_change, None)
+        near = memory.sigma < WATCHED + NEAR * sigma_change
+        zone = zone_from(history, branch.known_from(ZONE_FLOOR) if near else ZONE_FLOOR, t + h)
+        branch.zone = zone
+    rates = np.empty((s + 1, system.tangent_size))
+    sigmas = np.full(s + 1, memory.sigma)
+    rates[0] = memory.rate
+    weak_stages: list[int] = []
+    rank = np.iinfo(np.int64).max
+    moved: FloatArray | None = None
+    for j in range(1, s + 1):
+        end = j == s
+        delta = (h * (scheme.b if end else A[j, :j])) @ rates[:j]
+        x = system.retract(state, delta)
+        fraction = 1.0 if end else float(c[j])
+        time = t + fraction * h
+        terms = system.evaluate(time, x, zone)
+        sigmas[j] = terms.sigma
+        if branch is not None and fraction > 0.0:
+            terms, x, moved = branch(terms, time, fraction, x)
+        rate = terms.rate()
+        rates[j] = system.chart_rate(delta, rate)
+        rank = min(rank, terms.rank)
+        if terms.weak:
+            weak_stages.append(j)
+    magnitude = system.magnitudes(x)
+    if history is not None:
+        correction = theta * terms.correction()
+        new_state = system.retract(x, -correction)
+        end_rate = rate - system.rate_change(correction)
+        multiplier = None if terms.weak else terms.multiplier().copy()
+        if moved is not None:
+            correction = correction + moved
+    else:
+        correction = np.zeros(0)
+        new_state, end_rate, multiplier = x, rate.copy(), None
+    error_ratio = 0.0
+    if scheme.error is not None:
+        error = h * np.abs(scheme.error @ rates)
+        weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+        if history is not None and branch is not None:
+            if sigma_change > COUNT_UNCERTAINTY_ABOVE:
+                for j in weak_stages:
+                    if j < s:
+                        uncertainty = history.uncertainty(t + c[j] * h)
+                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
+            lowest = float(sigmas[1:].min())
+            if 0.0 < lowest < NEAR * sigma_change:
+                noise = branch.rounding(lowest, sigma_change, branch.projected)
+                weights = weights + np.abs(scheme.error).max() * noise
+        error_ratio = norm(error, weights)
+    return StepResult(
+        t=t,
+        h=h,
+        state=new_state,
+        rates=rates,
+        end_rate=end_rate,
+        correction=correction,
+        error_ratio=error_ratio,
+        sigmas=sigmas,
+        rank=rank,
+        zone=zone if weak_stages else None,
+        history=history if weak_stages else None,
+        multiplier=multiplier,
+        magnitude=magnitude,
+    )
+
+
+def split_accept(memory: Memory, result: StepResult) -> None:
+    """Move ``memory`` to the end of an accepted step."""
+    memory.rate = result.end_rate
+    memory.sigma = float(result.sigmas[-1])
+    memory.magnitude = result.magnitude
+    if result.multiplier is not None and memory.history is not None:
+        memory.history = memory.history.extended(result.t + result.h, result.multiplier)

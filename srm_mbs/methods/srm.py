@@ -1,0 +1,129 @@
+r"""The Sequential Regularization Method: m sweeps over every step.
+
+Mechanisms, (2.6) of the thesis,
+
+    q_s' = v_s - E g/eps,   v_s' = M^{-1} f - yhat_s,   yhat_s = P (yhat_{s-1} + v_s/eps);
+
+DAEs, (2.2) or (2.4) (:class:`srm_mbs.SemiExplicitDAE`).  The result is sweep m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.methods.iterated import First, IteratedSweeps
+from srm_mbs.methods.regularisation import parse_eps
+from srm_mbs.methods.sweeps import checked_regulariser, checked_tableau, interpolant
+from srm_mbs.methods.tableaus import get_tableau
+from srm_mbs.systems.base import System
+
+LARGEST_CARRIED = 3
+"""Number of sweeps up to which restarting with the carried multiplier is stable (measured)."""
+
+
+@dataclass(frozen=True)
+class SRM:
+    r"""SRM with m sweeps.
+
+    Parameters
+    ----------
+    tableau
+        Name in :data:`srm_mbs.TABLEAUS`, or a :class:`ButcherTableau`.
+    iterations
+        Number m of sweeps; by default the order of the tableau, at most 3 with ``carry``.
+    eps
+        Regularisation parameter: seconds, or ``"h"``, ``"5h"``, ``"h^(2/3)"`` with the step h (s).
+        Explicit schemes need h/eps below their real stability limit.
+    restart
+        False: every sweep keeps its own trajectory for the whole run, as in the thesis.  True:
+        every step starts all sweeps from the accepted state of the last one.
+    carry
+        With ``restart``: yhat_0 of a step is the last sweep's multiplier at its start instead of
+        0, which would put an initial layer into every step.  Needs m <= 3: more sweeps amplify
+        what is carried.
+    T
+        For DAEs: ``"identity"``, ``"transpose"`` (GB)^T or ``"inverse"`` (GB)^-1.
+    interpolation
+        Of the multiplier between the sweeps: ``"auto"``, ``"linear"`` or ``"stages"``
+        (:func:`~srm_mbs.methods.sweeps.interpolant`).
+
+    Raises
+    ------
+    InputError
+        For an unknown tableau or option, or a combination that makes no sense.
+    """
+
+    tableau: str | ButcherTableau = "tvd32"
+    iterations: int | None = None
+    eps: float | str = "h"
+    restart: bool = False
+    carry: bool = False
+    T: str = "identity"
+    interpolation: str = "auto"
+
+    def __post_init__(self) -> None:
+        scheme = checked_tableau(self.tableau)
+        m = self.iterations
+        if m is None:
+            m = min(scheme.order, LARGEST_CARRIED) if self.carry else scheme.order
+            object.__setattr__(self, "iterations", m)
+        if isinstance(m, bool) or not isinstance(m, int) or m < 1:
+            raise InputError(
+                f"iterations = {m!r} is not a number of sweeps",
+                element="iterations",
+                remedy="Give a positive integer",
+            )
+        for name in ("restart", "carry"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(
+                    f"{name} = {getattr(self, name)!r} is neither True nor False", element=name
+                )
+        if self.carry and not self.restart:
+            raise InputError(
+                "carry=True without restart=True: sweeps with their own history start from 0",
+                element="carry",
+                remedy="Give restart=True as well",
+            )
+        if self.carry and m > LARGEST_CARRIED:
+            raise InputError(
+                f"iterations = {m} with carry=True is unstable",
+                element="iterations",
+                remedy=f"Use at most {LARGEST_CARRIED} sweeps, or carry=False",
+            )
+        checked_regulariser(self.T)
+        self._sweeps  # noqa: B018 - bad eps or interpolation is refused now
+
+    @property
+    def scheme(self) -> ButcherTableau:
+        """The Runge-Kutta data."""
+        return get_tableau(self.tableau)
+
+    @cached_property
+    def _sweeps(self) -> IteratedSweeps:
+        return IteratedSweeps(
+            self.scheme,
+            First.HELD if self.carry else First.ZERO,
+            self.iterations or 1,
+            not self.restart,
+            parse_eps(self.eps),
+            interpolant(self.scheme, self.interpolation),
+        )
+
+    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+        """All sweeps at the initial state."""
+        return self._sweeps.start(system, t, state, norm)
+
+    def step(
+        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.methods.base.Method`."""
+        return self._sweeps.step(system, t, h, state, memory, norm)
+
+    def accept(self, memory: Memory, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        self._sweeps.accept(memory, result)

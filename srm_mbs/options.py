@@ -1,0 +1,144 @@
+"""Checks of the options that ``simulate`` and ``solve_dae`` share."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.methods.base import Method
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.methods.psrm import PSRM
+from srm_mbs.methods.srm import SRM
+from srm_mbs.stepping.stepsize import FixedStep, PIControl, StepSizeControl
+
+LOOSEST_RTOL = 1e-4
+"""Looser tolerances let a step jump to another branch at a change point."""
+TIGHTEST_RTOL = 100 * np.finfo(float).eps
+METHODS: dict[str, type[PSRM] | type[SRM]] = {"psrm": PSRM, "srm": SRM}
+"""Methods that can be given by name."""
+
+
+def positive(value: Any, what: str, unit: str = "") -> float:
+    """``value`` as a positive finite float."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(
+            f"{what} = {value!r} is not a positive number{unit}",
+            element=what,
+            remedy="Give a positive number",
+        )
+    return number
+
+
+def numbers(values: Any, what: str, remedy: str) -> FloatArray:
+    """``values`` as an array of finite numbers."""
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if not np.isfinite(array).all():
+        raise InputError(f"{what} = {values!r} is not finite numbers", element=what, remedy=remedy)
+    return array
+
+
+def checked_rtol(value: Any) -> float:
+    """rtol within what the methods can use; warns where it is changed."""
+    rtol = positive(value, "rtol")
+    if rtol > LOOSEST_RTOL:
+        warnings.warn(
+            f"rtol = {rtol:g} is looser than {LOOSEST_RTOL:g}, from where a step may jump to "
+            f"another branch at a singular configuration: using {LOOSEST_RTOL:g}",
+            SrmWarning,
+            stacklevel=3,
+        )
+        return LOOSEST_RTOL
+    if rtol < TIGHTEST_RTOL:
+        warnings.warn(
+            f"rtol = {rtol:g} is below round-off: using {TIGHTEST_RTOL:.1e}",
+            SrmWarning,
+            stacklevel=3,
+        )
+        return float(TIGHTEST_RTOL)
+    return rtol
+
+
+def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
+    """A method object from a name or an object."""
+    if isinstance(method, str):
+        if method.lower() not in METHODS:
+            raise InputError(
+                f"there is no method {method!r}",
+                element="method",
+                remedy=f"This version has {', '.join(repr(name) for name in METHODS)}",
+            )
+        kind = METHODS[method.lower()]
+        return kind() if tableau is None else kind(tableau)
+    if tableau is not None:
+        raise InputError(
+            "tableau is given beside a method object",
+            element="tableau",
+            remedy="Give the tableau to the method: PSRM(tableau=...)",
+        )
+    if isinstance(method, type) or not all(
+        hasattr(method, name) for name in ("scheme", "start", "step", "accept")
+    ):
+        raise InputError(
+            f"method = {method!r} is not a method",
+            element="method",
+            remedy='Give "psrm" or an object such as PSRM(tableau="dopr54")',
+        )
+    return method
+
+
+def checked_times(t_eval: Any, t0: float, t_end: float) -> FloatArray | None:
+    """Output times within the run, increasing; None if none are given."""
+    if t_eval is None:
+        return None
+    remedy = f"Give increasing times between {t0:g} and t_end = {t_end:g} s"
+    times = numbers(t_eval, "t_eval", remedy)
+    slack = 1e-12 * max(abs(t0), abs(t_end))  # np.arange(4) * 0.1 ends a rounding error after 0.3
+    if times.ndim != 1 or (
+        times.size and (times.min() < t0 - slack or times.max() > t_end + slack)
+    ):
+        raise InputError(
+            f"t_eval must be one-dimensional and lie within {t0:g} and t_end",
+            element="t_eval",
+            remedy=remedy,
+        )
+    if np.any(np.diff(times) <= 0.0):
+        raise InputError("t_eval must increase", element="t_eval", remedy=remedy)
+    return np.clip(times, t0, t_end)
+
+
+def step_size_control(
+    scheme: ButcherTableau,
+    t0: float,
+    t_end: float,
+    step: float | None,
+    first_step: Callable[[], float],
+) -> StepSizeControl:
+    """Fixed steps if ``step`` is given, otherwise control of the embedded pair's error.
+
+    Raises
+    ------
+    InputError
+        If the scheme has no embedded pair.
+    """
+    if step is not None:
+        return FixedStep(t0, t_end, step)
+    if scheme.controller_order is None:
+        raise InputError(
+            f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
+            element="tableau",
+            remedy="Give step=, or use tvd32, dopr54 or dop853",
+        )
+    return PIControl(t_end, first_step(), scheme.controller_order)

@@ -16,7 +16,6 @@ from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.systems.base import System, Zone
 
-
 NEGLIGIBLE = 1e-3
 """Fraction of the tolerance that is not worth an evaluation."""
 

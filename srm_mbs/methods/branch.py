@@ -127,7 +127,6 @@ class BranchStages:
         if self.norm.negligible == 0.0:
             return longest
         part = self.system.multiplier_part
-        turning = self.norm(self.rounding(1.0, self.sigma_change, True), self.weights)
-        force = np.zeros_like(self.weights)
-        force[part] = self.h * ROUNDING * np.abs(self.memory.rate[part])
-        return min(longest, max(float(np.cbrt(turning)), self.norm(force, self.weights) ** 0.5))
+        error = self.rounding(1.0, self.sigma_change, False)
+        error[part] += self.h * ROUNDING * np.abs(self.memory.rate[part])
+        return float(min(longest, np.sqrt(self.norm(error, self.weights))))

@@ -84,6 +84,40 @@ def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mecha
     return srm.Mechanism(model, (loop,), q0=q, v0=np.concatenate([[rate], R.T @ turn]))
 
 
+def floating_slider_crank(
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0), away: float = 0.0
+) -> srm.Mechanism:
+    """A slider-crank on a free-flying beam without gravity, starting on a singular configuration.
+
+    The beam carries a crank and a rod of 1 m, whose tip slides along the beam; ``turn`` is the
+    beam's orientation (rotation vector, rad), ``away`` the crank's angle from square to the beam.
+    """
+    model = pin.Model()
+    model.name = "floating_slider_crank"
+    model.gravity.linear = np.zeros(3)
+    base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "beam")
+    model.appendBodyToJoint(base, rod(2.0, 3.0), along_x(-0.5))
+    model.addBodyFrame("beam", base, pin.SE3.Identity(), 0)
+    crank = model.addJoint(base, pin.JointModelRZ(), pin.SE3.Identity(), "crank")
+    model.appendBodyToJoint(crank, rod(), pin.SE3.Identity())
+    model.addBodyFrame("crank", crank, pin.SE3.Identity(), 0)
+    tip = model.addJoint(crank, pin.JointModelRZ(), along_x(1.0), "rod")
+    model.appendBodyToJoint(tip, rod(1.5), pin.SE3.Identity())
+    model.addBodyFrame("rod", tip, pin.SE3.Identity(), 0)
+    loop = srm.LoopClosure(
+        "point_on_line",
+        srm.Anchor("rod", xyz=(1.0, 0.0, 0.0)),
+        srm.Anchor("beam"),
+        (1.0, 0.0, 0.0),
+        "slide",
+    )
+    q = pin.neutral(model)
+    q[3:7] = pin.Quaternion(pin.exp3(np.array(turn))).coeffs()
+    q[7:] = [0.5 * np.pi + away, -np.pi - 2.0 * away]
+    v = np.array([0.3, -0.2, 0.5, 0.7, -0.4, 0.6, 2.0, -4.0])
+    return srm.Mechanism(model, (loop,), q0=q, v0=v)
+
+
 def rescaled(
     mechanism: srm.Mechanism, length: float = 1.0, mass: float = 1.0, time: float = 1.0
 ) -> srm.Mechanism:

@@ -18,9 +18,16 @@ Field = Callable[[float, Any], Any]
 
 def integrate(field: Field, start: list[float], t_end: float) -> np.ndarray:
     """State at ``t_end`` by DOP853 at 1e-13."""
-    run = solve_ivp(field, (0.0, t_end), start, method="DOP853", rtol=1e-13, atol=1e-13)
+    return trajectory(field, start, np.array([t_end]))[0]
+
+
+def trajectory(field: Field, start: list[float], times: np.ndarray) -> np.ndarray:
+    """States (k, n) at ``times`` (k,), increasing, by DOP853 at 1e-13."""
+    run = solve_ivp(
+        field, (0.0, times[-1]), start, method="DOP853", t_eval=times, rtol=1e-13, atol=1e-13
+    )
     assert run.success
-    return run.y[:, -1]
+    return run.y.T
 
 
 def slider_crank(slider_mass: float = 0.0) -> Field:
@@ -73,6 +80,11 @@ def n_four_bar(n: int) -> Field:
     """Common crank angle of the IFToMM N-four-bar."""
     inertia, weight = (n + 1) / 3.0 + n, (n + 1) / 2.0 + n
     return lambda t, y: [y[1], -G * weight / inertia * np.cos(y[0])]
+
+
+def parallelogram() -> Field:
+    """Crank angle of the bundled parallelogram: (8/9) theta'' = -g cos theta."""
+    return lambda t, y: [y[1], -9.0 / 8.0 * G * np.cos(y[0])]
 
 
 def spatial_dead_point() -> Field:

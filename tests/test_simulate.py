@@ -160,15 +160,6 @@ def test_a_locked_up_error_estimate_ends_the_run_instead_of_hanging(
     assert "error estimate" in solution.message
 
 
-def test_a_singular_start_is_refused_with_a_reason() -> None:
-    mechanism = srm.load("slider_crank")
-    state = srm.assemble(mechanism, {"crank": 1.5 * np.pi}, guess={"rod": -3.0 * np.pi})
-    assert state.singular
-    solution = srm.simulate(mechanism, 1.0, q0=state.q, v0=state.v)
-    assert solution.status == "failed"
-    assert "singular configuration" in solution.message
-
-
 def test_loose_tolerances_are_capped_with_a_warning(four_bar: srm.Mechanism) -> None:
     with pytest.warns(srm.SrmWarning, match=r"rtol = 0.001 is looser than 0.0001"):
         solution = srm.simulate(four_bar, 0.5, rtol=1e-3)
@@ -299,17 +290,6 @@ def test_a_fixed_step_so_long_that_the_loops_come_apart_fails(
     assert solution.status == "failed"
     assert "smaller step" in solution.message
     assert solution.drift[:, 0].max() < 0.03
-
-
-@pytest.mark.parametrize("distance", [1e-6, 3e-7, -2e-7])
-def test_a_start_almost_on_a_singular_configuration_is_refused(distance: float) -> None:
-    """There the rates follow from the positions only to round-off over sigma."""
-    mechanism = srm.load("slider_crank")
-    theta = 1.5 * np.pi + distance
-    state = srm.assemble(mechanism, {"crank": theta}, {"crank": 1.0}, guess={"rod": -2 * theta})
-    solution = srm.simulate(mechanism, 1.0, q0=state.q, v0=state.v)
-    assert solution.status == "failed"
-    assert "almost is, a singular configuration" in solution.message
 
 
 def test_states_are_read_only(four_bar: srm.Mechanism) -> None:

@@ -34,11 +34,11 @@ def test_a_saved_run_interpolates_to_the_last_bit(name: str, tmp_path: Path) -> 
 
 
 def test_a_run_through_the_zone_interpolates_to_the_last_bit(tmp_path: Path) -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 2.0, rtol=1e-12, atol=1e-12)
+    solution = srm.simulate(srm.load("slider_crank"), 1.2, rtol=1e-12, max_step=2e-4)
     assert solution.stats.zone_steps > 0
     solution.save(tmp_path / "run")
     loaded = srm.load_solution(tmp_path / "run")
-    t = np.linspace(0.0, 2.0, 1001)
+    t = np.linspace(0.0, 1.2, 1001)
     assert np.array_equal(solution(t)[0], loaded(t)[0])
 
 

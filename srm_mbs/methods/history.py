@@ -11,6 +11,8 @@ from srm_mbs.errors import EvaluationError
 
 STALE = 4.0
 """A multiplier is predicted at most this many spans of the nodes beyond the last one."""
+WINDOW = 9
+"""Nodes of an interpolation between nodes on both sides."""
 POINTS = 5
 """Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
 
@@ -61,9 +63,17 @@ class MultiplierHistory:
         values = np.concatenate([self.values[before], value[None]])[-POINTS:]
         return MultiplierHistory(times, values)
 
+    def _around(self, t: float) -> slice:
+        """The nodes to use at ``t``: all, unless there are more than WINDOW."""
+        count = len(self.times)
+        first = int(np.searchsorted(self.times, t)) - WINDOW // 2
+        first = max(0, min(first, count - WINDOW))
+        return slice(first, first + WINDOW)
+
     def predict(self, t: float) -> FloatArray:
-        """yhat (nv,) extrapolated to ``t``."""
-        return lagrange_weights(self.times, t) @ self.values
+        """yhat (nv,) extrapolated, or between nodes interpolated, to ``t``."""
+        nodes = self._around(t)
+        return lagrange_weights(self.times[nodes], t) @ self.values[nodes]
 
     def predict_near(self, t: float) -> FloatArray:
         """yhat (nv,) extrapolated to ``t``, as long as that makes sense.
@@ -83,7 +93,9 @@ class MultiplierHistory:
 
     def uncertainty(self, t: float) -> FloatArray:
         """|yhat_pred - the prediction without the oldest node| (nv,); 0 with a single node."""
-        if len(self.times) < 2:
-            return np.zeros(self.values.shape[1])
-        lower = lagrange_weights(self.times[1:], t) @ self.values[1:]
+        nodes = self._around(t)
+        times, values = self.times[nodes], self.values[nodes]
+        if len(times) < 2:
+            return np.zeros(values.shape[1])
+        lower = lagrange_weights(times[1:], t) @ values[1:]
         return np.abs(self.predict(t) - lower)

@@ -18,8 +18,15 @@ import numpy as np
 from scipy.interpolate import BarycentricInterpolator
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
-from srm_mbs.systems.singular import SingularConfiguration, analyse_singular, sharpened
+from srm_mbs.systems.singular import (
+    SingularConfiguration,
+    analyse_singular,
+    determined_solution,
+    nearest_singular,
+    sharpened,
+)
 
 NODES = np.array([-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0])
 CENTRE = 4
@@ -171,7 +178,7 @@ def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray
     normal = null - tangent @ (tangent.T @ null)
     effects = np.array([(singular.hessians(t) @ normal).ravel() for t in tangent.T]).T
     wanted = effects @ (tangent.T @ u)
-    out: FloatArray = tangent @ np.linalg.lstsq(effects, wanted, rcond=1e-9)[0]
+    out: FloatArray = tangent @ determined_solution(effects, wanted)
     return out
 
 
@@ -198,3 +205,23 @@ def branch_limit(
     centre = analyse_singular(geometry, found, singular.structural_rank)
     tangent = centre.branch(direction)
     return None if tangent is None else BranchLimit(centre, q, frame, tangent, direction)
+
+
+def branch_next_to(
+    geometry: ClosureGeometry, structural_rank: int, q: FloatArray, u: FloatArray
+) -> tuple[SingularConfiguration | None, BranchLimit | None]:
+    """The singular configuration next to q (nq,), and the algebra at q on its branch.
+
+    The branch is that of the velocity u (nv,), in units, or if u does not choose one that of q.
+    None, None if there is no singular configuration within NEAR; None for the limit if neither
+    chooses a branch.
+    """
+    found = nearest_singular(geometry, q, structural_rank, NEAR)
+    if found is None:
+        return None, None
+    singular = analyse_singular(geometry, found, structural_rank)
+    limit = branch_limit(singular, q, u)
+    away = geometry.difference(found, q)
+    if limit is None and np.linalg.norm(away) > TELLS_THE_BRANCH:
+        limit = branch_limit(singular, q, away)
+    return singular, limit

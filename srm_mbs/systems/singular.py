@@ -44,6 +44,17 @@ THIRD_ORDER = ((1, 45.0 / 60.0), (2, -9.0 / 60.0), (3, 1.0 / 60.0))
 TAU = 3e-3
 
 
+def determined_solution(rows: FloatArray, right: FloatArray) -> FloatArray:
+    """Shortest least-squares solution; singular values below DETERMINED are zero.
+
+    The cut is absolute, because all rows may vanish and only rounding be left.
+    """
+    left, size, basis = np.linalg.svd(rows, full_matrices=False)
+    used = size > DETERMINED
+    out: FloatArray = basis[used].T @ ((left[:, used].T @ right) / size[used])
+    return out
+
+
 def sharpened(
     geometry: ClosureGeometry,
     q: FloatArray,
@@ -247,7 +258,7 @@ class SingularConfiguration:
         for _ in range(BRANCH_ITERATIONS):
             rows = np.concatenate([G, 2.0 / scale * self.hessians(u)])
             gap = np.concatenate([G @ u, self.curvature(u) / scale])
-            step = np.linalg.lstsq(rows, gap, rcond=DETERMINED)[0]
+            step = determined_solution(rows, gap)
             u = u - step
             if np.abs(step).max() <= 1e-15 * scale:
                 break
@@ -289,7 +300,7 @@ class SingularConfiguration:
         )
         gap = right * size**2 - rows @ (free / geometry.unit)
         white = np.linalg.solve(U.T, rows.T).T
-        fit = np.linalg.lstsq(white, gap, rcond=DETERMINED)[0]
+        fit = determined_solution(white / np.linalg.norm(white, 2), gap / np.linalg.norm(white, 2))
         out: FloatArray = free + geometry.unit * np.linalg.solve(U, fit)
         return out
 

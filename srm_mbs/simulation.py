@@ -30,6 +30,7 @@ from srm_mbs.progress import progress_of
 from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
 from srm_mbs.stepping.dense import DenseOutput, step_data
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
+from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.singular_times import PLACEMENTS, Placing, placed
 from srm_mbs.stepping.starting import start
@@ -155,9 +156,13 @@ def _control(
     """The step-size control of a run, and the wrappers in it that count what they did."""
     scheme = method.scheme
     control = step_size_control(scheme, 0.0, t_end, step, first_step)
-    return placed(
+    control, wrappers = placed(
         control, scheme, placement if system.has_constraints else None, singular_times, t_end, step
     )
+    if system.has_constraints and placement == "automatic":
+        guard = BranchGuard(control, system)
+        return guard, (*wrappers, guard)
+    return control, wrappers
 
 
 def simulate(
@@ -375,9 +380,24 @@ def _collect(
         ),
         events=None if watch is None else watch.found(),
         status=record.status,
-        message=record.message + _limits_left(mechanism, DenseOutput(system, scheme, data)),
+        message=record.message
+        + _turns(wrappers)
+        + _limits_left(mechanism, DenseOutput(system, scheme, data)),
         stats=stats,
         settings=settings,
+    )
+
+
+def _turns(wrappers: Sequence[Placing]) -> str:
+    """A sentence naming the times at which the motion may have changed its branch."""
+    times = [t for w in wrappers if isinstance(w, BranchGuard) for t in w.suspects]
+    if not times:
+        return ""
+    listed = ", ".join(f"{t:.6g}" for t in times[:5]) + (", ..." if len(times) > 5 else "")
+    return (
+        f" Next to singular configurations, up to t = {listed} s, the velocity turned and no "
+        "shorter step mended it: the motion may have changed its branch (solution.crossings). "
+        "Try a smaller rtol or step."
     )
 
 

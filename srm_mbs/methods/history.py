@@ -84,7 +84,7 @@ class MultiplierHistory:
             If ``t`` lies too far beyond the nodes.
         """
         span = float(self.times[-1] - self.times[0])
-        if t > max(self.times[-1] + STALE * span, self.known_until):
+        if span > 0.0 and t > max(self.times[-1] + STALE * span, self.known_until):
             raise EvaluationError(
                 "the motion stays next to a singular configuration for longer than its multiplier "
                 "can be predicted: it has too little momentum to pass"

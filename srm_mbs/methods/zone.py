@@ -14,20 +14,22 @@ COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_FLOOR
 counting it always would trap the step-size control next to the singular configuration."""
 
 
+HIT = 1e-6
+"""sigma that is a direct hit, for which anything predicted is better."""
 FEWEST = 3
-"""Nodes of the history without which nothing is predicted."""
+"""Nodes of the history from which a prediction is better than the direct solve."""
 
 
 def zone_from(history: MultiplierHistory | None, threshold: float, end: float) -> Zone | None:
     """The zone sigma < ``threshold`` of a step to the time ``end``.
 
-    None without a history; empty while the history is too short.
+    None without a history; only for direct hits while the history is too short.
     """
     if history is None:
         return None
     known = history.known_below if end <= history.known_until else 0.0
     if len(history.times) < FEWEST:
-        threshold = 0.0
+        threshold = min(threshold, HIT)
     return Zone(max(threshold, known), history.predict_near)
 
 

@@ -44,17 +44,19 @@ class BranchGuard:
 
     Attributes
     ----------
-    redone
-        Steps redone.
+    placed, replaced
+        0; how many steps were redone.
     suspects
         Times (s) of the steps that were kept although the velocity turned.
     """
+
+    placed = 0
 
     def __init__(self, inner: StepSizeControl, system: System) -> None:
         self._inner = inner
         self._system = system
         self.adaptive = inner.adaptive
-        self.redone = 0
+        self.replaced = 0
         self.suspects: list[float] = []
         self._limit = np.inf
         self._tries = 0
@@ -69,7 +71,7 @@ class BranchGuard:
         if suspect and self._tries < MAX_REDONE:
             self._limit = 0.5 * proposal.h
             self._tries += 1
-            self.redone += 1
+            self.replaced += 1
             return Verdict.REPLACED
         verdict = self._inner.judge(proposal, result)
         if verdict is Verdict.ACCEPTED:

@@ -19,6 +19,7 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import Memory, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.placement import (
     FAR_ENOUGH,
     TOO_CLOSE,
@@ -208,7 +209,7 @@ class HalvedStep(SlopeOfSigma):
         return bool(sigmas[-1] < TOO_CLOSE * reach and sigmas[0] > FAR_ENOUGH * reach)
 
 
-Placing = SingularityPlacement | SlopeOfSigma | AvoidTimes
+Placing = SingularityPlacement | SlopeOfSigma | AvoidTimes | BranchGuard
 """A control that counts, in ``placed`` and ``replaced``, what it did."""
 
 

@@ -15,7 +15,6 @@ from the singular configurations.
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import BarycentricInterpolator
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.systems.closure_geometry import ClosureGeometry
@@ -101,6 +100,8 @@ class BranchLimit:
 
     @staticmethod
     def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
+        from scipy.interpolate import BarycentricInterpolator
+
         return BarycentricInterpolator(times, values)(0.0)  # type: ignore[no-any-return]
 
     def _follow(self, q: FloatArray, move: FloatArray) -> FloatArray | None:

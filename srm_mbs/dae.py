@@ -206,8 +206,10 @@ def solve_dae(
         Initial state, with g(t0, x0) = 0.
     method
         ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
-        (GB)^-1; the last one carries B y, form (2.4) of the thesis, and with the split form is
-        the one to use where G B has isolated singularities.
+        (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Where G B has isolated
+        singularities use the split form.  Restarted sweeps with T = (GB)^-1 pass them too, fused
+        and two-sweep forms at tolerances of 1e-8; sweeps with own histories, whose first one is
+        off the constraints by O(eps), may leave the singularity on another branch of g = 0.
     tableau
         Runge-Kutta scheme for a method given by name.
     rtol

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,12 @@ from srm_mbs.stepping.stepsize import FixedStep, PIControl, StepSizeControl
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let a step jump to another branch at a change point."""
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
-METHODS: dict[str, type[PSRM] | type[SRM]] = {"psrm": PSRM, "srm": SRM}
-"""Methods that can be given by name."""
+METHODS: dict[str, Callable[..., Method]] = {
+    "psrm": PSRM,
+    "srm": partial(SRM, restart=True, carry=True),
+}
+"""Methods that can be given by name; sweeps that restart, because own histories and step-size
+control do not go together (:class:`srm_mbs.SRM`)."""
 
 
 def positive(value: Any, what: str, unit: str = "") -> float:

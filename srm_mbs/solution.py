@@ -238,7 +238,7 @@ class Solution:
         # A long step may turn the joint by more than pi: its chart coordinate knows by how much.
         h = np.diff(self.steps.times)
         weights = np.append(self.scheme.b, 0.0)
-        turned = h * (self.steps.rates[:, :, joint.idx_v] @ weights)
+        turned = h * (self.steps.rates[:, : len(weights), joint.idx_v] @ weights)
         wound = np.concatenate([[principal[0]], principal[0] + np.cumsum(turned)])
         wound = principal + 2.0 * np.pi * np.round((wound - principal) / (2.0 * np.pi))
         # Between nodes: the step's start plus the principal difference nearest to v dt.

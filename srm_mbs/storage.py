@@ -156,7 +156,6 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
     nq, m = mechanism.model.nq, 2 * mechanism.model.nv
     expected = {
         "states": (n + 1, nq + m // 2),
-        "rates": (n, s + 1, m),
         "sigmas": (n, s + 1),
         "ranks": (n,),
         "error_ratios": (n,),
@@ -166,6 +165,9 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
             raise ValueError(f"{name} has shape {getattr(steps, name).shape}, not {shape}")
     if steps.corrections.shape not in ((n, m), (n, 0)):
         raise ValueError(f"corrections has shape {steps.corrections.shape}")
+    # Methods with sweeps store the extra stages of the dense output as well.
+    if steps.rates.shape not in ((n, s + 1, m), (n, get_tableau(tableau).dense.n_rates, m)):
+        raise ValueError(f"rates has shape {steps.rates.shape}, not {(n, s + 1, m)}")
     if steps.stop is not None and not (n and steps.times[-2] <= steps.stop <= steps.times[-1]):
         raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 

@@ -39,25 +39,29 @@ def solution_two(t: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.array([np.exp(-t), np.sin(t)]).T, np.exp(t)
 
 
-def passing_singularity(rate: float = 1.0) -> srm.SemiExplicitDAE:
-    """G B loses rank where x_1 = 0, which the solution x = (t - 1, (t - 1)^2 / 2) passes.
+def passing_singularity() -> srm.SemiExplicitDAE:
+    """G B = x_1^2 (1 + x_1^2) on the parabola x_2 = x_1^2/2, whose vertex the solution passes.
 
-    x' = f - B y with g = x_1 (x_2 - x_1^2 / 2) and B = G^T: on the parabola
-    G = x_1 (-x_1, 1) vanishes at the vertex with its direction continuous.  f = (1, 0) + n with
-    the unit normal n is projected on the tangent (1, x_1)/sqrt(1 + x_1^2):
-    x_1' = 1/(1 + x_1^2) and B y = f - x'.
+    g = x_1 (x_2 - x_1^2/2), B = G^T, f = (1, 0) + n with the unit normal n: x' is the projection
+    of (1, 0) on the tangent, so that x_1' = 1/(1 + x_1^2) and x_1 + x_1^3/3 = t + const.
     """
 
-    def normal(x: Any) -> np.ndarray:
-        return np.array([-x[0], 1.0]) / np.hypot(1.0, x[0])
-
     def jacobian(t: float, x: Any) -> np.ndarray:
-        d = x[1] - 0.5 * x[0] ** 2
-        return np.array([d - x[0] ** 2, x[0]])
+        return np.array([x[1] - 1.5 * x[0] ** 2, x[0]])
 
     return srm.SemiExplicitDAE(
-        f=lambda t, x: np.array([rate, 0.0]) + normal(x),
+        f=lambda t, x: np.array([1.0, 0.0]) + np.array([-x[0], 1.0]) / np.hypot(1.0, x[0]),
         B=jacobian,
         g=lambda t, x: x[0] * (x[1] - 0.5 * x[0] ** 2),
         G=jacobian,
     )
+
+
+START_PASSING = np.array([-1.0, 0.5])
+
+
+def solution_passing(t: float) -> np.ndarray:
+    """x at time t for the start (-1, 1/2): the real root of x_1 + x_1^3/3 = t - 4/3."""
+    roots = np.roots([1.0 / 3.0, 0.0, 1.0, 4.0 / 3.0 - t])
+    x = float(roots[np.abs(roots.imag) < 1e-9].real[0])
+    return np.array([x, 0.5 * x * x])

@@ -30,6 +30,13 @@ LARGEST_CARRIED = 3
 class SRM:
     r"""SRM with m sweeps.
 
+    Theory: O(eps^m) + O(h^p), so min(m, p) with eps = h.  Observed (``tests/test_methods.py``):
+    2 for mechanisms with tvd32 and erk4, whose linear interpolation of the multiplier is of second
+    order; about 3 with dopr54 and m = 5, because with eps = h an explicit scheme has stage order 1
+    on the terms in 1/eps; 1 when restarted from multiplier 0, and 2 with ``carry``, whose first
+    multiplier is constant over the step, whatever m.  The higher orders of the thesis show on its
+    problem 1, which has no error but these.
+
     Parameters
     ----------
     tableau
@@ -41,7 +48,9 @@ class SRM:
         Explicit schemes need h/eps below their real stability limit.
     restart
         False: every sweep keeps its own trajectory for the whole run, as in the thesis.  True:
-        every step starts all sweeps from the accepted state of the last one.
+        every step starts all sweeps from the accepted state of the last one.  With step-size
+        control use True: eps changes with the step, and every change puts an initial layer into
+        sweeps with own histories, next to a singular configuration a fatal one.
     carry
         With ``restart``: yhat_0 of a step is the last sweep's multiplier at its start instead of
         0, which would put an initial layer into every step.  Needs m <= 3: more sweeps amplify
@@ -49,7 +58,7 @@ class SRM:
     T
         For DAEs: ``"identity"``, ``"transpose"`` (GB)^T or ``"inverse"`` (GB)^-1.
     interpolation
-        Of the multiplier between the sweeps: ``"auto"``, ``"linear"`` or ``"stages"``
+        Of the multiplier between the sweeps: ``"auto"`` or ``"linear"``
         (:func:`~srm_mbs.methods.sweeps.interpolant`).
 
     Raises

@@ -22,7 +22,8 @@ from srm_mbs.systems.base import System, Terms, Zone
 Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
 """(terms, node) -> tangent rate and multiplier there; the equation that a sweep integrates."""
 
-INTERPOLATIONS = ("auto", "linear", "stages")
+INTERPOLATIONS = ("auto", "linear")
+"""Those of SRM; PSRM has ``"stages"`` as well."""
 GOOD_EXTENSION = 4
 """Order from which an extension is used to interpolate the multiplier."""
 
@@ -89,8 +90,10 @@ def nodes_of(scheme: ButcherTableau) -> Nodes:
     return Nodes(np.concatenate([scheme.c, [1.0], extension.extra_c]), A)
 
 
-def interpolant(scheme: ButcherTableau, interpolation: str) -> DenseExtension | str:
-    """How the multiplier of a sweep is interpolated for the next.
+def interpolant(
+    scheme: ButcherTableau, interpolation: str, known: tuple[str, ...] = INTERPOLATIONS
+) -> DenseExtension | str:
+    """How the multiplier of a sweep reaches the nodes of the next.
 
     ``"auto"``: by the continuous extension where the tableau has one of order 4 or more (the
     thesis' own for dopr54), linearly for the others, as in the thesis.  ``"linear"``: between the
@@ -99,13 +102,13 @@ def interpolant(scheme: ButcherTableau, interpolation: str) -> DenseExtension | 
     Raises
     ------
     InputError
-        For another name.
+        For a name that is not ``known``.
     """
-    if interpolation not in INTERPOLATIONS:
+    if interpolation not in known:
         raise InputError(
             f"there is no interpolation {interpolation!r}",
             element="interpolation",
-            remedy=f"Use one of {', '.join(map(repr, INTERPOLATIONS))}",
+            remedy=f"Use one of {', '.join(map(repr, known))}",
         )
     if interpolation != "auto":
         return interpolation

@@ -1,0 +1,234 @@
+"""SRM and the forms of PSRM: orders beside theory, singular passages, tolerances, bad input.
+
+The split form, the default, has its own tests (``test_orders.py``, ``test_singular_passages.py``).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.methods.regularisation import parse_eps, real_stability_limit
+from tests import reduced
+from tests.convergence import observed_order, turning
+
+COARSE = (2e-2, 1e-2, 5e-3)
+FINE = (1e-2, 5e-3, 2.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("method", "steps", "theory", "tolerance"),
+    [
+        # eps = h: min(m, p), as far as stage order and linear interpolation allow
+        (srm.SRM("fe", 1), COARSE, 1.0, 0.1),
+        (srm.SRM("trap", 2), FINE, 2.0, 0.1),
+        (srm.SRM("tvd32", 2), COARSE, 2.0, 0.1),
+        (srm.SRM("dopr54", 5), COARSE, 3.0, 0.15),
+        (srm.SRM("erk4", 3, restart=True, carry=True), COARSE, 2.0, 0.1),
+        (srm.SRM("tvd32", 3, restart=True), COARSE, 1.0, 0.1),
+        (srm.PSRM("erk4", "simple"), FINE, 2.0, 0.1),
+        (srm.PSRM("trap", "simple"), FINE, 2.0, 0.1),
+        (srm.PSRM("erk4", "simple", eps=0.1), (5e-3, 2.5e-3, 1.25e-3), 1.0, 0.15),
+        (srm.PSRM("erk4", correction="sweep", interpolation="linear"), FINE, 8 / 3, 0.25),
+        (srm.PSRM("dopr54", correction="sweep"), COARSE, 13 / 3, 0.25),
+        (srm.PSRM("tvd32", correction="sweep", eps=0.1), COARSE, 3.0, 0.15),
+        (srm.PSRM("erk4", correction="sweep", eps=0.1), COARSE, 4.0, 0.2),
+        (srm.PSRM("erk4", correction="fused", eps=0.1), COARSE, 4.0, 0.2),
+        (srm.PSRM("dopr54", correction="fused", eps=0.1), COARSE, 5.0, 0.25),
+    ],
+    ids=str,
+)
+def test_observed_orders_on_a_mechanism(
+    method: Any, steps: tuple[float, ...], theory: float, tolerance: float
+) -> None:
+    order = observed_order(turning("slider_crank_regular", 2.0), method, steps)
+    assert order == pytest.approx(theory, abs=tolerance)
+
+
+def test_more_sweeps_than_two_do_not_raise_the_order_with_linear_interpolation() -> None:
+    """The docstring of SRM says so: erk4 with m = 4 is of order 2 on mechanisms, not 4."""
+    order = observed_order(turning("slider_crank_regular", 2.0), srm.SRM("erk4", 4), COARSE)
+    assert order == pytest.approx(2.0, abs=0.1)
+
+
+def crank_error(solution: srm.Solution, t_end: float) -> float:
+    theta, omega = reduced.integrate(reduced.slider_crank(), [7 * np.pi / 4, 0.0], t_end)
+    return max(abs(solution.q[-1, 0] - theta), abs(solution.v[-1, 0] - omega))
+
+
+@pytest.mark.parametrize(
+    ("method", "bounds"),
+    [
+        (srm.PSRM("tvd32", correction="sweep"), (1e-4, 1e-6)),
+        (srm.PSRM("dopr54", correction="sweep"), (1e-5, 1e-7)),
+        (srm.PSRM("dop853", correction="sweep"), (1e-6, 1e-7)),
+        (srm.PSRM("tvd32", correction="fused"), (1e-4, 1e-6)),
+        (srm.PSRM("dopr54", correction="fused"), (1e-5, 1e-7)),
+        (srm.PSRM("dop853", correction="fused"), (1e-6, 1e-7)),
+    ],
+    ids=str,
+)
+def test_exact_sweeps_pass_singular_configurations_and_follow_the_tolerance(
+    method: srm.PSRM, bounds: tuple[float, float]
+) -> None:
+    for tol, bound in zip((1e-5, 1e-7), bounds):
+        solution = srm.simulate(srm.load("slider_crank"), 5.0, method=method, rtol=tol, atol=tol)
+        assert solution.success, solution.message
+        assert len(solution.crossings) == 2
+        assert crank_error(solution, 5.0) < bound
+
+
+@pytest.mark.parametrize(
+    "method", [srm.SRM("tvd32", 3), srm.SRM("tvd32", 3, restart=True, carry=True)], ids=str
+)
+def test_srm_passes_singular_configurations_with_the_step_of_the_thesis(method: srm.SRM) -> None:
+    solution = srm.simulate(srm.load("slider_crank"), 2.0, method=method, step=5e-3)
+    assert solution.success
+    assert crank_error(solution, 2.0) < 1e-3
+    assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < 1e-3
+    assert solution.drift[:, 0].max() < 1e-4
+
+
+@pytest.mark.stress
+def test_adaptive_srm_meets_no_impasse_where_the_thesis_control_does() -> None:
+    """Its estimate compared two sweeps' trajectories and stalled near t = 34.5."""
+    solution = srm.simulate(srm.load("slider_crank"), 40.0, method="srm", rtol=1e-4, atol=1e-4)
+    assert solution.success, solution.message
+    assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < 1e-2
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["srm", srm.PSRM("dopr54", "simple"), srm.SRM("dopr54", 3, restart=True, carry=True)],
+    ids=str,
+)
+def test_errors_of_adaptive_sweeps_fall_with_the_tolerance(method: Any) -> None:
+    mechanism = turning("slider_crank_regular", 2.0)
+    reference = srm.simulate(mechanism, 1.0, rtol=1e-12, atol=1e-12)
+    errors = []
+    for tol in (1e-4, 1e-5, 1e-6):
+        solution = srm.simulate(mechanism, 1.0, method=method, rtol=tol, atol=tol)
+        assert solution.success, solution.message
+        errors.append(np.abs(solution.v[-1] - reference.v[-1]).max())
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[2] < 0.5 * errors[1]
+    assert errors[0] < 2e-2
+
+
+def test_the_error_estimate_vanishes_with_the_step() -> None:
+    """No impasse: neither the gap between sweeps nor eps = h leaves a floor."""
+    mechanism = turning("slider_crank_regular", 2.0)
+    solution = srm.simulate(
+        mechanism, 0.5, method=srm.SRM("tvd32", 3, restart=True, carry=True), rtol=1e-5, atol=1e-5
+    )
+    small = np.diff(solution.steps.times) < 0.2 * np.diff(solution.steps.times).max()
+    assert solution.success
+    assert solution.steps.error_ratios.max() <= 1.0
+    assert not small.any() or solution.steps.error_ratios[small].max() < 1.0
+    assert solution.stats.rejected < solution.stats.steps
+
+
+@pytest.mark.parametrize("form", ["sweep", "fused"])
+@pytest.mark.parametrize(("tableau", "order"), [("erk4", 4.0), ("dopr54", 5.0)])
+def test_dense_output_of_sweeps_has_the_order_of_the_steps(
+    form: str, tableau: str, order: float
+) -> None:
+    mechanism = turning("slider_crank_regular", 2.0)
+    method = srm.PSRM(tableau, correction=form, eps=0.2)
+    between = np.linspace(0.0, 1.0, 83)
+    reference = srm.simulate(mechanism, 1.0, rtol=1e-12, atol=1e-12, t_eval=between)
+    errors = []
+    for step in (0.01, 0.005):
+        solution = srm.simulate(mechanism, 1.0, method=method, step=step)
+        errors.append(np.abs(solution(between)[1] - reference.v).max())
+    assert np.log2(errors[0] / errors[1]) > order - 0.4
+
+
+def test_sweeps_evaluate_the_extra_stages_of_dense_output_in_the_step() -> None:
+    method = srm.PSRM("dop853", correction="fused")
+    mechanism = turning("slider_crank_regular", 2.0)
+    solution = srm.simulate(mechanism, 1.0, method=method, rtol=1e-8, atol=1e-8)
+    reference = srm.simulate(mechanism, 1.0, rtol=1e-12, atol=1e-12)
+    spent = solution._system.evaluations
+    t = np.linspace(0.0, 1.0, 41)
+    assert np.abs(solution(t)[1] - reference(t)[1]).max() < 1e-6
+    assert solution._system.evaluations == spent
+
+
+def test_a_run_with_sweeps_is_saved_with_its_dense_output(tmp_path: Any) -> None:
+    method = srm.PSRM("dop853", correction="fused")
+    solution = srm.simulate(srm.load("four_bar"), 0.3, method=method)
+    solution.save(tmp_path / "run.npz")
+    again = srm.load_solution(tmp_path / "run.npz")
+    assert np.array_equal(again(0.123)[0], solution(0.123)[0])
+
+
+def test_beyond_the_stability_limit_the_run_ends_and_says_so() -> None:
+    method = srm.SRM("tvd32", 3, eps=1e-3)
+    solution = srm.simulate(turning("slider_crank_regular", 2.0), 1.0, method=method, step=1e-2)
+    assert not solution.success
+    assert "h/eps = 10 is beyond 2.51" in solution.message
+    assert 1 <= len(solution.t) < 100
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"),
+    [("fe", 2.0), ("trap", 2.0), ("tvd32", 2.51), ("erk4", 2.79), ("dopr54", 3.31)],
+)
+def test_real_stability_limits_are_the_known_ones(name: str, limit: float) -> None:
+    assert real_stability_limit(srm.TABLEAUS[name]) == pytest.approx(limit, abs=6e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        (0.3, 0.3),
+        ("h", 0.01),
+        ("5h", 0.05),
+        ("0.5 * h", 0.005),
+        ("h^0.5", 0.1),
+        ("h^(2/3)", 0.01 ** (2 / 3)),
+        ("2h**2", 2e-4),
+    ],
+)
+def test_eps_is_a_time_a_multiple_or_a_power_of_the_step(text: Any, value: float) -> None:
+    assert parse_eps(text)(0.01) == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "eps", [0.0, -1.0, float("nan"), "-h", "0h", "k", "h^", "h^(1/0)", "h+1", "", None, True, [1]]
+)
+def test_any_other_eps_is_refused(eps: Any) -> None:
+    with pytest.raises(srm.InputError, match="eps"):
+        parse_eps(eps)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"tableau": "nonsense"}, "unknown tableau"),
+        ({"iterations": 0}, "iterations"),
+        ({"iterations": 2.0}, "iterations"),
+        ({"iterations": True}, "iterations"),
+        ({"eps": "fast"}, "eps"),
+        ({"carry": True}, "restart=True"),
+        ({"restart": "yes"}, "neither True nor False"),
+        ({"restart": True, "carry": True, "iterations": 4}, "unstable"),
+        ({"T": "both"}, "'identity', 'transpose', 'inverse'"),
+        ({"interpolation": "stages"}, "'auto', 'linear'"),
+    ],
+)
+def test_srm_refuses_what_makes_no_sense(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(srm.InputError, match=words):
+        srm.SRM(**options)
+
+
+def test_open_chains_run_with_any_method() -> None:
+    chain = srm.load("pendulum_chain")
+    reference = srm.simulate(chain, 0.5, rtol=1e-9)
+    for method in (srm.SRM("erk4"), srm.PSRM("erk4", correction="sweep")):
+        solution = srm.simulate(chain, 0.5, method=method, step=5e-3)
+        assert np.abs(solution.q[-1] - reference.q[-1]).max() < 1e-6

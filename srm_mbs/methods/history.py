@@ -7,22 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.systems.interpolation import lagrange_weights
 
 WINDOW = 9
 """Nodes of an interpolation between nodes on both sides."""
 POINTS = 5
 """Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
-
-
-def lagrange_weights(nodes: FloatArray, t: float) -> FloatArray:
-    """Weights (k,) of the polynomial through ``nodes`` (k,), distinct times, at ``t``."""
-    k = len(nodes)
-    weights = np.ones(k)
-    for i in range(k):
-        for j in range(k):
-            if i != j:
-                weights[i] *= (t - nodes[j]) / (nodes[i] - nodes[j])
-    return weights
 
 
 @dataclass(frozen=True, eq=False)

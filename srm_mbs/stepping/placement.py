@@ -67,7 +67,7 @@ class SingularityPlacement:
             h = self._before_the_step(t, proposal.h)
             if h < proposal.h:
                 self.placed += 1
-                return Proposal(h, t + h)
+                return Proposal(h, t + h, placed=True)
         return proposal
 
     def _before_the_step(self, t: float, h: float) -> float:

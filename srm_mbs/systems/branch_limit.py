@@ -15,10 +15,10 @@ from the singular configurations.
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import BarycentricInterpolator
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.interpolation import lagrange_weights
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
 from srm_mbs.systems.singular import (
     SingularConfiguration,
@@ -101,7 +101,8 @@ class BranchLimit:
 
     @staticmethod
     def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
-        return BarycentricInterpolator(times, values)(0.0)  # type: ignore[no-any-return]
+        out: FloatArray = np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
+        return out
 
     def _follow(self, q: FloatArray, move: FloatArray) -> FloatArray | None:
         """The configuration of the branch near q (+) move, moved off it along the normals only."""

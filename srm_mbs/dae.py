@@ -11,7 +11,6 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.methods.history import lagrange_weights
 from srm_mbs.options import (
     checked_method,
     checked_rtol,
@@ -28,6 +27,7 @@ from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.placement import SingularityPlacement
 from srm_mbs.stepping.stepsize import Verdict, initial_step
 from srm_mbs.systems.dae import DaeSystem
+from srm_mbs.systems.interpolation import lagrange_weights
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""

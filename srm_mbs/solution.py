@@ -253,8 +253,7 @@ class Solution:
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
-        found = find_crossings(self.scheme, self.steps)
-        return tuple(crossing for crossing in found if crossing.time <= self.steps.end)
+        return find_crossings(self._system, self.scheme, self.steps, self._dense)
 
     @cached_property
     def drift(self) -> FloatArray:

@@ -35,6 +35,7 @@ _STEP_ARRAYS = (
     "sigmas",
     "ranks",
     "error_ratios",
+    "placements",
 )
 
 
@@ -159,15 +160,16 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
         "sigmas": (n, s + 1),
         "ranks": (n,),
         "error_ratios": (n,),
+        "placements": (n,),
     }
     for name, shape in expected.items():
         if getattr(steps, name).shape != shape:
             raise ValueError(f"{name} has shape {getattr(steps, name).shape}, not {shape}")
-    if steps.corrections.shape not in ((n, m), (n, 0)):
-        raise ValueError(f"corrections has shape {steps.corrections.shape}")
     # Methods with sweeps store the extra stages of the dense output as well.
     if steps.rates.shape not in ((n, s + 1, m), (n, get_tableau(tableau).dense.n_rates, m)):
         raise ValueError(f"rates has shape {steps.rates.shape}, not {(n, s + 1, m)}")
+    if steps.corrections.shape not in ((n, m), (n, 0)):
+        raise ValueError(f"corrections has shape {steps.corrections.shape}")
     if steps.stop is not None and not (n and steps.times[-2] <= steps.stop <= steps.times[-1]):
         raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 

@@ -127,7 +127,7 @@ def test_the_split_form_passes_an_isolated_singularity_of_gb(tableau: str) -> No
         )
         assert solution.success, solution.message
         # tol bounds the error of a step; over the run errors add up.
-        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < 3.0 * tol
+        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < 10.0 * tol
         assert solution.stats.placements > 0
 
 

@@ -140,6 +140,9 @@ class StepResult:
         |x| of the error weights at the end.
     sweeps
         For methods with sweeps: where each one stands at the end.
+    placement
+        How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
+        ``"redone"``.
     """
 
     t: float
@@ -156,6 +159,7 @@ class StepResult:
     multiplier: FloatArray | None
     magnitude: FloatArray
     sweeps: tuple[SweepNode, ...] = ()
+    placement: str = ""
 
 
 class Method(Protocol):

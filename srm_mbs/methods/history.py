@@ -8,6 +8,7 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
+from srm_mbs.systems.interpolation import lagrange_weights
 
 STALE = 4.0
 """A multiplier is predicted at most this many spans of the nodes beyond the last one."""
@@ -15,17 +16,6 @@ WINDOW = 9
 """Nodes of an interpolation between nodes on both sides."""
 POINTS = 5
 """Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
-
-
-def lagrange_weights(nodes: FloatArray, t: float) -> FloatArray:
-    """Weights (k,) of the polynomial through ``nodes`` (k,), distinct times, at ``t``."""
-    k = len(nodes)
-    weights = np.ones(k)
-    for i in range(k):
-        for j in range(k):
-            if i != j:
-                weights[i] *= (t - nodes[j]) / (nodes[i] - nodes[j])
-    return weights
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,154 +1,361 @@
-"""Singular passages of a run, found after the fact from the recorded sigmas."""
+"""Singular passages of a run, found after the fact on its dense output.
+
+The recorded sigmas tell between which stages sigma may have passed zero.  There the smallest
+singular value of the closures is followed on the dense output.  A minimum of it is a passage if the
+part of G that loses rank changes sign across it, as it does when the motion goes through, or
+changes altogether, when it leaves on another branch; a motion that turns back, or passes by, keeps
+it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.stepping.dense import StepData
+from srm_mbs.stepping.dense import PLACEMENTS, DenseOutput, StepData
+from srm_mbs.systems.branches import branch_tangents
+from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+from srm_mbs.systems.singular import (
+    SingularConfiguration,
+    analyse_singular,
+    nearest_singular,
+    smallest_singular_value,
+)
 
-CLEARLY_BETTER = 0.2
-"""A sign change must reduce the residual of the fit to less than this fraction."""
+SLACK = 1.5
+"""How much faster sigma may change between two stages than it was seen to change around them."""
+NEAR_ZERO = 0.05
+"""Part of the sigmas around that sigma must be able to reach between two stages."""
+LINGERS = 0.05
+"""sigma below which a motion is close to a singular configuration, wherever it comes from."""
+SUBDIVISION = 4
+"""Samples on the dense output per interval between two stages."""
+LEFT_AT = 0.02
+"""Part of the largest value of a window from which a minimum has been left."""
 DEEP = 0.5
-"""Only steps in which sigma falls below this fraction of its largest value are examined."""
+"""A minimum must be lower than this part of its neighbours."""
+CERTAIN = 1e-5
+"""Below this part of the values around, a minimum is at a singular configuration; above, one must
+be found next to it."""
+CLOSE = 0.2
+"""How close, compared with the motion around the minimum."""
+TURNED_BACK = 0.9
+"""Cosine from which what is lost is the same before and after: the motion did not go through."""
+TOUCHES = 1e-6
+"""Below this part of the values around, it touched the singular configuration nevertheless."""
+REFINEMENTS = 12
+WITHIN = 0.3
+"""How far (units) from the dense output the singular configuration is looked for."""
+BESIDE = 0.05
+"""Part of the values around at which the velocity is taken before and after a passage."""
+
+
+class Watched:
+    """The closures along the dense output of a run."""
+
+    def __init__(self, system: ClosedSystem, dense: DenseOutput) -> None:
+        mechanism = system.mechanism
+        self.geometry = ClosureGeometry(mechanism, mechanism.q0)
+        self.rank = mechanism.structure.rank
+        self._system = system
+        self._dense = dense
+
+    def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """(q, v) at the times t (k,)."""
+        return [self._system.split(state) for state in self._dense(t)]
+
+    def q(self, t: float) -> FloatArray:
+        """Configuration (nq,) at t."""
+        return self.states(np.array([t]))[0][0]
+
+    def smallest(self, t: FloatArray) -> FloatArray:
+        """Last structural singular value of the normalised G at the times t (k,)."""
+        return np.array(
+            [smallest_singular_value(self.geometry, q, self.rank) for q, _ in self.states(t)]
+        )
+
+    def minimum(self, t: FloatArray, values: FloatArray) -> tuple[float, float]:
+        """Time and value of the minimum bracketed by t (3,), values (3,) there.
+
+        The square of the value is a parabola where the motion passes.
+        """
+        times, squares = t.tolist(), (values**2).tolist()
+        for _ in range(REFINEMENTS):
+            a, b, c = times
+            fa, fb, fc = squares
+            bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
+            if not bend > 0.0:
+                break
+            slope = (fb - fa) / (b - a)
+            new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
+            if not a < new < c or abs(new - b) <= 1e-10 * (c - a):
+                break
+            value = float(self.smallest(np.array([new]))[0]) ** 2
+            left = new < b
+            if value < fb:
+                times = [a, new, b] if left else [b, new, c]
+                squares = [fa, value, fb] if left else [fb, value, fc]
+            else:
+                times = [new, b, c] if left else [a, b, new]
+                squares = [value, fb, fc] if left else [fa, fb, value]
+        return times[1], float(np.sqrt(squares[1]))
 
 
 @dataclass(frozen=True)
 class Crossing:
     """A passage through a singular configuration.
 
+    What is not in the constructor is computed when it is read.
+
     Attributes
     ----------
     time
-        When sigma passed zero (s), from a fit to the stages of the step.
+        When the motion was closest to it (s), on the dense output.
+    sigma_before
+        sigma at the start of the step that passed it.
     sigma
         Smallest sigma of any evaluated stage of that step.
     rank
         Smallest number of closure rows in use in that step.
+    placement
+        What kept the stages away: ``"a priori"`` (the step was shortened in advance), ``"redone"``
+        (it was redone with another length), ``"zone"`` (a stage came too close and took the
+        predicted multiplier) or ``""``.
     """
 
     time: float
+    sigma_before: float
     sigma: float
     rank: int
+    placement: str
+    _watched: Watched = field(repr=False, compare=False)
+    _beside: float = field(repr=False, compare=False)
+    _range: tuple[float, float] = field(repr=False, compare=False)
+
+    @cached_property
+    def singular(self) -> SingularConfiguration | None:
+        """The local analysis at the exactly singular configuration nearest to the passage; None
+        if there is none close to it."""
+        watched = self._watched
+        q = watched.q(self.time)
+        found = nearest_singular(watched.geometry, q, watched.rank, WITHIN)
+        return None if found is None else analyse_singular(watched.geometry, found, watched.rank)
+
+    @property
+    def configuration(self) -> FloatArray | None:
+        """That configuration (nq,)."""
+        return None if self.singular is None else self.singular.q
+
+    @property
+    def loops(self) -> tuple[str, ...]:
+        """Names of the loops whose rows lose rank."""
+        return () if self.singular is None else self.singular.loops
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Names of those rows, ``loop.row``."""
+        return () if self.singular is None else self.singular.rows
+
+    @cached_property
+    def _velocities(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """Velocities (nv,) in units, extrapolated to the passage from before and from behind."""
+        out: list[FloatArray | None] = []
+        for side in (-1.0, 1.0):
+            times = self.time + side * self._beside * np.array([1.0, 2.0])
+            if not (self._range[0] <= times.min() and times.max() <= self._range[1]):
+                out.append(None)
+                continue
+            (_, near), (_, far) = self._watched.states(times)
+            out.append((2.0 * near - far) / self._watched.geometry.unit)
+        return out[0], out[1]
+
+    @cached_property
+    def branches(self) -> FloatArray:
+        """Velocity directions (k, nv) of the branches that meet there, of unit length in units.
+
+        With more than one degree of freedom: on each branch the one nearest to the arriving
+        velocity (:func:`srm_mbs.systems.branches.branch_tangents`).  Empty if they are not
+        isolated.
+        """
+        singular = self.singular
+        if singular is None:
+            return np.zeros((0, len(self._watched.geometry.unit)))
+        arriving, leaving = self._velocities
+        return branch_tangents(singular, leaving if arriving is None else arriving)
+
+    def _branch_of(self, u: FloatArray | None) -> int | None:
+        """Index in ``branches`` of the branch with the velocity u (nv,)."""
+        singular = self.singular
+        if u is None or singular is None or not len(self.branches):
+            return None
+        off = []
+        for direction in self.branches:
+            tangent = singular.branch(direction)
+            outside = u if tangent is None else u - tangent @ (tangent.T @ u)
+            off.append(float(np.linalg.norm(outside)))
+        return int(np.argmin(off))
+
+    @cached_property
+    def arrived_on(self) -> int | None:
+        """Index in ``branches`` of the branch before the passage; None if it cannot be told."""
+        return self._branch_of(self._velocities[0])
+
+    @cached_property
+    def left_on(self) -> int | None:
+        """Index in ``branches`` of the branch after the passage; None if it cannot be told."""
+        return self._branch_of(self._velocities[1])
+
+    @property
+    def switched(self) -> bool:
+        """Whether the run left on another branch than it arrived on."""
+        before, after = self.arrived_on, self.left_on
+        return before is not None and after is not None and before != after
 
 
-def _misfit(basis: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
-    """Norm of the residual of the least-squares fit of ``values``, and its coefficients."""
-    coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
-    return float(np.linalg.norm(basis @ coefficients - values)), np.asarray(
-        coefficients, dtype=np.float64
-    )
-
-
-def _zero_in_step(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
-    """Where in [0, 1] sigma changes sign, if a signed polynomial explains the |sigma| seen.
-
-    sigma is the modulus of a smooth quantity, so that a passage is a kink: with the sign turned
-    after it, a low-degree polynomial fits; without, it does not.
-    """
-    order = np.argsort(abscissae, kind="stable")
-    c, sigma = abscissae[order], sigmas[order]
-    top = float(sigma.max())
-    if not (top > 0.0 and sigma.min() < DEEP * top):
-        return None
-    degree = 2 if len(c) > 4 else 1
-    basis = np.vander(c, degree + 1)
-
-    plain, _ = _misfit(basis, sigma)
-    best: tuple[float, float] | None = None
-    for k in range(1, len(c)):
-        if c[k] <= c[k - 1]:
-            continue
-        signed = np.where(np.arange(len(c)) < k, sigma, -sigma)
-        error, coefficients = _misfit(basis, signed)
-        roots = np.roots(coefficients)
-        inside = [
-            float(root.real)
-            for root in roots
-            if abs(root.imag) < 1e-9 and c[k - 1] - 1e-9 <= root.real <= c[k] + 1e-9
-        ]
-        if inside and (best is None or error < best[0]):
-            best = (error, inside[0])
-    if best is None or not best[0] < CLEARLY_BETTER * plain + 1e-14 * top:
-        return None
-    return best[1]
-
-
-def _zero_among(t: FloatArray, sigma: FloatArray, low: int) -> float | None:
-    """Time at which sigma changes sign next to its local minimum ``low``, from three samples on
-    each side, whichever steps they belong to; None if no change of sign explains them."""
-    best: tuple[float, float] | None = None
-    for after in (low, low + 1):  # the zero lies before, or behind, the lowest sample
-        here = slice(max(0, after - 3), min(len(t), after + 3))
-        left = after - here.start
-        if left < 2 or here.stop - after < 2:
-            continue
-        width = t[here.stop - 1] - t[here.start]
-        x = (t[here] - t[after - 1]) / width
-        signed = np.where(np.arange(len(x)) < left, sigma[here], -sigma[here])
-        basis = np.vander(x, 3 if len(x) > 4 else 2)
-
-        plain, _ = _misfit(basis, sigma[here])
-        error, coefficients = _misfit(basis, signed)
-        gap = x[left] - x[left - 1]
-        inside = [
-            float(root.real)
-            for root in np.roots(coefficients)
-            if abs(root.imag) < 1e-9 and -0.2 * gap <= root.real <= 1.2 * gap
-        ]
-        if inside and error < CLEARLY_BETTER * plain and (best is None or error < best[0]):
-            best = (error, float(t[after - 1] + inside[0] * width))
-    return None if best is None else best[1]
-
-
-def _between_the_steps(
-    abscissae: FloatArray, steps: StepData, found: list[Crossing]
-) -> list[Crossing]:
-    """Passages at minima of sigma that no single step explains: few stages, or a long step."""
+def _recorded(abscissae: FloatArray, steps: StepData) -> tuple[FloatArray, FloatArray]:
+    """Times and sigmas of the stages in order of time, each time once."""
     order = np.argsort(abscissae[1:], kind="stable") + 1
     h = np.diff(steps.times)
     t = (steps.times[:-1, None] + h[:, None] * abscissae[order]).ravel()
     sigma = steps.sigmas[:, order].ravel()
     step_of = np.repeat(np.arange(steps.count), len(order))
+    t = np.concatenate([steps.times[:1], t])
+    sigma = np.concatenate([steps.sigmas[0, :1], sigma])
+    step_of = np.concatenate([[0], step_of])
     fresh = np.concatenate([[True], np.diff(t) > 1e-9 * h[step_of[1:]]])
-    t, sigma, step_of = t[fresh], sigma[fresh], step_of[fresh]
-    known = np.array([crossing.time for crossing in found])
-    more: list[Crossing] = []
-    lowest = np.flatnonzero((sigma[1:-1] <= sigma[:-2]) & (sigma[1:-1] <= sigma[2:])) + 1
-    for low in lowest:
-        around = sigma[max(0, low - 6) : low + 7]
-        h_here = h[step_of[low]]
-        if not sigma[low] < DEEP * around.max():
-            continue
-        if known.size and np.abs(known - t[low]).min() < h_here:
-            continue
-        zero = _zero_among(t, sigma, int(low))
-        if zero is not None and not (more and zero - more[-1].time < 0.05 * h_here):
-            more.append(Crossing(zero, float(sigma[low]), int(steps.ranks[step_of[low]])))
-    return more
+    return t[fresh], sigma[fresh]
 
 
-def find_crossings(scheme: ButcherTableau, steps: StepData) -> tuple[Crossing, ...]:
+def _may_vanish(t: FloatArray, sigma: FloatArray, around: int) -> BoolArray:
+    """Between which neighbouring samples (k - 1,) sigma may have come close to zero."""
+    dt = np.diff(t)
+    slope = np.abs(np.diff(sigma)) / dt
+    widest = np.array([slope[max(0, i - around) : i + around + 1].max() for i in range(len(slope))])
+    size = np.array([sigma[max(0, i - around) : i + around + 2].max() for i in range(len(slope))])
+    lowest = 0.5 * (sigma[:-1] + sigma[1:] - SLACK * widest * dt)
+    # A run that lingers next to a singular configuration takes steps far below its distance.
+    lingers = np.minimum(sigma[:-1], sigma[1:]) < LINGERS
+    out: BoolArray = (lowest < NEAR_ZERO * size) | lingers
+    return out
+
+
+def _windows(t: FloatArray, marked: BoolArray) -> list[FloatArray]:
+    """Sampling times of each run of marked intervals, one interval more on either side."""
+    grown = marked.copy()
+    grown[:-1] |= marked[1:]
+    grown[1:] |= marked[:-1]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], grown.astype(int), [0]])))
+    fractions = np.arange(SUBDIVISION) / SUBDIVISION
+    out = []
+    for first, last in zip(edges[::2], edges[1::2]):
+        nodes = t[first : last + 1]
+        times = nodes[:-1, None] + np.diff(nodes)[:, None] * fractions
+        out.append(np.append(times.ravel(), nodes[-1]))
+    return out
+
+
+def _minima(values: FloatArray) -> list[tuple[int, int, int]]:
+    """Indices of the minima inside ``values``, each with those on both sides where it is left.
+
+    Small minima between the same sides are one: dense output is rough where steps are tiny.
+    """
+    level = max(LEFT_AT * float(values.max()), 1e-12)
+    found: dict[tuple[int, int], int] = {}
+    for k in np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] < values[2:])) + 1:
+        first, last = k - 1, k + 1
+        while first > 0 and values[first] < level:
+            first -= 1
+        while last < len(values) - 1 and values[last] < level:
+            last += 1
+        sides = int(first), int(last)
+        if sides not in found or values[k] < values[found[sides]]:
+            found[sides] = int(k)
+    return [(first, k, last) for (first, last), k in found.items()]
+
+
+def _turned(
+    watched: Watched, time: float, certain: bool, before: float, after: float
+) -> float | None:
+    """Cosine between what G has lost at ``time`` as it is ``before`` and ``after``.
+
+    -1 if the motion went through, 1 if it turned back or passed by, in between if it left on
+    another branch.  None if nothing is lost: unless it is ``certain`` that it is, a singular
+    configuration must lie close to the motion, compared with how far that moves.
+    """
+    geometry = watched.geometry
+    q, q_before, q_after = (watched.q(t) for t in (time, before, after))
+    if not certain:
+        found = nearest_singular(geometry, q, watched.rank, WITHIN)
+        if found is None:
+            return None
+        moved = np.linalg.norm(geometry.difference(q_before, q_after))
+        if not np.linalg.norm(geometry.difference(q, found)) < CLOSE * moved:
+            return None
+        q = found
+    left, size, right = np.linalg.svd(geometry.normalised(q))
+    rank = int(np.sum(size > max(100.0 * size[watched.rank - 1], 1e-9)))
+    a, b = (
+        (left[:, rank:].T @ geometry.normalised(x) @ right[rank:].T).ravel()
+        for x in (q_before, q_after)
+    )
+    return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+
+def _placement(steps: StepData, i: int) -> str:
+    if i in steps.zones:
+        return "zone"
+    here = PLACEMENTS[int(steps.placements[i])]
+    # Placing may shorten the step before, so that the next one passes in the middle.
+    return here or (PLACEMENTS[int(steps.placements[i - 1])] if i else "")
+
+
+def find_crossings(
+    system: OpenSystem | ClosedSystem,
+    scheme: ButcherTableau,
+    steps: StepData,
+    dense: DenseOutput,
+) -> tuple[Crossing, ...]:
     """All passages of a run, in order of time."""
+    if not isinstance(system, ClosedSystem) or not steps.count:
+        return ()
     abscissae = np.append(scheme.c, 1.0)
+    t, sigma = _recorded(abscissae, steps)
+    inside = t <= steps.end
+    t, sigma = t[inside], sigma[inside]
+    if len(t) < 3 or not np.isfinite(sigma).all():
+        return ()
+    watched = Watched(system, dense)
     found: list[Crossing] = []
-    for i in range(steps.count):
-        sigmas = steps.sigmas[i]
-        if not np.isfinite(sigmas).all():
-            continue
-        zero = _zero_in_step(abscissae, sigmas)
-        if zero is None:
-            continue
-        h = steps.times[i + 1] - steps.times[i]
-        time = float(steps.times[i] + zero * h)
-        crossing = Crossing(time, float(sigmas.min()), int(steps.ranks[i]))
-        # A zero on the boundary of two steps is seen by both.
-        if found and time - found[-1].time < 0.05 * h:
-            continue
-        found.append(crossing)
-    if steps.count and np.isfinite(steps.sigmas).all():
-        found += _between_the_steps(abscissae, steps, found)
-    return tuple(sorted(found, key=lambda crossing: crossing.time))
+    for times in _windows(t, _may_vanish(t, sigma, scheme.n_stages)):
+        values = watched.smallest(times)
+        scale = float(values.max())
+        for first, k, last in _minima(values):
+            near = slice(k - 1, k + 2)
+            time, value = watched.minimum(times[near], values[near])
+            before, after = float(times[first]), float(times[last])
+            sides = values[[first, last]]
+            if not value < DEEP * sides.min():
+                continue
+            turned = _turned(watched, time, value < CERTAIN * scale, before, after)
+            if turned is None or (turned > TURNED_BACK and value > TOUCHES * scale):
+                continue
+            i = int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
+            slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
+            found.append(
+                Crossing(
+                    time,
+                    float(steps.sigmas[i, 0]),
+                    float(steps.sigmas[i].min()),
+                    int(steps.ranks[i]),
+                    _placement(steps, i),
+                    watched,
+                    BESIDE * scale / slope,
+                    (float(steps.times[0]), steps.end),
+                )
+            )
+    return tuple(found)

@@ -24,6 +24,10 @@ from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.stepping.hermite import HermiteStep, close_to_singular
 from srm_mbs.systems.base import System, Zone
 
+PLACEMENTS = ("", "a priori", "redone")
+"""How steps are placed around singular configurations; see
+:class:`~srm_mbs.methods.base.StepResult`."""
+
 
 @dataclass(frozen=True, eq=False)
 class StepData:
@@ -46,6 +50,8 @@ class StepData:
         Smallest number of rows in use in the step.
     error_ratios : (n,)
         Error estimate over tolerance.
+    placements : (n,)
+        How the step was placed around a singular configuration: index into PLACEMENTS.
     zones
         Step index -> (threshold, history) of the steps with a stage in the zone.
     stop
@@ -59,6 +65,7 @@ class StepData:
     sigmas: FloatArray
     ranks: FloatArray
     error_ratios: FloatArray
+    placements: FloatArray
     zones: dict[int, tuple[float, MultiplierHistory]]
     stop: float | None = None
 
@@ -92,6 +99,7 @@ def step_data(
         sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
         ranks=np.array([s.rank for s in steps], dtype=float),
         error_ratios=np.array([s.error_ratio for s in steps]),
+        placements=np.array([PLACEMENTS.index(s.placement) for s in steps], dtype=float),
         zones={
             i: (s.zone.threshold, s.history)
             for i, s in enumerate(steps)

@@ -117,6 +117,7 @@ def integrate(
     started = time.perf_counter()
     t, x = t0, state
     trouble = ""
+    redone = False
     try:
         if events is not None:
             events.begin(t, x)
@@ -134,6 +135,8 @@ def integrate(
                 result = None
                 trouble = str(error)
             verdict = control.judge(proposal, result)
+            placement = "redone" if redone else "a priori" if proposal.placed else ""
+            redone = verdict is Verdict.REPLACED
             if verdict is not Verdict.ACCEPTED or result is None:
                 ratio = np.inf if result is None else result.error_ratio
                 record.attempts.append(Attempt(t, h, ratio, verdict))
@@ -146,6 +149,7 @@ def integrate(
                 reason = "the step is so long that the loops come apart"
                 _fail(record, t, h, memory, reason, control.adaptive)
                 break
+            result.placement = placement
             method.accept(memory, result)
             start, t, x = x, proposal.t_new, result.state
             record.times.append(t)

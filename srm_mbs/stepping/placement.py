@@ -117,7 +117,7 @@ class SingularityPlacement:
             h = self._placed(self._zero - t, proposal.h, t)
             if h != proposal.h:
                 self.placed += 1
-                return Proposal(h, t + h)
+                return Proposal(h, t + h, placed=True)
         return proposal
 
     def _placed(self, distance: float, h: float, t: float) -> float:

@@ -37,10 +37,14 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Proposal:
-    """A step of length ``h`` that ends at ``t_new`` (exactly, where that is a given time)."""
+    """A step of length ``h`` that ends at ``t_new`` (exactly, where that is a given time).
+
+    ``placed``: it was made shorter so that no stage lies on a singular configuration.
+    """
 
     h: float
     t_new: float
+    placed: bool = False
 
 
 class StepSizeControl(Protocol):

@@ -18,6 +18,7 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.interpolation import lagrange_weights
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
 from srm_mbs.systems.singular import (
     SingularConfiguration,
@@ -100,9 +101,8 @@ class BranchLimit:
 
     @staticmethod
     def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
-        from scipy.interpolate import BarycentricInterpolator
-
-        return BarycentricInterpolator(times, values)(0.0)  # type: ignore[no-any-return]
+        out: FloatArray = np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
+        return out
 
     def _follow(self, q: FloatArray, move: FloatArray) -> FloatArray | None:
         """The configuration of the branch near q (+) move, moved off it along the normals only."""

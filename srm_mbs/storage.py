@@ -36,6 +36,8 @@ _STEP_ARRAYS = (
     "ranks",
     "error_ratios",
     "placements",
+    "held",
+    "end_rate",
 )
 
 
@@ -161,6 +163,8 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
         "ranks": (n,),
         "error_ratios": (n,),
         "placements": (n,),
+        "held": (n,),
+        "end_rate": (m,),
     }
     for name, shape in expected.items():
         if getattr(steps, name).shape != shape:

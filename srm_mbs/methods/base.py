@@ -143,6 +143,10 @@ class StepResult:
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
+    held
+        Whether a stage lingered next to a singular configuration and was held on its branch.
+    normals
+        Normals of the closures at an end point next to a singular configuration, else None.
     """
 
     t: float
@@ -160,6 +164,8 @@ class StepResult:
     magnitude: FloatArray
     sweeps: tuple[SweepNode, ...] = ()
     placement: str = ""
+    held: bool = False
+    normals: FloatArray | None = None
 
 
 class Method(Protocol):

@@ -28,6 +28,8 @@ PROJECTIONS = 4
 AMBIGUOUS = 0.1
 """A stage that lies off the branch by more than this fraction of sigma is evaluated where it is:
 Newton might lead to another branch."""
+HELD = 0.1
+"""Part of the tolerance up to which a slow motion is held on its branch, not extrapolated."""
 ROUNDING = 16.0 * np.finfo(float).eps
 """Rounding of the positions, in units."""
 
@@ -118,6 +120,18 @@ class BranchStages:
         if part.start:
             error[part] = change / (self.h * sigma) * error[: part.start]
         return self._turning(error, sigma, change)
+
+    def lingers(self, threshold: float) -> bool:
+        """Whether the motion is so slow that holding it tangential to the normals of the last node,
+        at ``threshold``, errs by little of the tolerance: by |a| threshold + v^2."""
+        part = self.system.multiplier_part
+        if not part.start or self.memory.history is None or self.memory.history.normals is None:
+            return False
+        v, a = self.memory.rate[: part.start], self.memory.rate[part]
+        speed = self.system.size(np.concatenate([v, a]))
+        error = np.zeros_like(self.weights)
+        error[part] = self.h * (threshold * np.abs(a) + speed * np.abs(v))
+        return self.norm(error, self.weights) < HELD
 
     def known_from(self, longest: float) -> float:
         """sigma from which the direct solve errs by less than the tolerance; at most ``longest``.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
-from srm_mbs.errors import EvaluationError
 from srm_mbs.systems.interpolation import lagrange_weights
 
 STALE = 4.0
@@ -31,19 +30,25 @@ class MultiplierHistory:
     known_until, known_below
         Of a start on a singular configuration, whose nodes lie ahead: until that time (s), and
         where sigma is smaller, they are more accurate than the direct solve.
+    normals
+        Of the last node, if it lies next to a singular configuration; see
+        :class:`~srm_mbs.systems.base.Zone`.
     """
 
     times: FloatArray
     values: FloatArray
     known_until: float = -np.inf
     known_below: float = 0.0
+    normals: FloatArray | None = None
 
     @classmethod
     def begin(cls, t: float, value: FloatArray) -> MultiplierHistory:
         """History with one node."""
         return cls(np.array([t]), value[None].copy())
 
-    def extended(self, t: float, value: FloatArray) -> MultiplierHistory:
+    def extended(
+        self, t: float, value: FloatArray, normals: FloatArray | None = None
+    ) -> MultiplierHistory:
         """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``POINTS`` nodes.
 
         Nodes ahead of ``t`` are dropped.
@@ -51,7 +56,7 @@ class MultiplierHistory:
         before = self.times < t
         times = np.concatenate([self.times[before], [t]])[-POINTS:]
         values = np.concatenate([self.values[before], value[None]])[-POINTS:]
-        return MultiplierHistory(times, values)
+        return MultiplierHistory(times, values, normals=normals)
 
     def _around(self, t: float) -> slice:
         """The nodes to use at ``t``: all, unless there are more than WINDOW."""
@@ -65,20 +70,11 @@ class MultiplierHistory:
         nodes = self._around(t)
         return lagrange_weights(self.times[nodes], t) @ self.values[nodes]
 
-    def predict_near(self, t: float) -> FloatArray:
-        """yhat (nv,) extrapolated to ``t``, as long as that makes sense.
-
-        Raises
-        ------
-        EvaluationError
-            If ``t`` lies too far beyond the nodes.
-        """
+    def predict_near(self, t: float) -> FloatArray | None:
+        """yhat (nv,) extrapolated to ``t``; None if that lies too far beyond the nodes."""
         span = float(self.times[-1] - self.times[0])
         if span > 0.0 and t > max(self.times[-1] + STALE * span, self.known_until):
-            raise EvaluationError(
-                "the motion stays next to a singular configuration for longer than its multiplier "
-                "can be predicted: it has too little momentum to pass"
-            )
+            return None
         return self.predict(t)
 
     def uncertainty(self, t: float) -> FloatArray:

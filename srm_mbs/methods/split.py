@@ -16,6 +16,8 @@ many evaluations as the tableau has stages, and a few more next to singular conf
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
@@ -66,7 +68,10 @@ def split_step(
         weights = norm.weights(memory.magnitude)
         branch = BranchStages(system, memory, norm, weights, h, sigma_change, None)
         near = memory.sigma < WATCHED + NEAR * sigma_change
-        zone = zone_from(history, branch.known_from(ZONE_FLOOR) if near else ZONE_FLOOR, t + h)
+        threshold = branch.known_from(ZONE_FLOOR) if near else ZONE_FLOOR
+        zone = zone_from(history, threshold, t + h)
+        if near and zone is not None and branch.lingers(threshold):
+            zone = replace(zone, predict=lambda _: None)
         branch.zone = zone
     rates = np.empty((s + 1, system.tangent_size))
     sigmas = np.full(s + 1, memory.sigma)
@@ -74,6 +79,7 @@ def split_step(
     weak_stages: list[int] = []
     rank = np.iinfo(np.int64).max
     moved: FloatArray | None = None
+    held = False
     for j in range(1, s + 1):
         end = j == s
         delta = (h * (scheme.b if end else A[j, :j])) @ rates[:j]
@@ -89,12 +95,16 @@ def split_step(
         rank = min(rank, terms.rank)
         if terms.weak:
             weak_stages.append(j)
+            held = held or terms.held
     magnitude = system.magnitudes(x)
+    normals: FloatArray | None = None
     if history is not None:
         correction = theta * terms.correction()
         new_state = system.retract(x, -correction)
         end_rate = rate - system.rate_change(correction)
         multiplier = None if terms.weak else terms.multiplier().copy()
+        if not terms.weak and terms.sigma < WATCHED:
+            normals = terms.normals().copy()
         if moved is not None:
             correction = correction + moved
     else:
@@ -129,6 +139,8 @@ def split_step(
         history=history if weak_stages else None,
         multiplier=multiplier,
         magnitude=magnitude,
+        held=held,
+        normals=normals,
     )
 
 
@@ -138,4 +150,6 @@ def split_accept(memory: Memory, result: StepResult) -> None:
     memory.sigma = float(result.sigmas[-1])
     memory.magnitude = result.magnitude
     if result.multiplier is not None and memory.history is not None:
-        memory.history = memory.history.extended(result.t + result.h, result.multiplier)
+        memory.history = memory.history.extended(
+            result.t + result.h, result.multiplier, result.normals
+        )

@@ -30,7 +30,7 @@ def zone_from(history: MultiplierHistory | None, threshold: float, end: float) -
     known = history.known_below if end <= history.known_until else 0.0
     if len(history.times) < FEWEST:
         threshold = min(threshold, HIT)
-    return Zone(max(threshold, known), history.predict_near)
+    return Zone(max(threshold, known), history.predict_near, history.normals)
 
 
 def zone_of(history: MultiplierHistory | None, sigma_change: float, end: float) -> Zone | None:

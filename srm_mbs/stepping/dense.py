@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -52,6 +51,10 @@ class StepData:
         Error estimate over tolerance.
     placements : (n,)
         How the step was placed around a singular configuration: index into PLACEMENTS.
+    held : (n,)
+        1 for steps that lingered next to a singular configuration, held on their branch, else 0.
+    end_rate : (m,)
+        Tangent rate at the end of the last step.
     zones
         Step index -> (threshold, history) of the steps with a stage in the zone.
     stop
@@ -66,6 +69,8 @@ class StepData:
     ranks: FloatArray
     error_ratios: FloatArray
     placements: FloatArray
+    held: FloatArray
+    end_rate: FloatArray
     zones: dict[int, tuple[float, MultiplierHistory]]
     stop: float | None = None
 
@@ -100,6 +105,8 @@ def step_data(
         ranks=np.array([s.rank for s in steps], dtype=float),
         error_ratios=np.array([s.error_ratio for s in steps]),
         placements=np.array([PLACEMENTS.index(s.placement) for s in steps], dtype=float),
+        held=np.array([s.held for s in steps], dtype=float),
+        end_rate=np.array(steps[-1].end_rate if n else np.zeros(tangent_size)),
         zones={
             i: (s.zone.threshold, s.history)
             for i, s in enumerate(steps)
@@ -173,9 +180,11 @@ class DenseOutput:
 
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
         data, system = self._steps, self._system
-        if data.count > 1 and close_to_singular(self._abscissae, data.sigmas[step]):
+        if data.count > 1 and (
+            step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
+        ):
             if step not in self._smooth:
-                self._smooth[step] = HermiteStep(system, data, step, self._last_rate)
+                self._smooth[step] = HermiteStep(system, data, step)
             return self._smooth[step](theta)
         h = data.times[step + 1] - data.times[step]
         start = data.states[step]
@@ -186,12 +195,6 @@ class DenseOutput:
             x = system.retract(start, delta[k])
             states.append(x if ramps is None else system.retract(x, ramps[k]))
         return np.array(states)
-
-    @cached_property
-    def _last_rate(self) -> FloatArray:
-        """Tangent rate at the end of the last step."""
-        data = self._steps
-        return self._system.evaluate(float(data.times[-1]), data.states[-1]).rate().copy()
 
     def _ramps(self, step: int, theta: FloatArray, h: float) -> FloatArray | None:
         correction = self._steps.corrections[step]

@@ -9,6 +9,7 @@ in the chart at the start of the step.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -41,26 +42,20 @@ class HermiteStep:
 
     Degree 11 where degree 15 confirms it better than it confirms degree 7: between steps of very
     different lengths a higher degree is not better.
-
-    Parameters
-    ----------
-    last_rate : (n,)
-        Tangent rate at the end of the last step of the run.
     """
 
-    def __init__(self, system: System, steps: StepData, step: int, last_rate: FloatArray) -> None:
+    def __init__(self, system: System, steps: StepData, step: int) -> None:
         self._system = system
         self._steps = steps
         self._step = step
         self._start = steps.states[step]
         self._h = steps.times[step + 1] - steps.times[step]
-        self._last_rate = last_rate
         polynomials = [self._through(count) for count in NODES]
         values = [polynomial(_PROBES) for polynomial in polynomials]
         changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
         self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
 
-    def _through(self, count: int):  # type: ignore[no-untyped-def]
+    def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
@@ -71,10 +66,10 @@ class HermiteStep:
         values: list[FloatArray] = []
         for i in range(first, min(first + count, last + 1)):
             delta = self._system.difference(self._start, steps.states[i])
-            rate = steps.rates[i, 0] if i < last else self._last_rate
+            rate = steps.rates[i, 0] if i < last else steps.end_rate
             points += 2 * [(steps.times[i] - t0) / self._h]
             values += [delta, self._h * self._system.chart_rate(delta, rate)]
-        return KroghInterpolator(np.array(points), np.array(values))
+        return KroghInterpolator(np.array(points), np.array(values))  # type: ignore[no-any-return]
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """States (k, nx) at the fractions ``theta`` (k,) of the step."""

@@ -24,11 +24,16 @@ class Zone:
     threshold
         sigma_z: pivots below ``threshold`` (relative to the structural reference) are dropped.
     predict
-        t -> (nv,), the multiplier yhat extrapolated from nodes outside the zone.
+        t -> (nv,), the multiplier yhat extrapolated from nodes outside the zone; None at times
+        that the nodes say nothing about.
+    normals : (nv, k) or None
+        M-orthonormal normals of the closures at the last node, the weakest last.  A motion that
+        lingers, with too little momentum to pass, is held tangential to them.
     """
 
     threshold: float
-    predict: Callable[[float], FloatArray]
+    predict: Callable[[float], FloatArray | None]
+    normals: FloatArray | None = None
 
 
 class Terms(Protocol):
@@ -48,6 +53,13 @@ class Terms(Protocol):
     @property
     def weak(self) -> bool:
         """Whether rows were dropped here and the predicted multiplier took their place."""
+
+    @property
+    def held(self) -> bool:
+        """Whether the normals of the zone took the place of the dropped rows."""
+
+    def normals(self) -> FloatArray:
+        """M-orthonormal normals of the closures (nv, rank), the weakest last."""
 
     def rate(self) -> FloatArray:
         """Tangent rate (2 nv,): (v, M^-1 f - yhat)."""

@@ -60,6 +60,13 @@ class _DaeTerms:
     def weak(self) -> bool:
         return self._p.weak
 
+    @property
+    def held(self) -> bool:
+        return False
+
+    def normals(self) -> FloatArray:
+        return np.zeros((len(self.x), 0))
+
     def _residual(self) -> FloatArray:
         if self._g is None:
             self._g = self._system.call("g", self.t, self.x)
@@ -326,8 +333,14 @@ class DaeSystem:
         self.projection.factor(G, B, None if zone is None else zone.threshold)
         terms = self._terms
         terms.load(t, state, f, B, G)
-        weak = self.projection.weak and zone is not None
-        terms.predicted = zone.predict(t) if weak and zone is not None else None
+        terms.predicted = None
+        if self.projection.weak and zone is not None:
+            terms.predicted = zone.predict(t)
+            if terms.predicted is None:
+                raise EvaluationError(
+                    "the solution stays next to a singularity of G B for longer than its "
+                    "multiplier can be predicted"
+                )
         return terms
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:

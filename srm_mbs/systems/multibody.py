@@ -171,10 +171,14 @@ class _OpenTerms:
     sigma = np.inf
     rank = 0
     weak = False
+    held = False
 
     def __init__(self, nv: int) -> None:
         self._rate = np.zeros(2 * nv)
         self._nv = nv
+
+    def normals(self) -> FloatArray:
+        return np.zeros((self._nv, 0))
 
     def rate(self) -> FloatArray:
         return self._rate
@@ -253,6 +257,13 @@ class _ClosedTerms:
         p = self._p
         prediction = p.U @ self.predicted
         return white + prediction - p.Q @ (p.Q.T @ prediction)
+
+    @property
+    def held(self) -> bool:
+        return self._p.held is not None
+
+    def normals(self) -> FloatArray:
+        return self._p.normals()
 
     def _white_multiplier(self) -> FloatArray:
         return self._completed(self._p.white_multiplier)
@@ -338,7 +349,16 @@ class ClosedSystem(_Mechanics):
         projection.factor(data.M, loops.G, f, loops.bias, None if zone is None else zone.threshold)
         terms = self._terms
         terms.v = v
-        terms.predicted = zone.predict(t) if projection.weak and zone is not None else None
+        terms.predicted = None
+        if projection.weak and zone is not None:
+            terms.predicted = zone.predict(t)
+            if terms.predicted is None:
+                if zone.normals is None:
+                    raise EvaluationError(
+                        "the motion stays next to a singular configuration with too little "
+                        "momentum to tell its branch"
+                    )
+                projection.hold(zone.normals)
         return terms
 
     def closure_gap(self, t: float, state: FloatArray) -> float:

@@ -81,6 +81,7 @@ class Projection:
         self.sigma = np.inf
         self.rank = rank
         self.weak = False
+        self.held: FloatArray | None = None
 
     def factor(
         self,
@@ -118,7 +119,24 @@ class Projection:
         self.order = permutation[:rank]
         self.R = packed[:rank, :rank]
         self.Q = lapack.dorgqr(packed[:, :rank], tau[:rank])[0] if rank else packed[:, :0]
+        self.held = None
         self.white_multiplier = self.normal((W.T @ self.white_force + bias)[self.order])
+
+    def hold(self, normals: FloatArray) -> None:
+        """Keep the motion tangential to the last of ``normals`` (nv, k) in place of the dropped
+        rows, whose own normals cannot be told here."""
+        missing = self.structural_rank - self.rank
+        white = self.U @ normals[:, -missing:]
+        for _ in range(2):
+            white = white - self.Q @ (self.Q.T @ white)
+        self.held = np.linalg.qr(white)[0]
+        self.white_multiplier = self.white_multiplier + self.held @ (
+            self.held.T @ (self.white_force - self.white_multiplier)
+        )
+
+    def normals(self) -> FloatArray:
+        """L^-T Q (nv, rank): M-orthonormal normals of the rows in use, the weakest last."""
+        return self.unwhiten(self.Q)
 
     def normal(self, right: FloatArray) -> FloatArray:
         """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
@@ -132,8 +150,10 @@ class Projection:
         return unwhiten(self.U, right)
 
     def white_project(self, w: FloatArray) -> FloatArray:
-        """Q Q^T L^T w (nv,)."""
-        return self.Q @ (self.Q.T @ (self.U @ w))
+        """Q Q^T L^T w (nv,), held normals included."""
+        white = self.U @ w
+        out: FloatArray = self.Q @ (self.Q.T @ white)
+        return out if self.held is None else out + self.held @ (self.held.T @ white)
 
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nv,)."""

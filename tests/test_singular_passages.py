@@ -173,14 +173,3 @@ def test_fixed_steps_are_placed_and_return_to_the_grid() -> None:
     assert np.abs(solution.t[:, None] - grid).min(axis=0).max() < 1e-12
     theta, omega = reduced.integrate(reduced.slider_crank(), [7 * np.pi / 4, 0.0], 5.0)
     assert error_at_end(solution, theta, omega) < 1e-5
-
-
-@pytest.mark.stress
-@pytest.mark.parametrize(("tableau", "bound"), [("dop853", 4e-6), ("dopr54", 2e-4)])
-def test_slider_crank_is_right_after_465_passages(
-    tableau: str, bound: float, exact: dict[str, Any]
-) -> None:
-    solution = run("slider_crank", 1000.0, tableau)
-    assert len(solution.crossings) == 465
-    assert error_at_end(solution, *crank_at(exact, "1000")) < 2.0 * bound
-    assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < 1e-5

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.stress, pytest.mark.timeout(300)]
 
 STARTS = 50
 TIMES = np.linspace(0.0, 10.0, 401)
-ON_THE_BRANCH = 1e-7
+ON_THE_BRANCH = 1e-5
 """Largest departure from the joint angles and rates that the right branch has (rad, rad/s)."""
 
 

@@ -307,7 +307,8 @@ def _turned(
 
 
 def _placement(steps: StepData, i: int) -> str:
-    if i in steps.zones:
+    # At the end of a step the next one's stages may be those that came too close.
+    if any(k in steps.zones for k in (i - 1, i, i + 1)):
         return "zone"
     here = PLACEMENTS[int(steps.placements[i])]
     # Placing may shorten the step before, so that the next one passes in the middle.

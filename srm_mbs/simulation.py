@@ -47,6 +47,8 @@ log = logging.getLogger(__name__)
 
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
+TOLD = 2
+"""Bifurcations that the message of a run describes."""
 BACKENDS = ("auto", "python")
 ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
@@ -332,6 +334,7 @@ def simulate(
         tuple(avoided.tolist()),
     )
     solution = _collect(mechanism, system, method, record, wrappers, watch, times, settings)
+    solution.message += _bifurcations(solution)
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)
     return solution
@@ -386,6 +389,13 @@ def _collect(
         stats=stats,
         settings=settings,
     )
+
+
+def _bifurcations(solution: Solution) -> str:
+    """A sentence for each singular configuration that was reached without momentum."""
+    found = solution.bifurcations
+    more = f" There were {len(found)} of them." if len(found) > TOLD else ""
+    return "".join(f" {bifurcation}." for bifurcation in found[:TOLD]) + more
 
 
 def _turns(wrappers: Sequence[Placing]) -> str:

@@ -15,6 +15,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
 from srm_mbs.systems.loops import closure_errors
@@ -254,6 +255,12 @@ class Solution:
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
         return find_crossings(self._system, self.scheme, self.steps, self._dense)
+
+    @cached_property
+    def bifurcations(self) -> tuple[Bifurcation, ...]:
+        """Singular configurations that the run reached without the momentum to choose a branch."""
+        failed = self.status == "failed"
+        return find_bifurcations(self._system, self.steps, self._dense, self.settings.rtol, failed)
 
     @cached_property
     def drift(self) -> FloatArray:

@@ -315,6 +315,21 @@ def _placement(steps: StepData, i: int) -> str:
     return here or (PLACEMENTS[int(steps.placements[i - 1])] if i else "")
 
 
+def passage_at(watched: Watched, steps: StepData, time: float, beside: float) -> Crossing:
+    """The passage of a run at ``time`` (s), whose velocity is taken ``beside`` (s) it."""
+    i = int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
+    return Crossing(
+        time,
+        float(steps.sigmas[i, 0]),
+        float(steps.sigmas[i].min()),
+        int(steps.ranks[i]),
+        _placement(steps, i),
+        watched,
+        beside,
+        (float(steps.times[0]), steps.end),
+    )
+
+
 def find_crossings(
     system: OpenSystem | ClosedSystem,
     scheme: ButcherTableau,
@@ -345,18 +360,6 @@ def find_crossings(
             turned = _turned(watched, time, value < CERTAIN * scale, before, after)
             if turned is None or (turned > TURNED_BACK and value > TOUCHES * scale):
                 continue
-            i = int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
             slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
-            found.append(
-                Crossing(
-                    time,
-                    float(steps.sigmas[i, 0]),
-                    float(steps.sigmas[i].min()),
-                    int(steps.ranks[i]),
-                    _placement(steps, i),
-                    watched,
-                    BESIDE * scale / slope,
-                    (float(steps.times[0]), steps.end),
-                )
-            )
+            found.append(passage_at(watched, steps, time, BESIDE * scale / slope))
     return tuple(found)

@@ -1,0 +1,143 @@
+"""Where a run came to a singular configuration without the momentum to pass it.
+
+Several branches of the motion meet at a singular configuration, and momentum chooses one.  A
+motion that comes to rest there, or turns back so close to it that its error could decide, has no
+unique continuation.  The run keeps the branch it came along; what it could not know is listed here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.stepping.crossings import Crossing, Watched, passage_at
+from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+from srm_mbs.systems.singular import nearest_singular
+
+LOOKED_AT = 0.02
+"""sigma below which a motion that turns back is looked at."""
+UNDECIDED = 100.0
+"""Distance to the singular configuration (units), over rtol, below which errors could decide."""
+WITHIN = 0.05
+"""How far (units) the singular configuration is looked for."""
+SAMPLES = 21
+
+
+@dataclass(frozen=True)
+class Bifurcation:
+    """A singular configuration that was reached without the momentum to choose a branch.
+
+    Attributes
+    ----------
+    start, end
+        Time (s) at which the motion came so close, and left or ended.
+    distance
+        Smallest distance to the singular configuration (rad, scene diagonals).
+    stopped
+        Whether the run ended there because it could not go on.
+    """
+
+    start: float
+    end: float
+    distance: float
+    stopped: bool
+    _passage: Crossing = field(repr=False, compare=False)
+
+    @property
+    def configuration(self) -> FloatArray | None:
+        """The singular configuration (nq,)."""
+        return self._passage.configuration
+
+    @property
+    def loops(self) -> tuple[str, ...]:
+        """Names of the loops whose rows lose rank there."""
+        return self._passage.loops
+
+    @property
+    def branches(self) -> FloatArray:
+        """Velocity directions (k, nv) of the branches that meet there; see
+        :attr:`~srm_mbs.stepping.crossings.Crossing.branches`."""
+        return self._passage.branches
+
+    @property
+    def kept(self) -> int | None:
+        """Index in ``branches`` of the branch that the run came along and kept; None if it cannot
+        be told."""
+        return self._passage.arrived_on
+
+    def __str__(self) -> str:
+        loops = ", ".join(map(repr, self.loops))
+        span = f"From t = {self.start:.6g} to {self.end:.6g} s the motion stayed"
+        moment = f"At t = {self.start:.6g} s the motion turned back"
+        kept = "" if self.kept is None else f", number {self.kept}"
+        did = "stopped there" if self.stopped else f"kept the one it came along{kept}"
+        return (
+            f"{span if self.end > self.start else moment} next to a singular configuration of the "
+            f"closures (loops {loops}) without the momentum to choose one of the "
+            f"{len(self.branches)} branches that meet there: the run {did} (solution.bifurcations)"
+        )
+
+
+def _turns_back(nq: int, steps: StepData, unit: FloatArray) -> set[int]:
+    """Indices of the steps next to a singular configuration in which the motion reverses."""
+    v = steps.states[:, nq:] / unit
+    reverses = (v[:-1] * v[1:]).sum(axis=1) <= 0.0
+    close = steps.sigmas.min(axis=1) < LOOKED_AT
+    return set(np.flatnonzero(reverses & close).tolist())
+
+
+def _ranges(marked: list[int], steps: StepData) -> list[tuple[int, int]]:
+    """First and last of the ``marked`` steps between which the motion does not get away."""
+    out: list[tuple[int, int]] = []
+    for i in marked:
+        if out and steps.sigmas[out[-1][1] : i + 1].max() < LOOKED_AT:
+            out[-1] = (out[-1][0], i)
+        else:
+            out.append((i, i))
+    return out
+
+
+def find_bifurcations(
+    system: OpenSystem | ClosedSystem,
+    steps: StepData,
+    dense: DenseOutput,
+    rtol: float,
+    failed: bool,
+) -> tuple[Bifurcation, ...]:
+    """The singular configurations that a run reached without momentum, in order of time.
+
+    Parameters
+    ----------
+    failed
+        Whether the run could not go on from its last state.
+    """
+    if not isinstance(system, ClosedSystem) or not steps.count:
+        return ()
+    held = set(np.flatnonzero(steps.held).tolist())
+    turning = _turns_back(system.nq, steps, system.mechanism.structure.units.coordinate)
+    last = steps.count - 1
+    stops = failed and steps.sigmas[last].min() < LOOKED_AT
+    marked = sorted(held | turning | ({last} if stops else set()))
+    watched = Watched(system, dense)
+    found = []
+    for first, final in _ranges(marked, steps):
+        t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
+        states = watched.states(t)
+        sigma = watched.smallest(t)
+        k = int(np.argmin(sigma))
+        singular = nearest_singular(watched.geometry, states[k][0], watched.rank, WITHIN)
+        if singular is None:
+            continue
+        distance = float(np.linalg.norm(watched.geometry.difference(singular, states[k][0])))
+        stayed = final > first or first in held
+        stopped = bool(stops and final == last)
+        if not (stayed or stopped or distance < UNDECIDED * rtol):
+            continue
+        begin, end = (float(t[0]), float(t[-1])) if stayed else (float(t[k]), float(t[k]))
+        # The way it came is told from where the motion was faster.
+        passage = passage_at(watched, steps, begin, float(t[-1] - t[0]) / (final + 1 - first))
+        found.append(Bifurcation(begin, end, distance, stopped, passage))
+    return tuple(found)

@@ -140,9 +140,15 @@ class StepResult:
         |x| of the error weights at the end.
     sweeps
         For methods with sweeps: where each one stands at the end.
+    drift_ratio
+        For methods with sweeps and an embedded pair: constraint error that the last sweep has left
+        at the end, over tolerance; else 0.
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
+    gap
+        Largest closure error before the correction, in row units, rows that are not in use
+        included.
     held
         Whether a stage lingered next to a singular configuration and was held on its branch.
     normals
@@ -163,7 +169,9 @@ class StepResult:
     multiplier: FloatArray | None
     magnitude: FloatArray
     sweeps: tuple[SweepNode, ...] = ()
+    drift_ratio: float = 0.0
     placement: str = ""
+    gap: float = 0.0
     held: bool = False
     normals: FloatArray | None = None
 

@@ -13,14 +13,20 @@ keeps its order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import ErrorNorm, Memory
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.zone import ZONE_FLOOR, zone_from
 from srm_mbs.systems.base import System, Terms, Zone
 
+WATCHED = 0.05
+"""sigma below which, or within NEAR steps of which, a step looks out for singular
+configurations."""
 NEAR = 3.0
 """Only stages with sigma below NEAR |d sigma / dt| h are looked at."""
 PROJECTIONS = 4
@@ -44,11 +50,15 @@ class BranchStages:
         Error norm and weights of the step.
     sigma_change
         |d sigma / dt| h, of the last steps.
-    zone
-        The zone of the step.
+    history
+        What the zone of the step predicts from; None for sweeps that need no zone.
+    end
+        End of the step (s).
 
     Attributes
     ----------
+    zone
+        The zone of the step.
     projected
         Whether any stage was moved.
     """
@@ -59,8 +69,18 @@ class BranchStages:
     weights: FloatArray
     h: float
     sigma_change: float
-    zone: Zone | None
+    history: MultiplierHistory | None
+    end: float
+    zone: Zone | None = field(init=False)
     projected: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        threshold = ZONE_FLOOR
+        if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
+            threshold = self.known_from(ZONE_FLOOR)
+        self.zone = zone_from(self.history, threshold, self.end)
+        if self.zone is not None and threshold < ZONE_FLOOR and self.lingers(threshold):
+            self.zone = replace(self.zone, predict=lambda _: None)
 
     def __call__(
         self, terms: Terms, t: float, c: float, x: FloatArray
@@ -120,6 +140,19 @@ class BranchStages:
         if part.start:
             error[part] = change / (self.h * sigma) * error[: part.start]
         return self._turning(error, sigma, change)
+
+    def widened(
+        self, weights: FloatArray, scheme: ButcherTableau, sigmas: FloatArray
+    ) -> FloatArray:
+        """``weights`` (n,) and what rounding does to the error estimate of a step of ``scheme``
+        with ``sigmas`` (s + 1,) at its stages."""
+        # Below the threshold of the zone nothing is solved for directly.
+        lowest = max(float(sigmas[1:].min()), 0.0 if self.zone is None else self.zone.threshold)
+        if scheme.error is None or not 0.0 < lowest < NEAR * self.sigma_change:
+            return weights
+        noise = self.rounding(lowest, self.sigma_change, self.projected)
+        wide: FloatArray = weights + np.abs(scheme.error).max() * noise
+        return wide
 
     def lingers(self, threshold: float) -> bool:
         """Whether the motion is so slow that holding it tangential to the normals of the last node,

@@ -16,21 +16,15 @@ many evaluations as the tableau has stages, and a few more next to singular conf
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
-from srm_mbs.methods.branch import NEAR, BranchStages
+from srm_mbs.methods.branch import WATCHED, BranchStages
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE, ZONE_FLOOR, zone_from
+from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE
 from srm_mbs.systems.base import System
-
-WATCHED = 0.05
-"""sigma below which, or within NEAR steps of which, a step looks out for singular
-configurations."""
 
 
 def split_start(system: System, t: float, state: FloatArray) -> Memory:
@@ -66,13 +60,8 @@ def split_step(
     zone = None
     if history is not None:
         weights = norm.weights(memory.magnitude)
-        branch = BranchStages(system, memory, norm, weights, h, sigma_change, None)
-        near = memory.sigma < WATCHED + NEAR * sigma_change
-        threshold = branch.known_from(ZONE_FLOOR) if near else ZONE_FLOOR
-        zone = zone_from(history, threshold, t + h)
-        if near and zone is not None and branch.lingers(threshold):
-            zone = replace(zone, predict=lambda _: None)
-        branch.zone = zone
+        branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
+        zone = branch.zone
     rates = np.empty((s + 1, system.tangent_size))
     sigmas = np.full(s + 1, memory.sigma)
     rates[0] = memory.rate
@@ -120,10 +109,7 @@ def split_step(
                     if j < s:
                         uncertainty = history.uncertainty(t + c[j] * h)
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
-            lowest = float(sigmas[1:].min())
-            if 0.0 < lowest < NEAR * sigma_change:
-                noise = branch.rounding(lowest, sigma_change, branch.projected)
-                weights = weights + np.abs(scheme.error).max() * noise
+            weights = branch.widened(weights, scheme, sigmas)
         error_ratio = norm(error, weights)
     return StepResult(
         t=t,
@@ -139,6 +125,7 @@ def split_step(
         history=history if weak_stages else None,
         multiplier=multiplier,
         magnitude=magnitude,
+        gap=0.0 if history is None else terms.gap(),
         held=held,
         normals=normals,
     )

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 NODES = (4, 6, 8)
 """Numbers of ends of steps: polynomials of degree 7, 11 and 15."""
+SPACING = 0.1
+"""Smallest distance of the ends of steps that are used, over the length of the step: closer ones
+would magnify their rounding."""
 CLOSE = 1.0
 """A step is close to a singular configuration if its smallest sigma is below CLOSE times the change
 of sigma over a step."""
@@ -55,16 +58,32 @@ class HermiteStep:
         changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
         self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
 
+    def _nodes(self, count: int) -> list[int]:
+        """Indices of up to ``count`` ends of steps around the step, none too close together."""
+        times, near = self._steps.times, SPACING * self._h
+        before, after = [self._step], [self._step + 1]
+        i, j = self._step - 1, self._step + 2
+        while len(before) + len(after) < count and (i >= 0 or j < len(times)):
+            left = i >= 0 and (j >= len(times) or len(before) <= len(after))
+            if left:
+                if times[before[-1]] - times[i] >= near:
+                    before.append(i)
+                i -= 1
+            else:
+                if times[j] - times[after[-1]] >= near:
+                    after.append(j)
+                j += 1
+        return sorted(before + after)
+
     def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
         last = steps.count
-        first = max(0, min(self._step + 1 - count // 2, last + 1 - count))
         t0 = steps.times[self._step]
         points: list[float] = []
         values: list[FloatArray] = []
-        for i in range(first, min(first + count, last + 1)):
+        for i in self._nodes(count):
             delta = self._system.difference(self._start, steps.states[i])
             rate = steps.rates[i, 0] if i < last else steps.end_rate
             points += 2 * [(steps.times[i] - t0) / self._h]

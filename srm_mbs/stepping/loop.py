@@ -22,8 +22,15 @@ SMALLEST_STEP = 1e-14
 """Steps shorter than this fraction of the run, or than round-off of t, end it."""
 
 
+WATCHED_STEPS = 5000
+STANDSTILL = 1e-6
+"""A run that covers less than this part of itself in WATCHED_STEPS steps would need more than
+5e9 of them."""
 LARGE_CORRECTION = 1e-3
 """Below this an end correction closes the loops to its square: nothing to look at."""
+OPEN = 1e-9
+"""Closure error before a correction, in row units, from which it is looked at whether the correction
+closes it."""
 LOST = 1e-2
 """Closure error after the correction, in row units, from which a run is meaningless."""
 
@@ -115,6 +122,7 @@ def integrate(
     record = RunRecord(t0, state.copy())
     smallest = SMALLEST_STEP * abs(t_end - t0)
     started = time.perf_counter()
+    closures = _Closures(system, norm)
     t, x = t0, state
     trouble = ""
     redone = False
@@ -126,7 +134,17 @@ def integrate(
             proposal = control.propose(t, limit, memory)
             h = proposal.h
             if not h > max(smallest, 4.0 * np.spacing(abs(t))):
+                if not (record.attempts and record.attempts[-1].t == t):
+                    trouble = "a step this short is below the round-off of the time"
                 _fail(record, t, h, memory, trouble, control.adaptive)
+                break
+            if len(record.times) % WATCHED_STEPS == 0 and _stands_still(record, t, t_end):
+                covered = t - record.times[-WATCHED_STEPS]
+                reason = (
+                    f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; what acts on the "
+                    "mechanism changes too fast or is not smooth"
+                )
+                _fail(record, t, h, memory, reason, control.adaptive)
                 break
             result: StepResult | None
             try:
@@ -145,8 +163,8 @@ def integrate(
                     break
                 continue
             trouble = ""
-            if _closures_lost(system, norm, result):
-                reason = "the step is so long that the loops come apart"
+            reason = closures.trouble(result)
+            if reason:
                 _fail(record, t, h, memory, reason, control.adaptive)
                 break
             result.placement = placement
@@ -159,7 +177,7 @@ def integrate(
                 record.status, record.stop, record.message = "event", stop.time, stop.message
                 break
             if tick is not None:
-                tick(t, h, x)
+                _tell(tick, t, h, x)
         else:
             record.status = "finished"
             record.message = f"The run reached t = {t_end:.6g} s."
@@ -177,13 +195,48 @@ def integrate(
     return record
 
 
-def _closures_lost(system: System, norm: ErrorNorm, result: StepResult) -> bool:
-    """Whether the end correction was too large to close the loops again."""
-    # atol over rtol is the size that the tolerances call "one", whatever the unit of length.
-    large = LARGE_CORRECTION * norm.one
-    if not result.correction.size or (np.abs(result.correction) < large).all():
+def _stands_still(record: RunRecord, t: float, t_end: float) -> bool:
+    """Whether the last steps covered so little that the run would never end."""
+    if len(record.times) < WATCHED_STEPS:
         return False
-    return not system.closure_gap(result.t + result.h, result.state) < LOST
+    return t - record.times[-WATCHED_STEPS] < STANDSTILL * (t_end - record.t0)
+
+
+def _tell(tick: Tick, t: float, h: float, x: FloatArray) -> None:
+    """Call ``tick``; what it raises must not lose the run."""
+    try:
+        tick(t, h, x)
+    except Exception as error:
+        raise ControllerError(f"the progress callback raised {error!r} at t = {t:.6g} s") from error
+
+
+class _Closures:
+    """Looks at whether the loops stay closed; almost always without computing anything."""
+
+    def __init__(self, system: System, norm: ErrorNorm) -> None:
+        self._system = system
+        self._large = LARGE_CORRECTION * norm.one
+        self._seen = OPEN
+
+    def trouble(self, result: StepResult) -> str:
+        """What is wrong with the closures at the end of a step; empty if nothing is."""
+        if not result.correction.size:
+            return ""
+        large = not (np.abs(result.correction) < self._large).all() or not result.gap < LOST
+        # With every structural row in use the correction closes all rows, or the rank is wrong.
+        unused = result.zone is None and result.gap > 2.0 * self._seen
+        if not (large or unused):
+            return ""
+        gap = self._system.closure_gap(result.t + result.h, result.state)
+        if not gap < LOST:
+            return "the step is so long that the loops come apart"
+        if unused and gap > 0.5 * result.gap:
+            return (
+                "closures that seemed to follow from the others open: no motion was found that "
+                "keeps all loops closed, the mechanism is locked there"
+            )
+        self._seen = max(self._seen, result.gap)
+        return ""
 
 
 def _fail(

@@ -121,6 +121,8 @@ class SingularityPlacement:
         return proposal
 
     def _placed(self, distance: float, h: float, t: float) -> float:
+        if t + h >= self._t_end and self._gaps.ends_on(distance, h):
+            return h  # the run ends there
         if self.adaptive:
             return self._gaps.longest_step(distance, h)
         # A fixed step may cross its grid point where that is singular: it could only creep up.
@@ -129,10 +131,14 @@ class SingularityPlacement:
         over = self._gaps.step_over(distance)
         return over if t + over <= self._t_end else h
 
-    def _better_step(self, h: float, sigmas: FloatArray) -> float | None:
-        """A better step length if a stage or the end came too close, else None."""
+    def _better_step(self, h: float, sigmas: FloatArray, last: bool) -> float | None:
+        """A better step length if a stage or the end came too close, else None.
+
+        ``last``: the run ends with this step, wherever that is.
+        """
         c = self._abscissae
-        lowest = float(sigmas[1:].min())
+        movable = (c > 0.0) & (c < 1.0) if last else c > 0.0
+        lowest = float(sigmas[movable].min(initial=np.inf))
         reach = max(self._slope, sigma_slope(c, sigmas, h)) * h
         if not (lowest < TOO_CLOSE * reach and lowest < 0.5 * sigmas[0]):
             return None
@@ -145,7 +151,7 @@ class SingularityPlacement:
         """Redo a badly placed step; otherwise the inner control's verdict."""
         h = proposal.h
         if result is not None and self._redone < MAX_REDONE:
-            better = self._better_step(h, result.sigmas)
+            better = self._better_step(h, result.sigmas, proposal.t_new >= self._t_end)
             if better is not None and 0.0 < better < h:
                 self._redo = better
                 self._redone += 1

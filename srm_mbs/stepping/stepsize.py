@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
 from srm_mbs.systems.base import System
 
@@ -22,6 +23,8 @@ PROPORTIONAL, INTEGRAL = 0.4, 0.7
 """h_new = h 0.9 xi^(-0.7/k) xi_old^(0.4/k): PI control after Gustafsson."""
 XI_OLD_FLOOR = 1e-4
 XI_FLOOR = 1e-10
+OVERFLOW = 1e100
+"""Size of a rate from which its products may overflow."""
 FAILED_EVALUATION = 1e6
 """Error ratio of a step whose stages could not be evaluated or are not finite."""
 
@@ -167,6 +170,8 @@ def initial_step(
     weights = norm.weights(memory.magnitude)
     # |x| itself may vanish; atol over rtol is the size that the tolerances call "one".
     d0 = norm(np.maximum(memory.magnitude, norm.one), weights)
+    if not np.abs(memory.rate).max() < OVERFLOW:
+        raise EvaluationError("the rates at the start overflow: an input is far too large")
     d1 = norm(memory.rate, weights)
     if not d1 > 0.0:
         return 0.01 * span

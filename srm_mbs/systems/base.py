@@ -70,6 +70,9 @@ class Terms(Protocol):
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nv,): the M-orthogonal projection of w on the constraint normals."""
 
+    def gap(self) -> float:
+        """Largest |g|, of all rows, in row units; 0 where there are none."""
+
     def correction(self) -> FloatArray:
         """(E g, E c) (2 nv,): what to subtract from the state to satisfy g = 0 and c = 0."""
 

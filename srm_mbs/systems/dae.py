@@ -98,6 +98,9 @@ class _DaeTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return self._p.project(w)
 
+    def gap(self) -> float:
+        return 0.0
+
     def correction(self) -> FloatArray:
         return self._p.lift(self._residual())
 

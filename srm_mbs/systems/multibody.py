@@ -189,6 +189,9 @@ class _OpenTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return np.zeros(self._nv)
 
+    def gap(self) -> float:
+        return 0.0
+
     def correction(self) -> FloatArray:
         return np.zeros(2 * self._nv)
 
@@ -232,9 +235,12 @@ class OpenSystem(_Mechanics):
 class _ClosedTerms:
     """Terms of one stage of a closed-loop mechanism."""
 
-    def __init__(self, projection: Projection, loops: LoopKinematics) -> None:
+    def __init__(
+        self, projection: Projection, loops: LoopKinematics, gap_scale: FloatArray
+    ) -> None:
         self._p = projection
         self._loops = loops
+        self._gap_scale = gap_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
 
@@ -285,6 +291,9 @@ class _ClosedTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return self._p.project(w)
 
+    def gap(self) -> float:
+        return float(np.abs(self._loops.g * self._gap_scale).max())
+
     def correction(self) -> FloatArray:
         p = self._p
         nv = self.v.size
@@ -319,7 +328,7 @@ class ClosedSystem(_Mechanics):
         unit = row_units(mechanism.loops, structure.units.length)
         self._gap_scale = (structure.row_scale / unit)[structure.kept]
         self.projection = Projection(structure.rank, structure.sigma_ref)
-        self._terms = _ClosedTerms(self.projection, self.loops)
+        self._terms = _ClosedTerms(self.projection, self.loops, self._gap_scale)
 
     @property
     def factorisations(self) -> int:

@@ -147,8 +147,8 @@ class StepResult:
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
     gap
-        Largest closure error before the correction, in row units, rows that are not in use
-        included.
+        Largest closure error before a full correction, in row units, rows that are not in use
+        included; 0 if the correction is partial.
     held
         Whether a stage lingered next to a singular configuration and was held on its branch.
     normals

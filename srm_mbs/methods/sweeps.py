@@ -15,6 +15,7 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
+from srm_mbs.methods.branch import BranchStages
 from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.methods.tableaus import get_tableau
 from srm_mbs.systems.base import System, Terms, Zone
@@ -160,6 +161,10 @@ class Sweep:
         Nodes with dropped rows.
     exact
         yhat by the exact prediction at the end point if it was asked for, else None.
+    off : (n,) or None
+        How far the end point lies off the closures, (E g, E c), if it was asked for.
+    off_before : (n,) or None
+        The same at the start of the step, where it is known.
     """
 
     start: FloatArray
@@ -171,6 +176,47 @@ class Sweep:
     rank: int
     weak: tuple[int, ...]
     exact: FloatArray | None
+    off: FloatArray | None
+    off_before: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class OnBranch:
+    """Evaluates a sweep next to a singular configuration: its algebra on the branch.
+
+    A sweep lies off the closures by its drift and the error of its stage.  M, f, P and E are taken
+    at the projection on the branch, from which (dq, dv) was subtracted; the terms in 1/eps are the
+    sweep's own: E g/eps = dq/eps and P v/eps = dv/eps to first order (dx/eps for a DAE).
+
+    Attributes
+    ----------
+    stages
+        Of the step.
+    eps
+        Regularisation (s); None for a sweep without terms in 1/eps.
+    """
+
+    stages: BranchStages
+    eps: float | None
+
+    def __call__(
+        self, terms: Terms, t: float, c: float, x: FloatArray, j: int, answer: Answer
+    ) -> tuple[Terms, FloatArray, FloatArray, FloatArray | None]:
+        """Terms of the stage ``x`` with abscissa ``c``, its tangent rate, its multiplier, and what
+        was subtracted, if anything."""
+        terms, _, moved = self.stages(terms, t, c, x)
+        return terms, *self.with_own_terms(*answer(terms, j), moved), moved
+
+    def with_own_terms(
+        self, rate: FloatArray, multiplier: FloatArray, moved: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """``rate`` and ``multiplier`` on the branch, with the sweep's own terms of a stage that
+        was ``moved`` to it."""
+        if moved is None or self.eps is None:
+            return rate, multiplier
+        system = self.stages.system
+        rate = rate + system.rate_change(moved) - moved / self.eps
+        return rate, multiplier + moved[system.multiplier_part] / self.eps
 
 
 def sweep_over(
@@ -182,8 +228,10 @@ def sweep_over(
     answer: Answer,
     start: Start | None = None,
     zone: Zone | None = None,
+    near: OnBranch | None = None,
     *,
     exact: bool = False,
+    off: bool = False,
 ) -> Sweep:
     """Integrate one sweep's equation from ``state`` at ``t`` over ``h``.
 
@@ -193,8 +241,12 @@ def sweep_over(
         The equation.
     start
         The first stage, if it is known; evaluated otherwise.
+    near
+        How stages next to a singular configuration are evaluated; by default like all others.
     exact
         Keep yhat by the exact prediction at the end point.
+    off
+        Keep how far the end point lies off the closures.
 
     Raises
     ------
@@ -213,23 +265,42 @@ def sweep_over(
     rates[0], multipliers[0], sigmas[0] = start.rate, start.multiplier, start.sigma
     rank = start.rank
     weak = [0] if start.weak else []
-    end_state, end_rate, end_exact = state, start.rate, None
+    end_state, end_rate = state, start.rate
+    end_exact: FloatArray | None = None
+    end_off: FloatArray | None = None
     for j in range(1, n):
         delta = (h * nodes.A[j, :j]) @ rates[:j]
         x = system.retract(state, delta)
-        terms = system.evaluate(t + nodes.c[j] * h, x, zone)
-        rate, multipliers[j] = answer(terms, j)
+        c = float(nodes.c[j])
+        terms = system.evaluate(t + c * h, x, zone)
+        if j <= s:
+            sigmas[j] = terms.sigma
+        moved: FloatArray | None = None
+        if near is not None and c > 0.0:
+            terms, rate, multipliers[j], moved = near(terms, t + c * h, c, x, j, answer)
+        else:
+            rate, multipliers[j] = answer(terms, j)
         rates[j] = system.chart_rate(delta, rate)
         rank = min(rank, terms.rank)
         if terms.weak:
             weak.append(j)
-        if j <= s:
-            sigmas[j] = terms.sigma
         if j == s:
             end_state, end_rate = x, rate.copy()
-            end_exact = terms.multiplier().copy() if exact and not terms.weak else None
+            if exact and not terms.weak:
+                end_exact = terms.multiplier().copy()
+            if off:
+                end_off = terms.correction() + (0.0 if moved is None else moved)
     return Sweep(
-        state, end_state, rates, multipliers, end_rate, sigmas, rank, tuple(weak), end_exact
+        state,
+        end_state,
+        rates,
+        multipliers,
+        end_rate,
+        sigmas,
+        rank,
+        tuple(weak),
+        end_exact,
+        end_off,
     )
 
 
@@ -242,6 +313,7 @@ def multipliers_between(
     sweep: Sweep,
     answer: Answer,
     zone: Zone | None = None,
+    near: OnBranch | None = None,
 ) -> FloatArray:
     """The multiplier of ``sweep`` at all nodes (s + 1 + e, k), for the next sweep.
 
@@ -264,7 +336,11 @@ def multipliers_between(
             continue
         weights = how.weights(theta)[0]
         delta = (h * weights) @ sweep.rates[: how.n_rates]
-        terms = system.evaluate(t + theta * h, system.retract(sweep.start, delta), zone)
-        out[j] = answer(terms, j)[1]
+        x = system.retract(sweep.start, delta)
+        terms = system.evaluate(t + theta * h, x, zone)
+        if near is not None:
+            out[j] = near(terms, t + theta * h, theta, x, j, answer)[2]
+        else:
+            out[j] = answer(terms, j)[1]
         done[theta] = j
     return out

@@ -50,8 +50,8 @@ def check(name: str, tableau: str, tolerances: list[float]) -> None:
     what = f"{name}, {tableau}: " + " ".join(f"{error:.1e}" for error in found)
     for looser, tighter in pairwise(found):
         assert tighter <= max(2.0 * looser, floor), what
-    lowest = np.flatnonzero(found < floor / 10.0)
-    used = slice(0, int(lowest[0]) + 1 if len(lowest) else None)
+    low = np.flatnonzero(found < floor)
+    used = slice(0, int(low[0]) + 1 if len(low) else None)
     slope = np.polyfit(np.log(tolerances[used]), np.log(found[used]), 1)[0]
     assert slope >= 0.8, f"{what}: slope {slope:.2f}"
 

@@ -27,8 +27,8 @@ from srm_mbs.systems.base import System, Terms, Zone
 WATCHED = 0.05
 """sigma below which, or within NEAR steps of which, a step looks out for singular
 configurations."""
-NEAR = 3.0
-"""Only stages with sigma below NEAR |d sigma / dt| h are looked at."""
+NEAR = 4.0
+"""Steps that start with sigma below NEAR |d sigma / dt| h are looked at."""
 PROJECTIONS = 4
 """Newton steps at most; the error squares each time."""
 AMBIGUOUS = 0.1
@@ -57,6 +57,8 @@ class BranchStages:
 
     Attributes
     ----------
+    near
+        Whether the step is next to a singular configuration.
     zone
         The zone of the step.
     projected
@@ -71,10 +73,14 @@ class BranchStages:
     sigma_change: float
     history: MultiplierHistory | None
     end: float
+    near: bool = field(init=False)
     zone: Zone | None = field(init=False)
     projected: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
+        # All stages of a step or none: a mixture of both loses the order.
+        reach = NEAR * self.sigma_change if self.sigma_change > 0.0 else WATCHED
+        self.near = self.memory.sigma < reach
         threshold = ZONE_FLOOR
         if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
             threshold = self.known_from(ZONE_FLOOR)
@@ -102,7 +108,7 @@ class BranchStages:
         change = max(self.sigma_change, abs(terms.sigma - self.memory.sigma) / c)
         for _ in range(PROJECTIONS):
             sigma = terms.sigma
-            if terms.weak or not 0.0 < sigma < NEAR * change:
+            if terms.weak or not sigma > 0.0 or not self.near:
                 break
             error = terms.correction()
             if self.system.size(error) > AMBIGUOUS * sigma:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.options import (
     checked_method,
+    checked_placement,
     checked_rtol,
+    checked_singular_times,
     checked_times,
     numbers,
     positive,
@@ -23,14 +26,27 @@ from srm_mbs.progress import progress_of
 from srm_mbs.semi_explicit import SemiExplicitDAE
 from srm_mbs.solution import Statistics
 from srm_mbs.stepping.dense import DenseOutput, StepData, step_data
+from srm_mbs.stepping.events import EventWatch, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
-from srm_mbs.stepping.placement import SingularityPlacement
+from srm_mbs.stepping.rate_guard import RateGuard
+from srm_mbs.stepping.remarks import drift, turns
+from srm_mbs.stepping.singular_times import Placing, placed
 from srm_mbs.stepping.stepsize import Verdict, initial_step
 from srm_mbs.systems.dae import DaeSystem
 from srm_mbs.systems.interpolation import lagrange_weights
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""
+MENDED = (
+    'Try a smaller rtol or step, restarted sweeps with T = "inverse" (restart=True, carry=True), '
+    "or PSRM in its split form."
+)
+"""What to do about a passage that may have changed the branch."""
+UNSTABLE = (
+    " Sweeps with T = I or (GB)^T are stable only while h |G B T|/eps is about 1 or less: try "
+    'T = "inverse", or a larger eps.'
+)
+"""Added to the message of such a run that cannot go on."""
 SINGULAR_START = 1e-5
 """sigma below which a start is refused: round-off in x, over sigma, is an error of x'."""
 MULTIPLIER_POINTS = 5
@@ -48,7 +64,11 @@ class DaeSolution:
         States and multipliers there.  y is that of the last sweep; for the split form, which has
         no sweep, the exact one at x.
     status, message, success
-        ``finished``, ``failed`` or ``interrupted``; when and why; whether the end was reached.
+        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``; when and why;
+        whether it is one of the first two.
+    t_events, x_events
+        For each event in turn the times (k,) and states (k, nx) of its occurrences; None if no
+        events were given.
     stats
         :class:`~srm_mbs.solution.Statistics`.
     steps
@@ -63,6 +83,7 @@ class DaeSolution:
         carried: Sequence[FloatArray],
         *,
         t_eval: FloatArray | None,
+        events: tuple[list[FloatArray], list[FloatArray]] | None,
         status: str,
         message: str,
         stats: Statistics,
@@ -70,7 +91,11 @@ class DaeSolution:
         self.steps = steps
         self.status = status
         self.message = message
-        self.success = status == "finished"
+        self.success = status in ("finished", "event")
+        self.t_events: list[FloatArray] | None = None
+        self.x_events: list[FloatArray] | None = None
+        if events is not None:
+            self.t_events, self.x_events = events
         self.stats = stats
         self._system = system
         self._dense = DenseOutput(system, method.scheme, steps)
@@ -82,11 +107,14 @@ class DaeSolution:
             self._nodes = np.array(
                 [system.uncarried(*node) for node in zip(steps.times, steps.states, carried)]
             )
-        self.t = steps.times if t_eval is None else t_eval[t_eval <= steps.times[-1]]
         if t_eval is None:
-            self.x = steps.states
-            self.y = self._multipliers(self.t, self.x) if self._nodes is None else self._nodes
+            self.t, self.x = self._dense.nodes()
+            if self._nodes is not None and steps.stop is None:
+                self.y = self._nodes
+            else:
+                self.y = self._multipliers(self.t, self.x)
         else:
+            self.t = t_eval[t_eval <= steps.end]
             self.x, self.y = self._at(self.t)
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
@@ -123,6 +151,21 @@ class DaeSolution:
             weights = lagrange_weights(nodes[near][:width], t)
             out[k] = weights @ known[near][:width]
         return out
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write t, x and y as a table of comma-separated values, one row per time ``t``.
+
+        Parameters
+        ----------
+        path
+            File name; ``.csv`` is usual and is not added.
+        """
+        from srm_mbs.export import write_table
+
+        columns = {"t": self.t}
+        for name, values in (("x", self.x), ("y", self.y)):
+            columns |= {f"{name}[{i}]": column for i, column in enumerate(values.T)}
+        write_table(columns, Path(path))
 
     def __repr__(self) -> str:
         return (
@@ -188,6 +231,9 @@ def solve_dae(
     first_step: float | None = None,
     max_step: float | None = None,
     t_eval: Any = None,
+    events: Any = None,
+    placement: str = "automatic",
+    singular_times: Any = (),
     progress: bool | Tick = False,
     raise_on_failure: bool = False,
 ) -> DaeSolution:
@@ -206,10 +252,12 @@ def solve_dae(
         Initial state, with g(t0, x0) = 0.
     method
         ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
-        (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Where G B has isolated
-        singularities use the split form.  Restarted sweeps with T = (GB)^-1 pass them too, fused
-        and two-sweep forms at tolerances of 1e-8; sweeps with own histories, whose first one is
-        off the constraints by O(eps), may leave the singularity on another branch of g = 0.
+        (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of
+        G B are passed by the split form, and by all restarted sweeps with T = (GB)^-1: at a
+        tolerance of 1e-4 with errors below 2e-4, at 1e-6 below 2e-6 (``tests/test_dae.py``).
+        Sweeps with own histories, whose first one is off the constraints by O(eps), leave on
+        another branch of g = 0, however small the step; so do sweeps that carry y, which is not
+        bounded there.  The message says so: x' is compared across every passage.
     tableau
         Runge-Kutta scheme for a method given by name.
     rtol
@@ -222,6 +270,17 @@ def solve_dae(
         First and longest step of the step-size control.
     t_eval : (n,)
         Times at which the solution is given; by default the ends of the steps.
+    events
+        A function (t, x) -> float or a list of them; an event is where it passes zero.  As in
+        ``scipy.integrate.solve_ivp``, the attribute ``terminal`` of the function (a bool, or a
+        number of occurrences) ends the run there with status ``event``, and ``direction`` (> 0
+        or < 0) counts only zeros passed upwards or downwards
+        (:mod:`srm_mbs.stepping.events`).
+    placement
+        How steps are placed around singular points of G B: ``"automatic"``, ``"halved"`` (thesis,
+        2.4.1 (1)) or ``"off"``; as in :func:`srm_mbs.simulate`.
+    singular_times : (k,)
+        Times on which no stage or end of a step may lie (thesis, 2.4.1 (2)).
     progress
         True for a progress bar (on a terminal only), or a callable (t, h, x).
     raise_on_failure
@@ -253,6 +312,8 @@ def solve_dae(
     method = checked_method(method, tableau)
     rtol = checked_rtol(rtol)
     times = checked_times(t_eval, t0, t_end)
+    placement = checked_placement(placement)
+    avoided = checked_singular_times(singular_times, t0, t_end)
     state = _start(x0)
     norm = ErrorNorm(
         _absolute_tolerance(atol, rtol, state.size), rtol, NEGLIGIBLE if step is None else 0.0
@@ -260,7 +321,12 @@ def solve_dae(
     system = DaeSystem(problem, t0, state, t_end, getattr(method, "T", "identity"))
     _check_start(system, method, t0, state)
 
-    placement: SingularityPlacement | None = None
+    watch: EventWatch | None = None
+    if events is not None:
+        prepared = prepare_events(events, lambda event: event)
+        watch = EventWatch(system, method.scheme, prepared, state.size)
+    wrappers: tuple[Placing, ...] = ()
+    with_sweeps = False
     carried: list[FloatArray] = []
     try:
         memory = method.start(system, t0, state, norm)
@@ -270,7 +336,8 @@ def solve_dae(
                 element="x0",
                 remedy="Start beside that point",
             )
-        if memory.sweeps:
+        with_sweeps = bool(memory.sweeps)
+        if with_sweeps:
             carried.append(memory.sweeps[-1].multiplier)
 
         def chosen_first_step() -> float:
@@ -280,12 +347,15 @@ def solve_dae(
             return initial_step(system, state, memory, norm, t_end - t0, order, t0)
 
         control = step_size_control(method.scheme, t0, t_end, step, chosen_first_step)
-        placement = SingularityPlacement(control, method.scheme)
+        control, wrappers = placed(control, method.scheme, placement, avoided, t_end, step)
+        if placement == "automatic":
+            guard = RateGuard(control, system)
+            control, wrappers = guard, (*wrappers, guard)
         with progress_of(progress, system, t_end) as tick:
             record = integrate(
                 system,
                 method,
-                placement,
+                control,
                 norm,
                 memory,
                 state,
@@ -293,17 +363,22 @@ def solve_dae(
                 t_end,
                 max_step=np.inf if max_step is None else max_step,
                 tick=tick,
+                events=watch,
             )
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = {t0:.6g}: {error}."
     carried += [result.sweeps[-1].multiplier for result in record.steps if result.sweeps]
-    data = step_data(t0, state, record.times, record.steps, method.scheme, system.tangent_size)
+    if record.status == "failed" and with_sweeps and not system.carries_yhat:
+        record.message += UNSTABLE
+    data = step_data(
+        t0, state, record.times, record.steps, method.scheme, system.tangent_size, record.stop
+    )
     stats = Statistics(
         steps=data.count,
         rejected=sum(a.verdict is Verdict.REJECTED for a in record.attempts),
-        placements=0 if placement is None else placement.placed,
-        replaced=0 if placement is None else placement.replaced,
+        placements=sum(wrapper.placed for wrapper in wrappers),
+        replaced=sum(wrapper.replaced for wrapper in wrappers),
         zone_steps=len(data.zones),
         evaluations=system.evaluations,
         factorisations=system.factorisations,
@@ -315,8 +390,9 @@ def solve_dae(
         data,
         carried,
         t_eval=times,
+        events=None if watch is None else watch.found(),
         status=record.status,
-        message=record.message,
+        message=record.message + turns(wrappers, "x' turned", MENDED) + drift(record.steps, norm),
         stats=stats,
     )
     if raise_on_failure and not solution.success:

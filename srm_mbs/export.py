@@ -48,6 +48,17 @@ def write_csv(solution: Solution, path: Path) -> None:
     # A state that runs away overflows in its drift and energy: "inf" or "nan" is written.
     with np.errstate(over="ignore", invalid="ignore"):
         columns = _columns(solution)
+    write_table(columns, path)
+
+
+def write_table(columns: dict[str, FloatArray], path: Path) -> None:
+    """Write ``columns``, header -> values (n,), to ``path``.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)

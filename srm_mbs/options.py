@@ -16,11 +16,14 @@ from srm_mbs.methods.base import Method
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.psrm import PSRM
 from srm_mbs.methods.srm import SRM
+from srm_mbs.stepping.singular_times import PLACEMENTS
 from srm_mbs.stepping.stepsize import FixedStep, PIControl, StepSizeControl
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let a step jump to another branch at a change point."""
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
+AVOIDABLE = 1e-9
+"""Fraction of the run within which of its ends a given singular time cannot be avoided."""
 METHODS: dict[str, Callable[..., Method]] = {
     "psrm": PSRM,
     "srm": partial(SRM, restart=True, carry=True),
@@ -122,6 +125,38 @@ def checked_times(t_eval: Any, t0: float, t_end: float) -> FloatArray | None:
     if np.any(np.diff(times) <= 0.0):
         raise InputError("t_eval must increase", element="t_eval", remedy=remedy)
     return np.clip(times, t0, t_end)
+
+
+def checked_placement(placement: Any) -> str:
+    """One of the known placements around singular configurations."""
+    if placement not in PLACEMENTS:
+        raise InputError(
+            f"there is no placement {placement!r}",
+            element="placement",
+            remedy=f"Give one of {', '.join(repr(name) for name in PLACEMENTS)}",
+        )
+    return str(placement)
+
+
+def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> FloatArray:
+    """The given times within the run, in order."""
+    remedy = "Give times (s) between the start and the end of the run"
+    times = numbers(singular_times, "singular_times", remedy)
+    if times.ndim != 1:
+        raise InputError(
+            f"singular_times has shape {times.shape}", element="singular_times", remedy=remedy
+        )
+    times = np.unique(times)
+    slack = AVOIDABLE * (t_end - t0)
+    for end in (t0, t_end):
+        if np.any(np.abs(times - end) <= slack):
+            raise InputError(
+                f"the run starts or ends at {end:g} s, where a step must begin or end",
+                element="singular_times",
+                remedy=remedy,
+            )
+    inside: FloatArray = times[(times > t0) & (times < t_end)]
+    return inside
 
 
 def step_size_control(

@@ -20,7 +20,9 @@ from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.options import (
     checked_method,
+    checked_placement,
     checked_rtol,
+    checked_singular_times,
     checked_times,
     numbers,
     positive,
@@ -32,7 +34,8 @@ from srm_mbs.stepping.dense import DenseOutput, step_data
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
-from srm_mbs.stepping.singular_times import PLACEMENTS, Placing, placed
+from srm_mbs.stepping.remarks import drift, turns
+from srm_mbs.stepping.singular_times import Placing, placed
 from srm_mbs.stepping.starting import start
 from srm_mbs.stepping.stepsize import (
     StepSizeControl,
@@ -45,6 +48,8 @@ from srm_mbs.systems.units import row_units
 
 log = logging.getLogger(__name__)
 
+MENDED = "See solution.crossings; try a smaller rtol or step."
+"""What to do about a passage that may have changed the branch."""
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
 TOLD = 2
@@ -52,8 +57,6 @@ TOLD = 2
 BACKENDS = ("auto", "python")
 ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
-AVOIDABLE = 1e-9
-"""Fraction of the run within which of its ends a given singular time cannot be avoided."""
 
 
 def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
@@ -82,27 +85,6 @@ def _checked_method(method: str | Method, tableau: str | ButcherTableau | None) 
             remedy="Leave T out; it is for srm.solve_dae",
         )
     return checked
-
-
-def _checked_singular_times(singular_times: Any, t_end: float) -> FloatArray:
-    """The given times within the run, in order."""
-    remedy = "Give times (s) between the start and the end of the run"
-    times = numbers(singular_times, "singular_times", remedy)
-    if times.ndim != 1:
-        raise InputError(
-            f"singular_times has shape {times.shape}", element="singular_times", remedy=remedy
-        )
-    times = np.unique(times)
-    slack = AVOIDABLE * t_end
-    for end in (0.0, t_end):
-        if np.any(np.abs(times - end) <= slack):
-            raise InputError(
-                f"the run starts or ends at {end:g} s, where a step must begin or end",
-                element="singular_times",
-                remedy=remedy,
-            )
-    inside: FloatArray = times[(times > 0.0) & (times < t_end)]
-    return inside
 
 
 def _event_watch(
@@ -274,13 +256,8 @@ def simulate(
             element="backend",
             remedy=f"This version has {', '.join(BACKENDS)}; the compiled kernel is not built yet",
         )
-    if placement not in PLACEMENTS:
-        raise InputError(
-            f"there is no placement {placement!r}",
-            element="placement",
-            remedy=f"Give one of {', '.join(repr(name) for name in PLACEMENTS)}",
-        )
-    avoided = _checked_singular_times(singular_times, t_end)
+    placement = checked_placement(placement)
+    avoided = checked_singular_times(singular_times, 0.0, t_end)
     method = _checked_method(method, tableau)
     rtol = checked_rtol(rtol)
     times = checked_times(t_eval, 0.0, t_end)
@@ -333,7 +310,7 @@ def simulate(
         placement,
         tuple(avoided.tolist()),
     )
-    solution = _collect(mechanism, system, method, record, wrappers, watch, times, settings)
+    solution = _collect(mechanism, system, method, record, wrappers, watch, times, settings, norm)
     solution.message += _bifurcations(solution)
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)
@@ -349,6 +326,7 @@ def _collect(
     watch: EventWatch | None,
     t_eval: FloatArray | None,
     settings: Settings,
+    norm: ErrorNorm,
 ) -> Solution:
     """Arrays and statistics from a run record."""
     scheme = method.scheme
@@ -384,7 +362,8 @@ def _collect(
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message
-        + _turns(wrappers)
+        + turns(wrappers, "the velocity turned", MENDED)
+        + drift(record.steps, norm)
         + _limits_left(mechanism, DenseOutput(system, scheme, data)),
         stats=stats,
         settings=settings,
@@ -396,19 +375,6 @@ def _bifurcations(solution: Solution) -> str:
     found = solution.bifurcations
     more = f" There were {len(found)} of them." if len(found) > TOLD else ""
     return "".join(f" {bifurcation}." for bifurcation in found[:TOLD]) + more
-
-
-def _turns(wrappers: Sequence[Placing]) -> str:
-    """A sentence naming the times at which the motion may have changed its branch."""
-    times = [t for w in wrappers if isinstance(w, BranchGuard) for t in w.suspects]
-    if not times:
-        return ""
-    listed = ", ".join(f"{t:.6g}" for t in times[:5]) + (", ..." if len(times) > 5 else "")
-    return (
-        f" Next to singular configurations, up to t = {listed} s, the velocity turned and no "
-        "shorter step mended it: the motion may have changed its branch (solution.crossings). "
-        "Try a smaller rtol or step."
-    )
 
 
 def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:

@@ -148,6 +148,125 @@ def test_sweeps_that_carry_by_pass_an_isolated_singularity(method: Any, bound: f
     assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < bound
 
 
+@pytest.mark.parametrize(
+    ("method", "bounds"),
+    [
+        (srm.PSRM("tvd32", correction="sweep", T="inverse"), (2e-4, 2e-6)),
+        (srm.PSRM("dopr54", correction="sweep", T="inverse"), (2e-4, 2e-6)),
+        (srm.PSRM("dop853", correction="fused", T="inverse"), (1e-6, 1e-8)),
+        (srm.SRM("tvd32", 3, T="inverse", restart=True, carry=True), (2e-4, 2e-6)),
+    ],
+    ids=str,
+)
+def test_adaptive_sweeps_pass_an_isolated_singularity_and_follow_the_tolerance(
+    method: Any, bounds: tuple[float, float]
+) -> None:
+    for tol, bound in zip((1e-4, 1e-6), bounds):
+        solution = srm.solve_dae(
+            passing_singularity(), (0.0, 3.0), START_PASSING, method=method, rtol=tol, atol=tol
+        )
+        assert solution.success, solution.message
+        assert "turned" not in solution.message
+        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < bound
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.02}),
+        (srm.SRM("erk4", 4, T="inverse"), {"step": 0.01}),
+        (srm.SRM("dopr54", 5, T="inverse"), {"step": 0.02}),
+        (srm.SRM("tvd32", 3, T="inverse"), {"rtol": 1e-4, "atol": 1e-4}),
+        pytest.param(
+            srm.PSRM("dopr54", correction="sweep"),
+            {"rtol": 1e-4, "atol": 1e-4},
+            marks=pytest.mark.stress,
+        ),
+    ],
+    ids=str,
+)
+def test_a_wrong_branch_is_never_silent(method: Any, options: dict[str, Any]) -> None:
+    """Own histories, and sweeps that carry the unbounded y, do not pass: the message says it."""
+    solution = srm.solve_dae(
+        passing_singularity(), (0.0, 3.0), START_PASSING, method=method, **options
+    )
+    off = np.abs(solution.x[-1] - solution_passing(float(solution.t[-1]))).max()
+    assert off > 0.1, "this method passes now: say so in the docstring of solve_dae"
+    assert "x' turned" in solution.message
+
+
+def test_a_sharp_turn_away_from_singularities_is_not_reported() -> None:
+    """The same problem on a level g = c that passes beside the singular point."""
+    problem = passing_singularity()
+    moved = srm.SemiExplicitDAE(
+        f=problem.f, B=problem.B, G=problem.G, g=lambda t, x: problem.g(t, x) + 0.02
+    )
+    start = [-1.0, 0.52]
+    solution = srm.solve_dae(moved, (0.0, 3.0), start, rtol=1e-6, atol=1e-6)
+    assert solution.success
+    assert solution.steps.sigmas.min() < 0.2
+    assert "turned" not in solution.message
+
+
+def test_singular_times_and_placement_are_those_of_simulate() -> None:
+    passage = 4.0 / 3.0
+    for options in (
+        {"singular_times": [passage], "placement": "off"},
+        {"singular_times": [passage], "step": 0.04},
+        {"placement": "halved", "step": 0.04},
+    ):
+        solution = srm.solve_dae(
+            passing_singularity(), (0.0, 3.0), START_PASSING, tableau="dopr54", **options
+        )
+        assert solution.success, solution.message
+        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < 1e-5
+        h = np.diff(solution.steps.times)
+        if "singular_times" in options:
+            stages = solution.steps.times[:-1, None] + h[:, None] * srm.TABLEAUS["dopr54"].c[1:]
+            assert (np.abs(stages - passage).min(axis=1) / h).min() > 0.049
+
+
+def test_events_are_located_and_end_a_run() -> None:
+    def crossing(t: float, x: Any) -> float:
+        return float(x[1] - 0.5)
+
+    def low(t: float, x: Any) -> float:
+        return float(x[0] - 0.3)
+
+    low.terminal = True  # type: ignore[attr-defined]
+    solution = srm.solve_dae(
+        problem_two(), (0.0, 2.0), START_TWO, rtol=1e-9, atol=1e-9, events=[crossing, low]
+    )
+    assert solution.status == "event"
+    assert solution.success
+    assert solution.t_events is not None
+    assert solution.x_events is not None
+    assert solution.t_events[0] == pytest.approx([np.pi / 6.0], abs=1e-8)
+    assert solution.t_events[1] == pytest.approx([-np.log(0.3)], abs=1e-8)
+    assert solution.x_events[1][0] == pytest.approx([0.3, np.sin(-np.log(0.3))], abs=1e-8)
+    assert solution.t[-1] == solution.t_events[1][0]
+    assert len(solution.x) == len(solution.y) == len(solution.t)
+    assert srm.solve_dae(problem_two(), (0.0, 0.1), START_TWO).t_events is None
+
+
+def test_a_run_is_written_as_a_table(tmp_path: Any) -> None:
+    solution = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO)
+    solution.to_csv(tmp_path / "run.csv")
+    lines = (tmp_path / "run.csv").read_text().splitlines()
+    assert lines[0] == "t,x[0],x[1],y[0]"
+    values = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    assert np.array_equal(values, np.column_stack([solution.t, solution.x, solution.y]))
+
+
+def test_sweeps_that_carry_y_say_why_they_cannot_go_on() -> None:
+    solution = srm.solve_dae(
+        passing_singularity(), (0.0, 1.0), START_PASSING, method="srm", rtol=1e-4, atol=1e-4
+    )
+    assert not solution.success
+    assert "T = I or (GB)^T" in solution.message
+    assert len(solution.x) > 10
+
+
 def test_constraints_hold_to_round_off_with_the_split_form() -> None:
     problem = problem_two()
     solution = srm.solve_dae(problem, (0.0, 5.0), START_TWO)
@@ -226,6 +345,9 @@ def test_a_function_that_fails_on_the_way_leaves_the_partial_solution(
         ({"rtol": 0.0}, "rtol"),
         ({"atol": [1e-6] * 3}, "atol"),
         ({"t_eval": [0.0, 3.0]}, "t_eval"),
+        ({"placement": "best"}, "no placement"),
+        ({"singular_times": [0.0]}, "singular_times"),
+        ({"events": [3]}, "events"),
         ({"method": "bdf"}, "no method"),
         ({"tableau": "erk4"}, "step="),
         ({"problem": problem_two(G=lambda t, x: 2.0 * x)}, "finite differences"),

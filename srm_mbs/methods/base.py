@@ -143,6 +143,8 @@ class StepResult:
     drift_ratio
         For methods with sweeps and an embedded pair: constraint error that the last sweep has left
         at the end, over tolerance; else 0.
+    off
+        For methods with sweeps: how far any of them is off the closures at the end, in units.
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
@@ -170,6 +172,7 @@ class StepResult:
     magnitude: FloatArray
     sweeps: tuple[SweepNode, ...] = ()
     drift_ratio: float = 0.0
+    off: float = 0.0
     placement: str = ""
     gap: float = 0.0
     held: bool = False

@@ -126,40 +126,21 @@ class IteratedSweeps:
         self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.methods.base.Method`."""
-        scheme, s = self.scheme, self.scheme.n_stages
         eps = max(self.eps(h), EPS_SHRINKS * memory.sweeps[-1].eps)
         if not (math.isfinite(eps) and eps > 0.0):
             raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
         kept = memory.sweeps[-1].history
-        sigma_change = h * memory.sigma_slope
         weights = norm.weights(memory.magnitude)
-        stages = BranchStages(system, memory, norm, weights, h, sigma_change, kept, t + h)
+        stages = BranchStages(system, memory, norm, weights, h, h * memory.sigma_slope, kept, t + h)
         make = self._own_sweeps if self.own_history else self._restarted_sweeps
         runs = make(system, t, h, eps, memory, stages)
         last = runs[-1]
         self._check_closures(system, t + h, last.state, h, eps)
 
         magnitude = system.magnitudes(last.state)
-        error_ratio = drift_ratio = 0.0
-        if scheme.error is not None:
-            error = h * np.abs(scheme.error @ last.rates[: s + 1])
-            if kept is not None and sigma_change > COUNT_UNCERTAINTY_ABOVE:
-                for j in last.weak:
-                    if j < s:
-                        uncertainty = kept.uncertainty(t + scheme.c[j] * h)
-                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
-            weights = norm.weights(np.maximum(memory.magnitude, magnitude))
-            weights = stages.widened(weights, scheme, last.sigmas)
-            if last.off is not None:
-                drift_ratio = norm(last.off, weights)
-                if last.off_before is not None:
-                    added = last.off - math.exp(-h / eps) * last.off_before
-                    error = np.maximum(error, np.abs(added))
-            error_ratio = norm(error, weights)
+        error_ratio, drift_ratio = self._estimate(t, h, eps, magnitude, stages, last)
         ends = runs if self.own_history else runs[-1:]
-        sweeps = tuple(
-            self._end(node, run, t + h, eps, s) for node, run in zip(memory.sweeps, ends)
-        )
+        sweeps = tuple(self._end(node, run, t + h, eps) for node, run in zip(memory.sweeps, ends))
         weak = any(run.weak for run in runs)
         return StepResult(
             t=t,
@@ -177,7 +158,38 @@ class IteratedSweeps:
             magnitude=magnitude,
             sweeps=sweeps,
             drift_ratio=drift_ratio,
+            off=max(0.0 if run.off is None else system.size(run.off) for run in ends),
         )
+
+    def _estimate(
+        self,
+        t: float,
+        h: float,
+        eps: float,
+        magnitude: FloatArray,
+        stages: BranchStages,
+        last: Sweep,
+    ) -> tuple[float, float]:
+        """Error estimate of the ``last`` sweep, and its constraint error, over tolerance."""
+        scheme, s = self.scheme, self.scheme.n_stages
+        if scheme.error is None:
+            return 0.0, 0.0
+        norm, memory, history = stages.norm, stages.memory, stages.history
+        weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+        weights = stages.widened(weights, scheme, last.sigmas)
+        error = h * np.abs(scheme.error @ last.rates[: s + 1])
+        if history is not None and stages.sigma_change > COUNT_UNCERTAINTY_ABOVE:
+            for j in last.weak:
+                if j < s:
+                    uncertainty = history.uncertainty(t + scheme.c[j] * h)
+                    part = stages.system.multiplier_part
+                    error[part] += h * abs(scheme.b[j]) * uncertainty
+        if last.off is None:
+            return norm(error, weights), 0.0
+        if last.off_before is not None:
+            added = last.off - math.exp(-h / eps) * last.off_before
+            error = np.maximum(error, np.abs(added))
+        return norm(error, weights), norm(last.off, weights)
 
     def accept(self, memory: Memory, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
@@ -227,7 +239,7 @@ class IteratedSweeps:
                 zone,
                 near,
                 exact=fused,
-                off=final,
+                off=True,
             )
             runs.append(run)
             if not final:
@@ -291,8 +303,8 @@ class IteratedSweeps:
                 )
         return runs
 
-    def _end(self, node: SweepNode, run: Sweep, t: float, eps: float, s: int) -> SweepNode:
-        multiplier = run.multipliers[s]
+    def _end(self, node: SweepNode, run: Sweep, t: float, eps: float) -> SweepNode:
+        multiplier = run.multipliers[self.scheme.n_stages]
         history = node.history
         if history is not None and run.exact is not None:
             history = history.extended(t, run.exact)

@@ -37,6 +37,14 @@ class SRM:
     multiplier is constant over the step, whatever m.  The higher orders of the thesis show on its
     problem 1, which has no error but these.
 
+    With step-size control, ``restart`` and ``carry``, measured with tvd32 and m = 3: slider-crank
+    to t = 40 through 19 passages, errors 8e-4 and 4e-5 at tolerances of 1e-4 and 1e-5; four-bar to
+    t = 5, 4e-3 and 3e-4.  Sweeps with their own history drift apart, and the last one is off the
+    closures by a power of eps that no step mends: the message says how far.  With a fixed eps of
+    0.01 and 0.003 s at 1e-4 and 1e-5 the slider-crank ends with errors of 4e-2 and 3e-5, the
+    four-bar with 6 and 0.6 at 1e-4; with eps = h every change of the step is an initial layer,
+    which takes seven times the steps of restarted sweeps.
+
     Parameters
     ----------
     tableau
@@ -49,8 +57,7 @@ class SRM:
     restart
         False: every sweep keeps its own trajectory for the whole run, as in the thesis.  True:
         every step starts all sweeps from the accepted state of the last one.  With step-size
-        control use True: eps changes with the step, and every change puts an initial layer into
-        sweeps with own histories, next to a singular configuration a fatal one.
+        control use True.
     carry
         With ``restart``: yhat_0 of a step is the last sweep's multiplier at its start instead of
         0, which would put an initial layer into every step.  Needs m <= 3: more sweeps amplify

@@ -22,11 +22,17 @@ TURNED = 0.3
 MAX_REDONE = 8
 
 
+def passes(result: StepResult) -> bool:
+    """Whether sigma changes by so much over a step that it may have passed zero."""
+    sigmas = result.sigmas.tolist()
+    return 2.0 * min(sigmas) < max(sigmas)
+
+
 def turned(system: System, result: StepResult) -> bool:
     """Whether the velocity of a step next to a singular configuration took another direction."""
-    sigmas, k = result.sigmas, system.multiplier_part.start
-    if not sigmas.min() < sigmas.max() - sigmas.min():
+    if not passes(result):
         return False
+    k = system.multiplier_part.start
     start, end = result.rates[0], result.end_rate
     halfway = 0.5 * result.h * (start[k:] + end[k:])
     still = np.zeros(k)
@@ -40,7 +46,8 @@ def turned(system: System, result: StepResult) -> bool:
 class BranchGuard:
     """Wraps ``inner`` step-size control: a passage that changes the branch is redone.
 
-    For second-order systems; a DAE of first order has no velocity to compare.
+    For second-order systems; :class:`~srm_mbs.stepping.rate_guard.RateGuard` for those of first
+    order.
 
     Attributes
     ----------
@@ -67,7 +74,7 @@ class BranchGuard:
 
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a step whose velocity turned; otherwise the inner control's verdict."""
-        suspect = result is not None and turned(self._system, result)
+        suspect = result is not None and self.suspect(result)
         if suspect and self._tries < MAX_REDONE:
             self._limit = 0.5 * proposal.h
             self._tries += 1
@@ -80,3 +87,11 @@ class BranchGuard:
             self._limit = np.inf
             self._tries = 0
         return verdict
+
+    def told(self) -> list[float]:
+        """Times (s) up to which the motion may have changed its branch."""
+        return self.suspects
+
+    def suspect(self, result: StepResult) -> bool:
+        """Whether a step may have changed the branch."""
+        return turned(self._system, result)

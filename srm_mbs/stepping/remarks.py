@@ -1,0 +1,47 @@
+"""What the message of a run says about its methods' limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from srm_mbs.methods.base import ErrorNorm, StepResult
+from srm_mbs.stepping.guard import BranchGuard
+from srm_mbs.stepping.singular_times import Placing
+
+TOLD = 5
+"""Times listed."""
+DRIFTED = 10.0
+"""Constraint error over tolerance from which a run says so."""
+
+
+def turns(wrappers: Sequence[Placing], what: str, remedy: str) -> str:
+    """A sentence naming the times at which the motion may have changed its branch.
+
+    Parameters
+    ----------
+    what
+        "the velocity turned".
+    remedy
+        A sentence.
+    """
+    times = [t for w in wrappers if isinstance(w, BranchGuard) for t in w.told()]
+    if not times:
+        return ""
+    listed = ", ".join(f"{t:.6g}" for t in times[:TOLD]) + (", ..." if len(times) > TOLD else "")
+    return (
+        f" Next to singular configurations, up to t = {listed} s, {what} and no shorter step "
+        f"mended it: the motion may have changed its branch. {remedy}"
+    )
+
+
+def drift(steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+    """A sentence about sweeps that stay off the constraints by more than the tolerance."""
+    worst = max(steps, key=lambda step: step.drift_ratio, default=None)
+    if norm.negligible == 0.0 or worst is None or not worst.drift_ratio > DRIFTED:
+        return ""
+    return (
+        f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times the "
+        f"tolerance (at t = {worst.t + worst.h:.6g} s), which no step-size control mends: sweeps "
+        "are accurate to a power of eps. Use restarted sweeps (restart=True, carry=True), a "
+        "smaller eps, or PSRM."
+    )

@@ -97,6 +97,8 @@ class Memory:
         Multipliers at recent step ends outside the zone; None without closures.
     sigma_slope
         |d sigma / dt| (1/s) seen by step-size control; it widens the zone for fast passages.
+    steps
+        Number of accepted steps.
     sweeps
         For methods with sweeps: where each one stands, the last one last.
     """
@@ -106,6 +108,7 @@ class Memory:
     magnitude: FloatArray
     history: MultiplierHistory | None = None
     sigma_slope: float = 0.0
+    steps: int = 0
     sweeps: tuple[SweepNode, ...] = ()
 
 

@@ -53,6 +53,11 @@ class MultiplierHistory:
 
         Nodes ahead of ``t`` are dropped.
         """
+        if len(self.times) == POINTS and self.times[-1] < t:
+            moved, kept = np.empty_like(self.times), np.empty_like(self.values)
+            moved[:-1], moved[-1] = self.times[1:], t
+            kept[:-1], kept[-1] = self.values[1:], value
+            return MultiplierHistory(moved, kept, normals=normals)
         before = self.times < t
         times = np.concatenate([self.times[before], [t]])[-POINTS:]
         values = np.concatenate([self.values[before], value[None]])[-POINTS:]

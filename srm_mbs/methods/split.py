@@ -26,6 +26,11 @@ from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE
 from srm_mbs.systems.base import System
 
+FAR = 8.0
+"""Steps from a singular configuration from which a step prepares nothing for one."""
+GAP_EVERY = 16
+"""Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
+
 
 def split_start(system: System, t: float, state: FloatArray) -> Memory:
     """First stage, and the first node of the multiplier history."""
@@ -58,7 +63,7 @@ def split_step(
     sigma_change = h * memory.sigma_slope
     branch: BranchStages | None = None
     zone = None
-    if history is not None:
+    if history is not None and memory.sigma < WATCHED + FAR * sigma_change:
         weights = norm.weights(memory.magnitude)
         branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
         zone = branch.zone
@@ -77,7 +82,7 @@ def split_step(
         time = t + fraction * h
         terms = system.evaluate(time, x, zone)
         sigmas[j] = terms.sigma
-        if branch is not None and fraction > 0.0:
+        if branch is not None and branch.near and fraction > 0.0:
             terms, x, moved = branch(terms, time, fraction, x)
         rate = terms.rate()
         rates[j] = system.chart_rate(delta, rate)
@@ -99,6 +104,10 @@ def split_step(
     else:
         correction = np.zeros(0)
         new_state, end_rate, multiplier = x, rate.copy(), None
+    gap = 0.0
+    due = memory.steps < GAP_EVERY or memory.steps % GAP_EVERY == 0
+    if due and history is not None and theta == 1.0:
+        gap = terms.gap()
     error_ratio = 0.0
     if scheme.error is not None:
         error = h * np.abs(scheme.error @ rates)
@@ -125,7 +134,7 @@ def split_step(
         history=history if weak_stages else None,
         multiplier=multiplier,
         magnitude=magnitude,
-        gap=terms.gap() if history is not None and theta == 1.0 else 0.0,
+        gap=gap,
         held=held,
         normals=normals,
     )
@@ -133,6 +142,7 @@ def split_step(
 
 def split_accept(memory: Memory, result: StepResult) -> None:
     """Move ``memory`` to the end of an accepted step."""
+    memory.steps += 1
     memory.rate = result.end_rate
     memory.sigma = float(result.sigmas[-1])
     memory.magnitude = result.magnitude

@@ -24,7 +24,7 @@ MAX_REDONE = 8
 
 def passes(result: StepResult) -> bool:
     """Whether sigma changes by so much over a step that it may have passed zero."""
-    sigmas = result.sigmas.tolist()
+    sigmas: list[float] = result.sigmas.tolist()
     return 2.0 * min(sigmas) < max(sigmas)
 
 

@@ -54,17 +54,17 @@ def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
     return zero
 
 
-def zero_ahead(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
+def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
     """Where sigma will vanish, in steps from the start of the last one (> 1); None if it does not
     fall, or not within ``AHEAD`` steps.
 
-    A parabola through the start, a middle stage and the end; a line if that has no zero ahead.
+    A parabola through the start, the stage ``k`` with the abscissa ``c``, and the end; a line if
+    that has no zero ahead.
     """
     start, end = float(sigmas[0]), float(sigmas[-1])
     if not end < start:
         return None
-    k = int(np.argmin(np.abs(abscissae - 0.5)))
-    c, middle = float(abscissae[k]), float(sigmas[k])
+    middle = float(sigmas[k])
     line = start / (start - end)
     zero = line
     if 0.1 < c < 0.9:

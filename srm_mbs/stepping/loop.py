@@ -29,8 +29,8 @@ STANDSTILL = 1e-6
 LARGE_CORRECTION = 1e-3
 """Below this an end correction closes the loops to its square: nothing to look at."""
 OPEN = 1e-9
-"""Closure error before a correction, in row units, from which it is looked at whether the correction
-closes it."""
+"""Closure error before a correction, in row units, from which it is looked at whether the
+correction closes it."""
 LOST = 1e-2
 """Closure error after the correction, in row units, from which a run is meaningless."""
 
@@ -141,8 +141,8 @@ def integrate(
             if len(record.times) % WATCHED_STEPS == 0 and _stands_still(record, t, t_end):
                 covered = t - record.times[-WATCHED_STEPS]
                 reason = (
-                    f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; what acts on the "
-                    "mechanism changes too fast or is not smooth"
+                    f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; what acts on "
+                    "the mechanism changes too fast or is not smooth"
                 )
                 _fail(record, t, h, memory, reason, control.adaptive)
                 break

@@ -33,7 +33,11 @@ MAX_REDONE = 3
 
 def sigma_slope(abscissae: FloatArray, sigmas: FloatArray, h: float) -> float:
     """max_j |sigma_j - sigma_0| / (c_j h) over the stages with c_j > 0 (1/s)."""
-    return float(np.max(np.abs(sigmas[1:] - sigmas[0]) / abscissae[1:])) / h
+    # Lists: NumPy's overhead on a dozen numbers is several times the work, in every step.
+    values: list[float] = sigmas.tolist()
+    c: list[float] = abscissae.tolist()
+    start = values[0]
+    return max(abs(sigma - start) / x for sigma, x in zip(values[1:], c[1:]) if x > 0.0) / h
 
 
 class Gaps:
@@ -96,7 +100,11 @@ class SingularityPlacement:
         self._inner = inner
         self._t_end = t_end
         self._gaps = Gaps(scheme)
-        self._abscissae = np.append(scheme.c, 1.0)
+        c = self._abscissae = np.append(scheme.c, 1.0)
+        self._later_stages = np.flatnonzero(c > 0.0).tolist()
+        self._inner_stages = np.flatnonzero((c > 0.0) & (c < 1.0)).tolist()
+        middle = int(np.argmin(np.abs(c - 0.5)))
+        self._middle = middle, float(c[middle])
         self.adaptive = inner.adaptive
         self.placed = 0
         self.replaced = 0
@@ -131,18 +139,18 @@ class SingularityPlacement:
         over = self._gaps.step_over(distance)
         return over if t + over <= self._t_end else h
 
-    def _better_step(self, h: float, sigmas: FloatArray, last: bool) -> float | None:
+    def _better_step(self, h: float, sigmas: FloatArray, slope: float, last: bool) -> float | None:
         """A better step length if a stage or the end came too close, else None.
 
         ``last``: the run ends with this step, wherever that is.
         """
-        c = self._abscissae
-        movable = (c > 0.0) & (c < 1.0) if last else c > 0.0
-        lowest = float(sigmas[movable].min(initial=np.inf))
-        reach = max(self._slope, sigma_slope(c, sigmas, h)) * h
-        if not (lowest < TOO_CLOSE * reach and lowest < 0.5 * sigmas[0]):
+        values = sigmas.tolist()
+        movable = self._inner_stages if last else self._later_stages
+        lowest = min((values[i] for i in movable), default=np.inf)
+        reach = max(self._slope, slope) * h
+        if not (lowest < TOO_CLOSE * reach and lowest < 0.5 * values[0]):
             return None
-        zero = zero_within(c, sigmas)
+        zero = zero_within(self._abscissae, sigmas)
         if zero is None or not zero > 0.0:
             return None
         return self._gaps.longest_step(zero * h, 0.98 * h)
@@ -150,8 +158,10 @@ class SingularityPlacement:
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a badly placed step; otherwise the inner control's verdict."""
         h = proposal.h
+        slope = 0.0 if result is None else sigma_slope(self._abscissae, result.sigmas, h)
         if result is not None and self._redone < MAX_REDONE:
-            better = self._better_step(h, result.sigmas, proposal.t_new >= self._t_end)
+            last = proposal.t_new >= self._t_end
+            better = self._better_step(h, result.sigmas, slope, last)
             if better is not None and 0.0 < better < h:
                 self._redo = better
                 self._redone += 1
@@ -161,8 +171,7 @@ class SingularityPlacement:
         self._redo = None
         self._redone = 0
         if verdict is Verdict.ACCEPTED and result is not None:
-            slope = sigma_slope(self._abscissae, result.sigmas, h)
             self._slope = max(slope, 0.5 * self._slope)
-            ahead = zero_ahead(self._abscissae, result.sigmas)
+            ahead = zero_ahead(*self._middle, result.sigmas)
             self._zero = None if ahead is None else result.t + h * ahead
         return verdict

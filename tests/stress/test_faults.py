@@ -210,11 +210,11 @@ def test_closures_that_contradict_each_other_are_refused_with_their_gaps() -> No
 def test_a_chain_stretched_to_its_reach_is_locked(lengths: tuple[float, ...]) -> None:
     """Its closed configuration is isolated: gravity must not pull the loop open."""
     mechanism = chain(lengths, sum(lengths), (0.0,) * len(lengths))
-    try:
-        solution = srm.simulate(mechanism, 2.0)
-    except srm.InputError as error:  # known at the start: it rests on a singular configuration
-        assert "singular configuration" in str(error)
+    if lengths == (1.0, 2.0, 0.5, 1.0):  # known at the start to rest on a singular configuration
+        with pytest.raises(srm.InputError, match="singular configuration"):
+            srm.simulate(mechanism, 2.0)
         return
+    solution = srm.simulate(mechanism, 2.0)
     assert gap(solution) <= 1e-9
     assert np.abs(solution.q).max() < 1e-6
     if not solution.success:

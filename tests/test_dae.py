@@ -358,7 +358,7 @@ def test_a_function_that_fails_on_the_way_leaves_the_partial_solution(
         ({"problem": problem_two(f=lambda t, x: x * np.nan)}, "not finite"),
         ({"problem": problem_two(B=lambda t, x: np.array([-x[1], x[0]]))}, "singular"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else "options",
 )
 def test_bad_input_is_refused_before_any_stepping(options: dict[str, Any], words: str) -> None:
     arguments: dict[str, Any] = {"problem": problem_two(), "t_span": (0.0, 1.0), "x0": START_TWO}

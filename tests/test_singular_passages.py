@@ -155,13 +155,13 @@ def test_no_evaluated_stage_lies_on_a_singular_point(tableau: str) -> None:
 
 
 def test_the_zone_carries_a_run_whose_steps_are_too_small_to_step_over() -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 2.0, rtol=1e-12, max_step=2e-4)
+    solution = srm.simulate(srm.load("slider_crank"), 1.3, rtol=1e-12, max_step=5e-4)
     assert solution.success
     assert solution.stats.zone_steps > 0
-    q, v = solution(np.linspace(0.0, 2.0, 201))
+    q, v = solution(np.linspace(0.0, 1.3, 201))
     assert np.abs(q[:, 1] + 2.0 * q[:, 0]).max() < 1e-11
     assert np.abs(v[:, 1] + 2.0 * v[:, 0]).max() < 1e-11
-    theta, omega = reduced.integrate(reduced.slider_crank(), [7 * np.pi / 4, 0.0], 2.0)
+    theta, omega = reduced.integrate(reduced.slider_crank(), [7 * np.pi / 4, 0.0], 1.3)
     assert error_at_end(solution, theta, omega) < 1e-11
 
 

@@ -34,7 +34,7 @@ def test_a_saved_run_interpolates_to_the_last_bit(name: str, tmp_path: Path) -> 
 
 
 def test_a_run_through_the_zone_interpolates_to_the_last_bit(tmp_path: Path) -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 1.2, rtol=1e-12, max_step=2e-4)
+    solution = srm.simulate(srm.load("slider_crank"), 1.2, rtol=1e-12, max_step=5e-4)
     assert solution.stats.zone_steps > 0
     solution.save(tmp_path / "run")
     loaded = srm.load_solution(tmp_path / "run")

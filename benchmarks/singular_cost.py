@@ -3,8 +3,9 @@
     python -m benchmarks.singular_cost [--repeats 15] [--json FILE]
 
 Run from a checkout; BLAS runs on one thread.  Regular mechanisms are run as they are, and with
-placement, the guard of the branch, the zone with its history, stages on the branch and the look for
-bifurcations all left out.  The two runs alternate; times are CPU times of the process.
+placement, the guard of the branch, the zone with its history, stages on the branch, the watch
+over closure errors and the look for bifurcations all left out.  The two take the same
+steps, which is checked; the runs alternate; times are CPU times of the process.
 """
 
 from __future__ import annotations
@@ -84,7 +85,6 @@ class Plain:
             zone=None,
             history=None,
             multiplier=None,
-            gap=terms.gap(),
             magnitude=magnitude,
         )
 

@@ -17,7 +17,7 @@ PYTHON = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 def test_the_python_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    assert len(PYTHON) == 2
+    assert len(PYTHON) == 3
     for block in PYTHON:
         exec(block, names)
     assert (tmp_path / "drift.png").stat().st_size > 10_000

@@ -64,9 +64,9 @@ class PSRM:
         Mechanisms have no such choice, and the split form is the same for all.
     interpolation
         Of the predicted multiplier, with ``correction="sweep"``: ``"stages"``, the predictor's own
-        stages, the default: full order with a fixed eps, and far smaller errors at singular
-        configurations (with the others the slider-crank changes branch at a tolerance of 1e-4);
-        or as in the thesis, ``"auto"`` or ``"linear"``
+        stages, the default: full order with a fixed eps, and passes singular configurations at
+        all tolerances (with ``"linear"`` the adaptive slider-crank stalls next to one, or changes
+        the branch; the message says so); or as in the thesis, ``"auto"`` or ``"linear"``
         (:func:`~srm_mbs.methods.sweeps.interpolant`).
 
     Raises

@@ -38,12 +38,12 @@ class SRM:
     problem 1, which has no error but these.
 
     With step-size control, ``restart`` and ``carry``, measured with tvd32 and m = 3: slider-crank
-    to t = 40 through 19 passages, errors 8e-4 and 4e-5 at tolerances of 1e-4 and 1e-5; four-bar to
-    t = 5, 4e-3 and 3e-4.  Sweeps with their own history drift apart, and the last one is off the
+    to t = 40 through its passages, errors 1e-3 and 4e-5 at tolerances of 1e-4 and 1e-5; four-bar
+    to t = 5, 5e-3 and 4e-4.  Sweeps with their own history drift apart, and the last one is off the
     closures by a power of eps that no step mends: the message says how far.  With a fixed eps of
-    0.01 and 0.003 s at 1e-4 and 1e-5 the slider-crank ends with errors of 4e-2 and 3e-5, the
-    four-bar with 6 and 0.6 at 1e-4; with eps = h every change of the step is an initial layer,
-    which takes seven times the steps of restarted sweeps.
+    0.01 and 0.003 s at 1e-4 and 1e-5 the slider-crank has errors of 1e-3 and 3e-5, but the four-bar
+    0.6 with 0.003 s at 1e-4; with eps = h every change of the step is an initial layer, which takes
+    nine times the steps of restarted sweeps.
 
     Parameters
     ----------

@@ -7,8 +7,6 @@ from srm_mbs.systems.base import Zone
 
 ZONE_FLOOR = 1e-3
 """Smallest sigma_z; smaller values failed at tight tolerances."""
-ZONE_PER_STEP = 0.05
-"""sigma_z as a fraction of the change of sigma over the step."""
 COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_FLOOR
 """h * slope of sigma from which the uncertainty of the predicted multiplier counts as error;
 counting it always would trap the step-size control next to the singular configuration."""
@@ -23,16 +21,11 @@ FEWEST = 3
 def zone_from(history: MultiplierHistory | None, threshold: float, end: float) -> Zone | None:
     """The zone sigma < ``threshold`` of a step to the time ``end``.
 
-    None without a history; only for direct hits while the history is too short.
+    None without nodes; only for direct hits while they are few.
     """
-    if history is None:
+    if history is None or not history.begun:
         return None
     known = history.known_below if end <= history.known_until else 0.0
     if len(history.times) < FEWEST:
         threshold = min(threshold, HIT)
     return Zone(max(threshold, known), history.predict_near, history.normals)
-
-
-def zone_of(history: MultiplierHistory | None, sigma_change: float, end: float) -> Zone | None:
-    """The zone of a step of a method that evaluates its stages where they are."""
-    return zone_from(history, max(ZONE_FLOOR, ZONE_PER_STEP * sigma_change), end)

@@ -15,10 +15,9 @@ import numpy as np
 
 from srm_mbs.methods.base import Memory, StepResult
 from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
+from srm_mbs.stepping.turning import TURNED, AmbiguousPassages
 from srm_mbs.systems.base import System
 
-TURNED = 0.3
-"""Part of the velocity by which it may differ from the trapezoidal rule."""
 MAX_REDONE = 8
 
 
@@ -67,6 +66,7 @@ class BranchGuard:
         self.suspects: list[float] = []
         self._limit = np.inf
         self._tries = 0
+        self._passages = AmbiguousPassages(system)
 
     def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
         """The inner proposal, halved after a passage that has to be redone."""
@@ -81,7 +81,8 @@ class BranchGuard:
             self.replaced += 1
             return Verdict.REPLACED
         verdict = self._inner.judge(proposal, result)
-        if verdict is Verdict.ACCEPTED:
+        if verdict is Verdict.ACCEPTED and result is not None:
+            self._passages.watch(proposal.t_new, result)
             if suspect:
                 self.suspects.append(proposal.t_new)
             self._limit = np.inf
@@ -89,8 +90,14 @@ class BranchGuard:
         return verdict
 
     def told(self) -> list[float]:
-        """Times (s) up to which the motion may have changed its branch."""
-        return self.suspects
+        """Times (s) up to which the motion may have changed its branch: the suspects, and the ends
+        of longer passages (:mod:`srm_mbs.stepping.turning`) without any."""
+        longer = [
+            end
+            for begin, end in self._passages.turned()
+            if not any(begin < t <= end for t in self.suspects)
+        ]
+        return sorted([*self.suspects, *longer])
 
     def suspect(self, result: StepResult) -> bool:
         """Whether a step may have changed the branch."""

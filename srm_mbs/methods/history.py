@@ -46,6 +46,15 @@ class MultiplierHistory:
         """History with one node."""
         return cls(np.array([t]), value[None].copy())
 
+    @property
+    def begun(self) -> bool:
+        """Whether there is a node."""
+        return len(self.times) > 0
+
+    def emptied(self) -> MultiplierHistory:
+        """Without nodes: far from singular configurations none are kept."""
+        return MultiplierHistory(self.times[:0], self.values[:0])
+
     def extended(
         self, t: float, value: FloatArray, normals: FloatArray | None = None
     ) -> MultiplierHistory:

@@ -28,6 +28,7 @@ from srm_mbs.systems.base import System
 
 FAR = 8.0
 """Steps from a singular configuration from which a step prepares nothing for one."""
+ALL_ROWS = np.iinfo(np.int64).max
 GAP_EVERY = 16
 """Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
 
@@ -71,7 +72,7 @@ def split_step(
     sigmas = np.full(s + 1, memory.sigma)
     rates[0] = memory.rate
     weak_stages: list[int] = []
-    rank = np.iinfo(np.int64).max
+    rank = ALL_ROWS
     moved: FloatArray | None = None
     held = False
     for j in range(1, s + 1):
@@ -86,8 +87,8 @@ def split_step(
             terms, x, moved = branch(terms, time, fraction, x)
         rate = terms.rate()
         rates[j] = system.chart_rate(delta, rate)
-        rank = min(rank, terms.rank)
         if terms.weak:
+            rank = min(rank, terms.rank)
             weak_stages.append(j)
             held = held or terms.held
     magnitude = system.magnitudes(x)
@@ -96,9 +97,11 @@ def split_step(
         correction = theta * terms.correction()
         new_state = system.retract(x, -correction)
         end_rate = rate - system.rate_change(correction)
-        multiplier = None if terms.weak else terms.multiplier().copy()
-        if not terms.weak and terms.sigma < WATCHED:
-            normals = terms.normals().copy()
+        multiplier = None
+        if not terms.weak and (branch is not None or terms.sigma < WATCHED):
+            multiplier = terms.multiplier()
+            if terms.sigma < WATCHED:
+                normals = terms.normals()
         if moved is not None:
             correction = correction + moved
     else:
@@ -129,7 +132,7 @@ def split_step(
         correction=correction,
         error_ratio=error_ratio,
         sigmas=sigmas,
-        rank=rank,
+        rank=min(rank, terms.rank),
         zone=zone if weak_stages else None,
         history=history if weak_stages else None,
         multiplier=multiplier,
@@ -146,7 +149,11 @@ def split_accept(memory: Memory, result: StepResult) -> None:
     memory.rate = result.end_rate
     memory.sigma = float(result.sigmas[-1])
     memory.magnitude = result.magnitude
-    if result.multiplier is not None and memory.history is not None:
+    if memory.history is None:
+        return
+    if result.multiplier is not None:
         memory.history = memory.history.extended(
             result.t + result.h, result.multiplier, result.normals
         )
+    elif result.zone is None and memory.history.begun:
+        memory.history = memory.history.emptied()

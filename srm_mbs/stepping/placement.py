@@ -31,13 +31,17 @@ CLEARANCE = 0.6
 MAX_REDONE = 3
 
 
-def sigma_slope(abscissae: FloatArray, sigmas: FloatArray, h: float) -> float:
-    """max_j |sigma_j - sigma_0| / (c_j h) over the stages with c_j > 0 (1/s)."""
+def inverse_abscissae(scheme: ButcherTableau) -> list[float]:
+    """1/c of the stages and the end (s + 1,); 0 where c is."""
+    return [1.0 / c if c > 0.0 else 0.0 for c in [*scheme.c.tolist(), 1.0]]
+
+
+def sigma_slope(inverse: list[float], sigmas: FloatArray, h: float) -> float:
+    """max_j |sigma_j - sigma_0| / (c_j h) over the stages (1/s); ``inverse`` has their 1/c_j."""
     # Lists: NumPy's overhead on a dozen numbers is several times the work, in every step.
     values: list[float] = sigmas.tolist()
-    c: list[float] = abscissae.tolist()
     start = values[0]
-    return max(abs(sigma - start) / x for sigma, x in zip(values[1:], c[1:]) if x > 0.0) / h
+    return max([abs(sigma - start) * x for sigma, x in zip(values, inverse)]) / h
 
 
 class Gaps:
@@ -101,6 +105,7 @@ class SingularityPlacement:
         self._t_end = t_end
         self._gaps = Gaps(scheme)
         c = self._abscissae = np.append(scheme.c, 1.0)
+        self._inverse = inverse_abscissae(scheme)
         self._later_stages = np.flatnonzero(c > 0.0).tolist()
         self._inner_stages = np.flatnonzero((c > 0.0) & (c < 1.0)).tolist()
         middle = int(np.argmin(np.abs(c - 0.5)))
@@ -144,11 +149,12 @@ class SingularityPlacement:
 
         ``last``: the run ends with this step, wherever that is.
         """
-        values = sigmas.tolist()
+        values: list[float] = sigmas.tolist()
+        reach = TOO_CLOSE * max(self._slope, slope) * h
+        if not min(values) < min(reach, 0.5 * values[0]):
+            return None
         movable = self._inner_stages if last else self._later_stages
-        lowest = min((values[i] for i in movable), default=np.inf)
-        reach = max(self._slope, slope) * h
-        if not (lowest < TOO_CLOSE * reach and lowest < 0.5 * values[0]):
+        if not min((values[i] for i in movable), default=np.inf) < min(reach, 0.5 * values[0]):
             return None
         zero = zero_within(self._abscissae, sigmas)
         if zero is None or not zero > 0.0:
@@ -158,7 +164,7 @@ class SingularityPlacement:
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a badly placed step; otherwise the inner control's verdict."""
         h = proposal.h
-        slope = 0.0 if result is None else sigma_slope(self._abscissae, result.sigmas, h)
+        slope = 0.0 if result is None else sigma_slope(self._inverse, result.sigmas, h)
         if result is not None and self._redone < MAX_REDONE:
             last = proposal.t_new >= self._t_end
             better = self._better_step(h, result.sigmas, slope, last)

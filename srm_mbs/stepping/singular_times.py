@@ -24,6 +24,7 @@ from srm_mbs.stepping.placement import (
     FAR_ENOUGH,
     TOO_CLOSE,
     SingularityPlacement,
+    inverse_abscissae,
     sigma_slope,
 )
 from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
@@ -131,7 +132,7 @@ class SlopeOfSigma:
 
     def __init__(self, inner: StepSizeControl, scheme: ButcherTableau) -> None:
         self._inner = inner
-        self._abscissae = np.append(scheme.c, 1.0)
+        self._inverse = inverse_abscissae(scheme)
         self._slope = 0.0
         self.adaptive = inner.adaptive
         self.placed = 0
@@ -146,7 +147,7 @@ class SlopeOfSigma:
         """The inner control's verdict."""
         verdict = self._inner.judge(proposal, result)
         if verdict is Verdict.ACCEPTED and result is not None:
-            slope = sigma_slope(self._abscissae, result.sigmas, proposal.h)
+            slope = sigma_slope(self._inverse, result.sigmas, proposal.h)
             self._slope = max(slope, 0.5 * self._slope)
         return verdict
 
@@ -205,7 +206,7 @@ class HalvedStep(SlopeOfSigma):
 
     def _ends_on_a_singular_point(self, h: float, result: StepResult) -> bool:
         sigmas = result.sigmas
-        reach = h * max(self._slope, sigma_slope(self._abscissae, sigmas, h))
+        reach = h * max(self._slope, sigma_slope(self._inverse, sigmas, h))
         return bool(sigmas[-1] < TOO_CLOSE * reach and sigmas[0] > FAR_ENOUGH * reach)
 
 

@@ -7,6 +7,8 @@ slopes on these problems, hence its finer steps.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pinocchio as pin
 
@@ -25,6 +27,7 @@ STEPS = {
 SAMPLES = np.linspace(0.2, 1.0, 5)
 
 
+@cache
 def turning(name: str, rate: float) -> Mechanism:
     """A bundled mechanism with its crank at 1 rad and ``rate`` rad/s."""
     mechanism = srm.load(name)
@@ -32,11 +35,16 @@ def turning(name: str, rate: float) -> Mechanism:
     return mechanism.with_state(state.q, state.v)
 
 
+@cache
+def reference_of(mechanism: Mechanism) -> srm.Solution:
+    return srm.simulate(mechanism, 1.0, rtol=1e-13, atol=1e-13, max_step=0.02, t_eval=SAMPLES)
+
+
 def observed_order(
     mechanism: Mechanism, method: srm.PSRM, steps: tuple[float, ...] | None = None
 ) -> float:
     steps = steps or STEPS[method.scheme.name]
-    reference = srm.simulate(mechanism, 1.0, rtol=1e-13, atol=1e-13, max_step=0.02, t_eval=SAMPLES)
+    reference = reference_of(mechanism)
     errors = []
     for h in steps:
         solution = srm.simulate(mechanism, 1.0, method=method, step=h, t_eval=SAMPLES)

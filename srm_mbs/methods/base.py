@@ -151,6 +151,8 @@ class StepResult:
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
+    quiet
+        Whether the whole step is so far from singular configurations that nothing needs a look.
     gap
         Largest closure error before a full correction, in row units, rows that are not in use
         included; 0 if the correction is partial.
@@ -177,6 +179,7 @@ class StepResult:
     drift_ratio: float = 0.0
     off: float = 0.0
     placement: str = ""
+    quiet: bool = False
     gap: float = 0.0
     held: bool = False
     normals: FloatArray | None = None

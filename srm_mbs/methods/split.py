@@ -107,6 +107,8 @@ def split_step(
     else:
         correction = np.zeros(0)
         new_state, end_rate, multiplier = x, rate.copy(), None
+    change = abs(terms.sigma - memory.sigma)
+    quiet = branch is None and terms.sigma > WATCHED + FAR * change
     gap = 0.0
     due = memory.steps < GAP_EVERY or memory.steps % GAP_EVERY == 0
     if due and history is not None and theta == 1.0:
@@ -137,6 +139,7 @@ def split_step(
         history=history if weak_stages else None,
         multiplier=multiplier,
         magnitude=magnitude,
+        quiet=quiet,
         gap=gap,
         held=held,
         normals=normals,

@@ -74,7 +74,7 @@ class BranchGuard:
 
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a step whose velocity turned; otherwise the inner control's verdict."""
-        suspect = result is not None and self.suspect(result)
+        suspect = result is not None and not result.quiet and self.suspect(result)
         if suspect and self._tries < MAX_REDONE:
             self._limit = 0.5 * proposal.h
             self._tries += 1
@@ -82,7 +82,8 @@ class BranchGuard:
             return Verdict.REPLACED
         verdict = self._inner.judge(proposal, result)
         if verdict is Verdict.ACCEPTED and result is not None:
-            self._passages.watch(proposal.t_new, result)
+            if not result.quiet:
+                self._passages.watch(proposal.t_new, result)
             if suspect:
                 self.suspects.append(proposal.t_new)
             self._limit = np.inf

@@ -164,20 +164,27 @@ class SingularityPlacement:
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a badly placed step; otherwise the inner control's verdict."""
         h = proposal.h
-        slope = 0.0 if result is None else sigma_slope(self._inverse, result.sigmas, h)
-        if result is not None and self._redone < MAX_REDONE:
-            last = proposal.t_new >= self._t_end
-            better = self._better_step(h, result.sigmas, slope, last)
-            if better is not None and 0.0 < better < h:
-                self._redo = better
-                self._redone += 1
-                self.replaced += 1
-                return Verdict.REPLACED
+        if result is None:
+            slope = 0.0
+        elif result.quiet:
+            sigmas, (k, c) = result.sigmas, self._middle
+            start = float(sigmas[0])
+            slope = max(abs(sigmas[-1] - start), abs(sigmas[k] - start) / c if c else 0.0) / h
+        else:
+            slope = sigma_slope(self._inverse, result.sigmas, h)
+            if self._redone < MAX_REDONE:
+                last = proposal.t_new >= self._t_end
+                better = self._better_step(h, result.sigmas, slope, last)
+                if better is not None and 0.0 < better < h:
+                    self._redo = better
+                    self._redone += 1
+                    self.replaced += 1
+                    return Verdict.REPLACED
         verdict = self._inner.judge(proposal, result)
         self._redo = None
         self._redone = 0
         if verdict is Verdict.ACCEPTED and result is not None:
             self._slope = max(slope, 0.5 * self._slope)
-            ahead = zero_ahead(*self._middle, result.sigmas)
+            ahead = None if result.quiet else zero_ahead(*self._middle, result.sigmas)
             self._zero = None if ahead is None else result.t + h * ahead
         return verdict

@@ -21,7 +21,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import ErrorNorm, Memory
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.zone import ZONE_FLOOR, zone_from
+from srm_mbs.methods.zone import ZONE_LARGEST, zone_from
 from srm_mbs.systems.base import System, Terms, Zone
 
 WATCHED = 0.05
@@ -81,11 +81,11 @@ class BranchStages:
         # All stages of a step or none: a mixture of both loses the order.
         reach = NEAR * self.sigma_change if self.sigma_change > 0.0 else WATCHED
         self.near = self.memory.sigma < reach
-        threshold = ZONE_FLOOR
+        threshold = ZONE_LARGEST
         if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
-            threshold = self.known_from(ZONE_FLOOR)
+            threshold = self.known_from(ZONE_LARGEST)
         self.zone = zone_from(self.history, threshold, self.end)
-        if self.zone is not None and threshold < ZONE_FLOOR and self.lingers(threshold):
+        if self.zone is not None and threshold < ZONE_LARGEST and self.lingers(threshold):
             self.zone = replace(self.zone, predict=lambda _: None)
 
     def __call__(

@@ -5,9 +5,10 @@ from __future__ import annotations
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.systems.base import Zone
 
-ZONE_FLOOR = 1e-3
-"""Smallest sigma_z; smaller values failed at tight tolerances."""
-COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_FLOOR
+ZONE_LARGEST = 1e-3
+"""Largest sigma_z: the zone starts here where rounding exceeds the tolerance, or there is none
+(fixed steps), and later otherwise (:meth:`~srm_mbs.methods.branch.BranchStages.known_from`)."""
+COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_LARGEST
 """h * slope of sigma from which the uncertainty of the predicted multiplier counts as error;
 counting it always would trap the step-size control next to the singular configuration."""
 

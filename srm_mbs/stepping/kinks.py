@@ -1,7 +1,7 @@
 r"""Zeros of sigma, from its values at the stages of a step.
 
 sigma is the modulus of a smooth quantity: at a passage it has a kink.  With the sign turned behind
-it, a polynomial of low degree explains the values; without, it does not.
+it, the values follow a polynomial of low degree.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 
-CLEARLY_BETTER = 0.2
-"""A sign change must reduce the residual of the fit to less than this fraction."""
 AHEAD = 3.0
 """Zeros are looked for within this many steps."""
 

@@ -19,7 +19,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.methods.base import ErrorNorm, Memory
 from srm_mbs.methods.history import WINDOW, MultiplierHistory
 from srm_mbs.methods.psrm import PSRM
-from srm_mbs.methods.zone import ZONE_FLOOR
+from srm_mbs.methods.zone import ZONE_LARGEST
 from srm_mbs.systems.base import Zone
 from srm_mbs.systems.branch_limit import branch_next_to
 from srm_mbs.systems.closure_geometry import ClosureGeometry
@@ -34,7 +34,7 @@ SHARE = 1.0
 BLOCKS = 12
 LEFT = 0.02
 """sigma from which the singular configuration has been left."""
-DIRECT_SIGMA = ZONE_FLOOR
+DIRECT_SIGMA = ZONE_LARGEST
 """sigma from which a node is solved directly."""
 ROUNDS = 8
 CONVERGED = 1e-11

@@ -24,8 +24,6 @@ SIGMA_CHANGE = 0.5
 """Largest change of sigma in one step, by the slope of the last steps."""
 TOO_CLOSE = 0.05
 """A stage is too close if sigma < TOO_CLOSE * slope * h, and nearer to zero than the start."""
-FAR_ENOUGH = 0.15
-"""A step that starts nearer to the zero than this fraction of its reach is leaving it."""
 CLEARANCE = 0.6
 """Distance of the zero from the abscissae that is good enough, over half the widest gap."""
 MAX_REDONE = 3

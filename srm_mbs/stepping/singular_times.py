@@ -21,7 +21,6 @@ from srm_mbs.methods.base import Memory, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.placement import (
-    FAR_ENOUGH,
     TOO_CLOSE,
     SingularityPlacement,
     inverse_abscissae,
@@ -33,6 +32,8 @@ PLACEMENTS = ("automatic", "halved", "off")
 """What is done around singular configurations that sigma shows."""
 CLEARANCE = 0.05
 """Smallest distance of a stage from a given time, as a fraction of the step."""
+FAR_ENOUGH = 0.15
+"""A step that starts nearer to the zero than this fraction of its reach is leaving it."""
 AHEAD = 0.15
 """Smallest distance from the end of a step to a given time after it, as a fraction of the step;
 the next step could pass a nearer one only by being very short."""

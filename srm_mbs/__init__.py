@@ -21,8 +21,16 @@ if TYPE_CHECKING:
         SrmError,
         SrmWarning,
     )
+    from srm_mbs.forces import (
+        FORCE_TYPES,
+        Bushing,
+        JointTorque,
+        SpringDamper,
+        TorsionSpring,
+        Wrench,
+    )
     from srm_mbs.loading import bundled_models, load, n_four_bar
-    from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
+    from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure, Mechanism
     from srm_mbs.methods.butcher import ButcherTableau
     from srm_mbs.methods.psrm import PSRM
     from srm_mbs.methods.srm import SRM
@@ -36,10 +44,14 @@ _HOME = {
     "Anchor": "mechanism",
     "Assembly": "assembly",
     "AssemblyError": "errors",
+    "Bushing": "forces",
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
     "DaeSolution": "dae",
+    "FORCE_TYPES": "forces",
+    "ForceElement": "mechanism",
     "InputError": "errors",
+    "JointTorque": "forces",
     "LoopClosure": "mechanism",
     "Mechanism": "mechanism",
     "PSRM": "methods.psrm",
@@ -47,9 +59,12 @@ _HOME = {
     "SemiExplicitDAE": "semi_explicit",
     "SimulationError": "errors",
     "Solution": "solution",
+    "SpringDamper": "forces",
     "SrmError": "errors",
     "SrmWarning": "errors",
     "TABLEAUS": "methods.tableaus",
+    "TorsionSpring": "forces",
+    "Wrench": "forces",
     "assemble": "assembly",
     "bundled_models": "loading",
     "load": "loading",
@@ -61,22 +76,29 @@ _HOME = {
 
 __all__ = [
     "CLOSURE_TYPES",
+    "FORCE_TYPES",
     "PSRM",
     "SRM",
     "TABLEAUS",
     "Anchor",
     "Assembly",
     "AssemblyError",
+    "Bushing",
     "ButcherTableau",
     "DaeSolution",
+    "ForceElement",
     "InputError",
+    "JointTorque",
     "LoopClosure",
     "Mechanism",
     "SemiExplicitDAE",
     "SimulationError",
     "Solution",
+    "SpringDamper",
     "SrmError",
     "SrmWarning",
+    "TorsionSpring",
+    "Wrench",
     "assemble",
     "bundled_models",
     "load",

@@ -298,11 +298,11 @@ def _first(*values: float | None) -> float:
 @app.command()
 @_reported()
 def info(model: Model) -> None:
-    """Print degrees of freedom, joints and loops of a mechanism.
+    """Print degrees of freedom, joints, loops and force elements of a mechanism.
 
     With the rank of its closure rows, the rows that are redundant, and the start.
     """
-    from srm_mbs.summary import joint_rows, loop_rows, mechanism_rows
+    from srm_mbs.summary import force_rows, joint_rows, loop_rows, mechanism_rows
 
     mechanism = srm_mbs.load(model)
     _table(mechanism_rows(mechanism))
@@ -311,6 +311,9 @@ def info(model: Model) -> None:
     if mechanism.loops:
         typer.echo()
         _table(loop_rows(mechanism), ("loop", "type", "anchor a", "anchor b", "gap at the start"))
+    if mechanism.forces:
+        typer.echo()
+        _table(force_rows(mechanism), ("force", "type", "acts on", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
     if notes:
         typer.echo()

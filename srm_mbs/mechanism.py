@@ -1,4 +1,4 @@
-"""Immutable descriptions: anchors, loop closures, mechanisms.
+"""Immutable descriptions: anchors, loop closures, mechanisms, and what a force element is.
 
 Nothing here computes; :mod:`srm_mbs.systems` evaluates a mechanism.  A ``pin.Model`` cannot be
 frozen: the package treats it as constant and never attaches anything to it, and so should you.
@@ -6,10 +6,11 @@ frozen: the package treats it as constant and never attaches anything to it, and
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -25,15 +26,28 @@ WORLD = "world"
 """Reserved link name: the fixed ground."""
 
 
-def _vector(values: Sequence[float], what: str) -> tuple[float, float, float]:
-    array = np.asarray(values, dtype=float)
-    if array.shape != (3,) or not np.isfinite(array).all():
+def finite_numbers(values: Any, count: int, what: str, remedy: str) -> tuple[float, ...]:
+    """``values`` as a tuple of ``count`` finite floats.
+
+    Raises
+    ------
+    InputError
+        About the element ``what``, with that ``remedy``, if they are anything else.
+    """
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (count,) or not np.isfinite(array).all():
         raise InputError(
-            f"{what} must be three finite numbers, not {values!r}",
-            element=what,
-            remedy="Give [x, y, z]",
+            f"{what} must be {count} finite numbers, not {values!r}", element=what, remedy=remedy
         )
-    return (float(array[0]), float(array[1]), float(array[2]))
+    return tuple(array.tolist())
+
+
+def _vector(values: Sequence[float], what: str) -> tuple[float, float, float]:
+    x, y, z = finite_numbers(values, 3, what, "Give [x, y, z]")
+    return (x, y, z)
 
 
 @dataclass(frozen=True)
@@ -170,6 +184,68 @@ class LoopClosure:
         return tuple(f"{self.name}.{label}" for label in self.rows.labels)
 
 
+class ForceElement(ABC):
+    """What acts on the joints or links of a mechanism; the kinds are in :mod:`srm_mbs.forces`.
+
+    Attributes
+    ----------
+    type
+        Its type in a description.
+    name
+        Unique name; by default made from the type and what the element acts on.
+    """
+
+    type: ClassVar[str]
+    name: str
+
+    @abstractmethod
+    def check(self, model: pin.Model) -> None:
+        """Refuse a joint, link or frame that ``model`` does not have or that cannot take the force.
+
+        Raises
+        ------
+        InputError
+            Naming the element and the remedy.
+        """
+
+
+def resolve_apart(
+    model: pin.Model, a: Anchor, b: Anchor, element: str
+) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
+    """Both anchors of ``element`` as in :meth:`Anchor.resolve`, on two different bodies.
+
+    Raises
+    ------
+    InputError
+        If the model has no such link or frame, or both lie on the same body.
+    """
+    resolved = []
+    for side, anchor in (("a", a), ("b", b)):
+        try:
+            resolved.append(anchor.resolve(model))
+        except InputError as error:
+            error.element = f"{element}, anchor {side}"
+            raise
+    if resolved[0][0] == resolved[1][0]:
+        raise InputError(
+            "both anchors lie on the same body",
+            element=element,
+            remedy="Anchor it on two bodies that move relative to each other "
+            "(locked and fixed joints join bodies)",
+        )
+    return resolved[0], resolved[1]
+
+
+def _check_names(what: str, names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"the {what} name {name!r} is used twice",
+                element=f"{what} {name!r}",
+                remedy=f"Give every {what} its own name",
+            )
+
+
 @dataclass(frozen=True)
 class Source:
     """Where a mechanism came from: enough to load it again, and to draw it.
@@ -244,6 +320,8 @@ class Mechanism:
     q0 : (nq,), v0 : (nv,)
         Initial state; by default the neutral configuration at rest.  :func:`srm_mbs.load`
         assembles it; from a ``pin.Model`` in hand use :func:`srm_mbs.assemble`.
+    forces
+        Force elements (:mod:`srm_mbs.forces`); names must be unique.
     name
         Name in messages and plots.
     source, defaults, notes
@@ -253,15 +331,16 @@ class Mechanism:
     Raises
     ------
     InputError
-        If loop names repeat, an anchor is unknown, a shape does not fit, the joints of the model
-        are not in depth-first order, or it has joint friction or mimic joints, which this version
-        does not simulate.
+        If names repeat, an anchor or the joint of a force is unknown, a shape does not fit, the
+        joints of the model are not in depth-first order, or it has joint friction or mimic joints,
+        which this version does not simulate.
     """
 
     model: pin.Model
     loops: tuple[LoopClosure, ...] = ()
     q0: FloatArray = None  # type: ignore[assignment]
     v0: FloatArray = None  # type: ignore[assignment]
+    forces: tuple[ForceElement, ...] = ()
     name: str = ""
     source: Source | None = None
     defaults: SimulationDefaults = field(default_factory=SimulationDefaults)
@@ -290,28 +369,13 @@ class Mechanism:
             )
         set_(self, "q0", q0)
         set_(self, "v0", _frozen_array(v0, (model.nv,), "v0"))
-        names = [loop.name for loop in self.loops]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(
-                    f"the loop name {name!r} is used twice",
-                    element=f"loop {name!r}",
-                    remedy="Give every loop its own name",
-                )
+        _check_names("loop", [loop.name for loop in self.loops])
         for loop in self.loops:
-            for side, anchor in (("a", loop.a), ("b", loop.b)):
-                try:
-                    anchor.resolve(model)
-                except InputError as error:
-                    error.element = f"loop {loop.name!r}, anchor {side}"
-                    raise
-            if loop.a.resolve(model)[0] == loop.b.resolve(model)[0]:
-                raise InputError(
-                    "both anchors lie on the same body",
-                    element=f"loop {loop.name!r}",
-                    remedy="Anchor it on two bodies that move relative to each other "
-                    "(locked and fixed joints join bodies)",
-                )
+            resolve_apart(model, loop.a, loop.b, f"loop {loop.name!r}")
+        set_(self, "forces", tuple(self.forces))
+        _check_names("force", [force.name for force in self.forces])
+        for force in self.forces:
+            force.check(model)
         if np.any(model.friction != 0.0):
             raise InputError(
                 "joint friction is not simulated by this version",
@@ -368,5 +432,6 @@ class Mechanism:
     def __repr__(self) -> str:
         return (
             f"Mechanism({self.name!r}, joints={list(self.joint_names)}, "
-            f"loops={[loop.name for loop in self.loops]})"
+            f"loops={[loop.name for loop in self.loops]}, "
+            f"forces={[force.name for force in self.forces]})"
         )

@@ -270,7 +270,10 @@ class Solution:
 
     @cached_property
     def energy(self) -> FloatArray:
-        """Kinetic plus potential energy (n,) J."""
+        """Kinetic plus potential energy (n,) J: gravity, springs and bushings.
+
+        Constant torques and wrenches have no potential here.
+        """
         return np.array([self._system.energy(np.concatenate(x)) for x in zip(self.q, self.v)])
 
     @cached_property

@@ -16,8 +16,16 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
+from srm_mbs.forces import FORCE_TYPES
 from srm_mbs.loading import rebuild
-from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism, SimulationDefaults, Source
+from srm_mbs.mechanism import (
+    Anchor,
+    ForceElement,
+    LoopClosure,
+    Mechanism,
+    SimulationDefaults,
+    Source,
+)
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
@@ -26,7 +34,7 @@ from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure
 from srm_mbs.systems.units import Units
 
-FORMAT = 2
+FORMAT = 3
 _STEP_ARRAYS = (
     "times",
     "states",
@@ -68,6 +76,7 @@ def save_solution(solution: Solution, path: Path) -> None:
             "source": None if mechanism.source is None else asdict(mechanism.source),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
             "loops": [asdict(loop) for loop in mechanism.loops],
+            "forces": [_force_entry(force) for force in mechanism.forces],
             "defaults": asdict(mechanism.defaults),
             "notes": mechanism.notes,
         },
@@ -109,6 +118,19 @@ def save_solution(solution: Solution, path: Path) -> None:
         np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
 
 
+def _force_entry(force: ForceElement) -> dict[str, Any]:
+    return {"type": force.type} | asdict(force)  # type: ignore[call-overload,no-any-return]
+
+
+def _force(entry: dict[str, Any]) -> ForceElement:
+    values = {
+        key: Anchor(**value) if isinstance(value, dict) else value
+        for key, value in entry.items()
+        if key != "type"
+    }
+    return FORCE_TYPES[entry["type"]](**values)
+
+
 def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:
     if entry["source"] is not None:
         source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
@@ -132,6 +154,7 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         tuple(loops),
         q0=arrays["q0"],
         v0=arrays["v0"],
+        forces=tuple(_force(force) for force in entry["forces"]),
         name=entry["name"],
         source=source,
         defaults=SimulationDefaults(**entry["defaults"]),

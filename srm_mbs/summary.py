@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import fields
 
 import numpy as np
 
@@ -90,6 +91,23 @@ def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
         gaps = [(own[:positions], "m"), (own[positions:], "rad")]
         gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
         yield loop.name, loop.type, _anchor(loop.a), _anchor(loop.b), gap
+
+
+def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, type, what it acts on, values with units) of each force element."""
+    for force in mechanism.forces:
+        places, values = [], []
+        for key in fields(force):  # type: ignore[arg-type]
+            value = getattr(force, key.name)
+            if isinstance(value, Anchor):
+                places.append(_anchor(value))
+            elif key.name == "joint":
+                places.append(value)
+            elif key.name != "name":
+                text = f"{value:.6g}" if isinstance(value, float) else value
+                text = _vector(value) if isinstance(value, tuple) else text
+                values.append(f"{key.name} {text} {key.metadata.get('unit', '')}".rstrip())
+        yield force.name, force.type, ", ".join(places), ", ".join(values)
 
 
 def _anchor(anchor: Anchor) -> str:

@@ -18,7 +18,7 @@ LAYERS = (
     ("arrays", "errors", "semi_explicit"),
     ("closures",),
     ("mechanism",),
-    ("coordinates", "systems"),
+    ("coordinates", "forces", "systems"),
     ("methods",),
     ("stepping",),
     ("closing",),

@@ -143,7 +143,6 @@ DESCRIPTION_FAULTS = {
     "unknown key in initial": ("v = {", "w = {", ("initial.w", "q, v, guess")),
     "unknown key in simulation": ("t_end", "tend", ("simulation.tend", "t_end, rtol, atol")),
     "unknown table": ("[simulation]", "[simulations]", ("simulations", "unknown key")),
-    "a force": ("[simulation]", '[[force]]\ntype = "torque"\n[simulation]', ("force", "Remove")),
     "a drive": ("[simulation]", '[[drive]]\njoint = "hinge"\n[simulation]', ("drive", "Remove")),
     "an SDF": ("urdf =", 'sdf = "a.sdf"\nurdf =', ("sdf", "give a URDF", "Remove")),
     "an MJCF": ("urdf =", 'mjcf = "a.xml"\nurdf =', ("mjcf", "give a URDF", "Remove")),

@@ -36,6 +36,7 @@ KNOWN = {
     "slider_crank_whirl": (2, 1, ()),
     "spatial_four_bar": (5, 3, ()),
     "spatial_dead_point": (4, 2, ()),
+    "squeezing_mechanism": (7, 6, ("pin_k3.y", "pin_k4.y", "pin_k6.y")),
 }
 CLOSED_MODELS = tuple(name for name in KNOWN if KNOWN[name][1])
 

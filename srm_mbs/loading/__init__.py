@@ -18,7 +18,13 @@ from srm_mbs.assembly import assemble
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.loading.bundled import bundled_models, generated_size, models_folder
-from srm_mbs.loading.description import LARGEST, Description, parse_description
+from srm_mbs.loading.description import (
+    LARGEST,
+    Description,
+    TorqueEntry,
+    TorsionSpringEntry,
+    parse_description,
+)
 from srm_mbs.loading.generated import n_four_bar as _n_four_bar_texts
 from srm_mbs.loading.urdf import (
     ROOT_JOINTS,
@@ -63,6 +69,11 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
         ("initial.q", list(description.initial.q)),
         ("initial.v", list(description.initial.v)),
         ("initial.guess", list(description.initial.guess)),
+        *(
+            (f"force[{i}].joint", [force.joint])
+            for i, force in enumerate(description.force)
+            if isinstance(force, TorqueEntry | TorsionSpringEntry)
+        ),
     ]
     for where, names in places:
         for name in names:
@@ -73,6 +84,14 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
                     element=where,
                     remedy=f"Known: {', '.join(known)}",
                 )
+    for i, force in enumerate(description.force):
+        if isinstance(force, TorqueEntry | TorsionSpringEntry) and force.joint in description.lock:
+            raise InputError(
+                f"joint {force.joint!r} is locked",
+                file=file,
+                element=f"force[{i}].joint",
+                remedy="Remove the force, or the joint from lock",
+            )
     for i, name in enumerate(description.lock):
         if name in description.lock[:i]:
             raise InputError(
@@ -100,20 +119,19 @@ def _element(where: str) -> Iterator[None]:
 
 def _check_frames(description: Description, model: pin.Model) -> None:
     """Refuse an anchor's frame name that means two different frames, say a joint's and a link's."""
-    for i, loop in enumerate(description.loop):
-        for side, anchor in (("a", loop.a), ("b", loop.b)):
-            if anchor.frame is None:
-                continue
-            first, *others = [f for f in model.frames if f.name == anchor.frame] or [None]
-            for other in others:
-                if other.parentJoint != first.parentJoint or not other.placement.isApprox(
-                    first.placement, 1e-12
-                ):
-                    raise InputError(
-                        f"the name {anchor.frame!r} belongs to a joint and to another joint's link",
-                        element=f"loop[{i}].{side}.frame",
-                        remedy="Rename one of them in the URDF, or write link = instead of frame =",
-                    )
+    for where, anchor in description.anchors():
+        if anchor.frame is None:
+            continue
+        first, *others = [f for f in model.frames if f.name == anchor.frame] or [None]
+        for other in others:
+            if other.parentJoint != first.parentJoint or not other.placement.isApprox(
+                first.placement, 1e-12
+            ):
+                raise InputError(
+                    f"the name {anchor.frame!r} belongs to a joint and to another joint's link",
+                    element=f"{where}.frame",
+                    remedy="Rename one of them in the URDF, or write link = instead of frame =",
+                )
 
 
 def _without_locked(
@@ -159,6 +177,7 @@ def _unassembled(
     mechanism = Mechanism(
         model,
         description.closures(),
+        forces=description.force_elements(),
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),

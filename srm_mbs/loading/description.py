@@ -7,6 +7,8 @@ file, the key and the remedy.
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, StrictStr, ValidationError
@@ -14,7 +16,8 @@ from pydantic_core import PydanticCustomError
 
 from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import Anchor, LoopClosure
+from srm_mbs.forces import FORCE_TYPES
+from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure
 
 LARGEST = 1e30
 """Numbers beyond this have lost their meaning, and their squares may overflow."""
@@ -36,11 +39,11 @@ def _joint_value(value: Any) -> float | list[float]:
 
 Number = Annotated[float, PlainValidator(_number)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+SixNumbers = Annotated[list[Number], Field(min_length=6, max_length=6)]
 JointValue = Annotated[float | list[float], PlainValidator(_joint_value)]
 Base = Literal["fixed", "floating", "planar"]
 
 LATER = {
-    "force": "force elements are not read by this version; use a controller for them",
     "drive": "drives are not read by this version",
     "sdf": "SDF files are not read by this version; give a URDF",
     "mjcf": "MJCF files are not read by this version; give a URDF",
@@ -51,6 +54,7 @@ PROBLEMS = {
     "string_type": ("a text is wanted", "Put it in quotes"),
     "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
     "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "model_attributes_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
     "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
     "number": (None, "Give a finite number"),
     "greater_than": (None, "Give a positive number"),
@@ -84,6 +88,75 @@ class LoopEntry(_Strict):
     axis: Vector | None = None
 
 
+class ForceEntry(_Strict):
+    """What every ``[[force]]`` has; ``type`` tells which of the following it is."""
+
+    type: str
+    name: StrictStr = ""
+
+
+class SpringDamperEntry(ForceEntry):
+    """A ``[[force]]`` of type ``spring_damper``; the keys are those of the element."""
+
+    type: Literal["spring_damper"]
+    a: AnchorEntry
+    b: AnchorEntry
+    stiffness: Number = 0.0
+    damping: Number = 0.0
+    rest_length: Number | None = None
+
+
+class TorqueEntry(ForceEntry):
+    """A ``[[force]]`` of type ``torque``."""
+
+    type: Literal["torque"]
+    joint: StrictStr
+    torque: JointValue
+
+
+class TorsionSpringEntry(ForceEntry):
+    """A ``[[force]]`` of type ``torsion_spring``."""
+
+    type: Literal["torsion_spring"]
+    joint: StrictStr
+    stiffness: Number = 0.0
+    damping: Number = 0.0
+    rest_angle: Number = 0.0
+
+
+class WrenchEntry(ForceEntry):
+    """A ``[[force]]`` of type ``wrench``."""
+
+    type: Literal["wrench"]
+    at: AnchorEntry
+    force: Vector = [0.0, 0.0, 0.0]
+    moment: Vector = [0.0, 0.0, 0.0]
+    frame: Literal["world", "link"] = "world"
+
+
+class BushingEntry(ForceEntry):
+    """A ``[[force]]`` of type ``bushing``."""
+
+    type: Literal["bushing"]
+    a: AnchorEntry
+    b: AnchorEntry
+    stiffness: SixNumbers = [0.0] * 6
+    damping: SixNumbers = [0.0] * 6
+
+
+AnyForceEntry = Annotated[
+    SpringDamperEntry | TorqueEntry | TorsionSpringEntry | WrenchEntry | BushingEntry,
+    Field(discriminator="type"),
+]
+FORCE_ENTRIES: dict[str, type[ForceEntry]] = {
+    "spring_damper": SpringDamperEntry,
+    "torque": TorqueEntry,
+    "torsion_spring": TorsionSpringEntry,
+    "wrench": WrenchEntry,
+    "bushing": BushingEntry,
+}
+
+
 class InitialEntry(_Strict):
     """``[initial]``: held positions and rates, and guesses, by joint name."""
 
@@ -110,6 +183,7 @@ class Description(_Strict):
     gravity: Vector = [0.0, 0.0, -9.81]
     lock: list[StrictStr] = []
     loop: list[LoopEntry] = []
+    force: list[AnyForceEntry] = []
     initial: InitialEntry = InitialEntry()
     simulation: SimulationEntry = SimulationEntry()
 
@@ -123,31 +197,75 @@ class Description(_Strict):
         """
         out = []
         for i, entry in enumerate(self.loop):
-            label = f"loop {entry.name!r}" if entry.name else f"loop[{i}]"
-            try:
-                anchors = {}
-                for side, given in (("a", entry.a), ("b", entry.b)):
-                    label_side = f"{label}, anchor {side}"
-                    try:
-                        anchors[side] = Anchor(
-                            given.link, given.frame, _triple(given.xyz), _triple(given.rpy)
-                        )
-                    except InputError as error:
-                        what = "" if error.element == "anchor" else f": {error.element}"
-                        error.element = label_side + what
-                        raise
+            with _labelled("loop", i, entry.name) as label:
+                a, b = (_anchor(label, side, getattr(entry, side)) for side in "ab")
                 axis = None if entry.axis is None else _triple(entry.axis)
-                out.append(LoopClosure(entry.type, anchors["a"], anchors["b"], axis, entry.name))
-            except InputError as error:
-                if not (error.element or "").startswith("loop"):
-                    error.element = f"{label}: {error.element}" if error.element else label
-                raise
+                out.append(LoopClosure(entry.type, a, b, axis, entry.name))
         return tuple(out)
+
+    def anchors(self) -> Iterator[tuple[str, AnchorEntry]]:
+        """Every anchor with its key, ``loop[0].a`` for example."""
+        entries: list[tuple[str, Iterable[tuple[str, Any]]]] = [
+            *((f"loop[{i}]", entry) for i, entry in enumerate(self.loop)),
+            *((f"force[{i}]", entry) for i, entry in enumerate(self.force)),
+        ]
+        for where, entry in entries:
+            for key, value in entry:
+                if isinstance(value, AnchorEntry):
+                    yield f"{where}.{key}", value
+
+    def force_elements(self) -> tuple[ForceElement, ...]:
+        """The force elements.
+
+        Raises
+        ------
+        InputError
+            For a value that an element cannot take, or an anchor without link or frame.
+        """
+        out = []
+        for i, entry in enumerate(self.force):
+            with _labelled("force", i, entry.name) as label:
+                values = {
+                    key: _anchor(label, key, value) if isinstance(value, AnchorEntry) else value
+                    for key, value in entry
+                    if key != "type"
+                }
+                out.append(FORCE_TYPES[entry.type](**values))
+        return tuple(out)
+
+
+@contextmanager
+def _labelled(kind: str, index: int, name: str) -> Iterator[str]:
+    """Call an element by its name or number in errors that do not name it yet."""
+    label = f"{kind} {name!r}" if name else f"{kind}[{index}]"
+    try:
+        yield label
+    except InputError as error:
+        if not (error.element or "").startswith(kind):
+            error.element = f"{label}: {error.element}" if error.element else label
+        raise
+
+
+def _anchor(label: str, side: str, given: AnchorEntry) -> Anchor:
+    try:
+        return Anchor(given.link, given.frame, _triple(given.xyz), _triple(given.rpy))
+    except InputError as error:
+        what = "" if error.element == "anchor" else f": {error.element}"
+        error.element = f"{label}, anchor {side}{what}"
+        raise
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:
     x, y, z = values
     return (x, y, z)
+
+
+def _location(error: Any) -> tuple[int | str, ...]:
+    """Where an error is, without the type of force that pydantic puts behind its number."""
+    location: tuple[int | str, ...] = error["loc"]
+    if location[:1] == ("force",) and len(location) > 2 and location[2] in FORCE_TYPES:
+        return (*location[:2], *location[3:])
+    return location
 
 
 def _key_path(location: tuple[int | str, ...]) -> str:
@@ -161,7 +279,10 @@ def _key_path(location: tuple[int | str, ...]) -> str:
 
 
 def _known_keys(location: tuple[int | str, ...]) -> str:
+    """Keys of the table that holds ``location``, a location of pydantic's."""
     table: type[_Strict] = Description
+    if location[0] == "force" and len(location) > 2:
+        table = FORCE_ENTRIES[str(location[2])]
     for part in location[:-1]:
         if isinstance(part, int) or part not in table.model_fields:
             continue
@@ -175,13 +296,19 @@ def _known_keys(location: tuple[int | str, ...]) -> str:
 def _explain(error: ValidationError) -> tuple[str, str, str | None]:
     """Key, problem and remedy of the first thing that is wrong."""
     first = error.errors()[0]
-    location = first["loc"]
+    location = _location(first)
     key = _key_path(location)
     if first["type"] == "extra_forbidden":
         name = str(location[-1])
         if len(location) == 1 and name in LATER:
             return key, LATER[name], "Remove it"
-        return key, f"unknown key {name!r}", f"Known here: {_known_keys(location)}"
+        return key, f"unknown key {name!r}", f"Known here: {_known_keys(first['loc'])}"
+    if first["type"] == "union_tag_not_found":
+        return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"
+    if first["type"] == "union_tag_invalid":
+        tag = first["input"]["type"]
+        known = f"This version knows {', '.join(FORCE_TYPES)}"
+        return f"{key}.type", f"there is no force type {_shown(tag)}", known
     if first["type"] == "missing":
         return key, "this key is missing", "Add it"
     message = f"{first['msg'][0].lower()}{first['msg'][1:]}"

@@ -1,8 +1,9 @@
 r"""A mechanism as a system: Pinocchio terms, closures, and the answers of a stage.
 
-    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0,   f = tau - nle(q, v) - damping v.
+    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0,   f = tau - nle(q, v) - damping v,
 
-Only this module, ``loops`` and the load-time analysis call Pinocchio algorithms.
+tau from the controller and the force elements.  Only this module, ``loops``, ``forces`` and the
+load-time analysis call Pinocchio algorithms.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from srm_mbs.systems.charts import (
     group_joints,
     planar_translation,
 )
+from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import Projection
 from srm_mbs.systems.units import row_units
@@ -54,6 +56,7 @@ class _Mechanics:
         self.evaluations = 0
         self._controller = controller
         self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
+        self._forces = ForceKinematics(self.model, mechanism.forces) if mechanism.forces else None
         self._groups = group_joints(self.model)
         self._planar = tuple(joint for joint in self._groups if joint.group == "se2")
         self._flat = self.nq == self.nv
@@ -160,9 +163,10 @@ class _Mechanics:
         return ROTATION_PER_STEP / speed if speed > 0.0 else np.inf
 
     def energy(self, state: FloatArray) -> float:
-        """Kinetic plus potential energy (J)."""
+        """Kinetic plus potential energy (J), of gravity and springs."""
         q, v = self.split(state)
-        return float(pin.computeMechanicalEnergy(self.model, self.data, q, v))
+        energy = float(pin.computeMechanicalEnergy(self.model, self.data, q, v))
+        return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 
 class _OpenTerms:
@@ -222,6 +226,11 @@ class OpenSystem(_Mechanics):
         self.evaluations += 1
         q, v = state[: self.nq], state[self.nq :]
         force = self.applied_force(t, q, v)
+        if self._forces is not None:
+            pin.forwardKinematics(self.model, self.data, q, v)
+            pin.computeJointJacobians(self.model, self.data)
+            elements = self._forces.generalised(self.data, q, v)
+            force = elements if force is None else force + elements
         rate = self._terms._rate
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(
@@ -352,6 +361,8 @@ class ClosedSystem(_Mechanics):
         force = self.applied_force(t, q, v)
         if force is not None:
             f += force
+        if self._forces is not None:
+            f += self._forces.generalised(data, q, v)
         loops = self.loops
         loops.update(data)
         projection = self.projection

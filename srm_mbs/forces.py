@@ -1,0 +1,303 @@
+"""Force elements as immutable descriptions; :mod:`srm_mbs.systems.forces` evaluates them.
+
+The energy of springs and bushings is part of ``solution.energy``; torques and wrenches have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.errors import InputError
+from srm_mbs.mechanism import Anchor, ForceElement, finite_numbers, resolve_apart
+
+
+def _in(unit: str, default: Any) -> Any:
+    """A field with a unit, for tables."""
+    return field(default=default, metadata={"unit": unit})
+
+
+def _fault(force: ForceElement, problem: str, remedy: str) -> InputError:
+    return InputError(problem, element=f"force {force.name!r}", remedy=remedy)
+
+
+def _take_name(force: ForceElement, *places: str) -> None:
+    """The default name, if none is given."""
+    if not force.name:
+        object.__setattr__(force, "name", "_".join((force.type, *places)))
+
+
+def _take(force: ForceElement, key: str, count: int = 0, lowest: float = -np.inf) -> Any:
+    """Check a number, or ``count`` numbers, of ``force`` and store them as float or tuple."""
+    given = getattr(force, key)
+    remedy = f"Give a list of {count} finite numbers" if count else "Give a finite number"
+    try:
+        numbers = finite_numbers(given if count else (given,), count or 1, key, remedy)
+    except InputError as error:
+        raise _fault(force, f"{key} = {given!r} cannot be", remedy) from error
+    if min(numbers) < lowest:
+        raise _fault(force, f"{key} = {given!r} is negative", "Give a value >= 0")
+    value = numbers if count else numbers[0]
+    object.__setattr__(force, key, value)
+    return value
+
+
+def _take_rates(force: ForceElement, count: int = 0) -> None:
+    """Check stiffness and damping: not negative, not both zero."""
+    given = [_take(force, key, count, 0.0) for key in ("stiffness", "damping")]
+    if not np.any(given):
+        raise _fault(
+            force, "stiffness and damping are zero", "Give one of them, or remove the element"
+        )
+
+
+def _joint(force: ForceElement, model: pin.Model, name: str) -> Any:
+    names = list(model.names)[1:]
+    if name not in names:
+        raise _fault(
+            force, f"there is no moving joint {name!r}", f"Known: {', '.join(names) or 'none'}"
+        )
+    return model.joints[model.getJointId(name)]
+
+
+@dataclass(frozen=True)
+class SpringDamper(ForceElement):
+    """Spring and damper between two points, along the line that joins them.
+
+    With the distance l of the points it pulls them together with F = k (l - l0) + c dl/dt.
+
+    Parameters
+    ----------
+    a, b
+        Anchors on different bodies; their orientation does not matter.
+    stiffness, damping
+        k in N/m and c in N s/m, not negative.
+    rest_length
+        l0 in m; needed where there is stiffness.
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For a value that is negative, missing or not finite.
+
+    Notes
+    -----
+    Where the points coincide the line has no direction.  If l0 = 0 the force is continuous there in
+    any motion and acts; otherwise that state cannot be evaluated, and a run that meets it says so.
+    """
+
+    type: ClassVar[str] = "spring_damper"
+    a: Anchor
+    b: Anchor
+    stiffness: float = _in("N/m", 0.0)
+    damping: float = _in("N s/m", 0.0)
+    rest_length: float | None = _in("m", None)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_name(self, self.a.where, self.b.where)
+        _take_rates(self)
+        if self.rest_length is None:
+            if self.stiffness:
+                raise _fault(
+                    self, "a spring needs a rest_length", "Give the length without force, in m"
+                )
+            object.__setattr__(self, "rest_length", 0.0)
+        _take(self, "rest_length", 0, 0.0)
+
+    def check(self, model: pin.Model) -> None:
+        resolve_apart(model, self.a, self.b, f"force {self.name!r}")
+
+
+@dataclass(frozen=True)
+class JointTorque(ForceElement):
+    """A constant generalised force on a joint.
+
+    Parameters
+    ----------
+    joint
+        Its name.
+    torque
+        N m (prismatic: N), in the positive sense of the joint; for a joint of several degrees of
+        freedom one number for each, in Pinocchio's order.
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For a value that is not finite.
+    """
+
+    type: ClassVar[str] = "torque"
+    joint: str
+    torque: float | tuple[float, ...] = _in("N m, N", 0.0)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_name(self, self.joint)
+        several = np.ndim(self.torque) > 0
+        _take(self, "torque", np.size(self.torque) if several else 0)
+
+    def check(self, model: pin.Model) -> None:
+        joint = _joint(self, model, self.joint)
+        if np.size(self.torque) != joint.nv:
+            raise _fault(
+                self,
+                f"torque = {self.torque!r} does not fit the {joint.nv} degrees of freedom of "
+                f"joint {self.joint!r}",
+                "Give one number" if joint.nv == 1 else f"Give a list of {joint.nv} numbers",
+            )
+
+
+@dataclass(frozen=True)
+class TorsionSpring(ForceElement):
+    """Spring and damper on the coordinate of a one-degree joint: tau = -k (q - q_0) - c dq/dt.
+
+    Parameters
+    ----------
+    joint
+        Name of a revolute or prismatic joint; for a continuous one, whose angle (cos, sin) does not
+        count turns, only damping is possible.
+    stiffness, damping
+        k in N m/rad and c in N m s/rad (prismatic: N/m, N s/m), not negative.
+    rest_angle
+        q_0 in rad (prismatic: m).
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For a value that is negative or not finite.
+    """
+
+    type: ClassVar[str] = "torsion_spring"
+    joint: str
+    stiffness: float = _in("N m/rad, N/m", 0.0)
+    damping: float = _in("N m s/rad, N s/m", 0.0)
+    rest_angle: float = _in("rad, m", 0.0)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_name(self, self.joint)
+        _take_rates(self)
+        _take(self, "rest_angle")
+
+    def check(self, model: pin.Model) -> None:
+        joint = _joint(self, model, self.joint)
+        if joint.nv != 1:
+            raise _fault(
+                self,
+                f"joint {self.joint!r} has {joint.nv} degrees of freedom",
+                "Use a bushing between its links",
+            )
+        if joint.nq != 1 and self.stiffness:
+            raise _fault(
+                self,
+                f"the angle of the continuous joint {self.joint!r} does not count turns",
+                'Make the joint "revolute" in the URDF, with wide limits: they do not act',
+            )
+
+
+@dataclass(frozen=True)
+class Wrench(ForceElement):
+    """A constant force and moment on a link.
+
+    Parameters
+    ----------
+    at
+        Where the force takes hold: an anchor on a moving link.
+    force : (3,) N, moment : (3,) N m
+        Components in the axes of ``frame``.
+    frame
+        ``"world"``, or ``"link"`` for the axes of the anchor, which turn with the link.
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite, both zero, or another ``frame``.
+    """
+
+    type: ClassVar[str] = "wrench"
+    at: Anchor
+    force: tuple[float, float, float] = _in("N", (0.0, 0.0, 0.0))
+    moment: tuple[float, float, float] = _in("N m", (0.0, 0.0, 0.0))
+    frame: Literal["world", "link"] = "world"
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_name(self, self.at.where)
+        if not np.any([_take(self, "force", 3), _take(self, "moment", 3)]):
+            raise _fault(
+                self, "force and moment are zero", "Give one of them, or remove the element"
+            )
+        if self.frame not in ("world", "link"):
+            raise _fault(self, f"there is no frame {self.frame!r}", 'Give "world" or "link"')
+
+    def check(self, model: pin.Model) -> None:
+        try:
+            joint, _ = self.at.resolve(model)
+        except InputError as error:
+            error.element = f"force {self.name!r}, anchor at"
+            raise
+        if joint == 0:
+            raise _fault(
+                self, f"{self.at.where!r} does not move", "Let the wrench act on a moving link"
+            )
+
+
+@dataclass(frozen=True)
+class Bushing(ForceElement):
+    """Spring and damper in all six directions between two frames.
+
+    Let p be the position of a's origin in b's frame and phi the rotation vector (log3) of a's axes
+    against b's.  The energy is (p . Kt p + phi . Kr phi)/2 with diagonal Kt, Kr, the power lost
+    dp/dt . Ct dp/dt + dphi/dt . Cr dphi/dt; force and moment follow by virtual work.
+    For small rotations they are -Kt p - Ct dp/dt and -Kr phi - Cr w, with the relative angular
+    velocity w; the energy balance is exact for any rotation below pi.
+
+    Parameters
+    ----------
+    a, b
+        Anchors on different bodies; relaxed where they coincide.
+    stiffness : (6,), damping : (6,)
+        Three for the translation (N/m, N s/m), then three for the rotation (N m/rad, N m s/rad),
+        along the axes of b; not negative.
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For a value that is negative or not finite.
+    """
+
+    type: ClassVar[str] = "bushing"
+    a: Anchor
+    b: Anchor
+    stiffness: Sequence[float] = _in("N/m, N m/rad", (0.0,) * 6)
+    damping: Sequence[float] = _in("N s/m, N m s/rad", (0.0,) * 6)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_name(self, self.a.where, self.b.where)
+        _take_rates(self, 6)
+
+    def check(self, model: pin.Model) -> None:
+        resolve_apart(model, self.a, self.b, f"force {self.name!r}")
+
+
+FORCE_TYPES: Mapping[str, Callable[..., ForceElement]] = MappingProxyType(
+    {kind.type: kind for kind in (SpringDamper, JointTorque, TorsionSpring, Wrench, Bushing)}
+)
+"""The force elements by their type in a description."""

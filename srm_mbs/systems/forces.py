@@ -1,0 +1,223 @@
+r"""Generalised forces of the force elements, from the kinematics of one evaluation.
+
+A wrench W = (f, m) in world axes about the world origin that acts on body a, and -W on body b, is
+
+    tau = (J_a - J_b)^T W
+
+with J the world-frame joint Jacobian: all elements between bodies are reduced to that.  Velocities
+are spatial, in world axes at the world origin; that of a point p is v_lin + w x p.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
+from srm_mbs.forces import Bushing, JointTorque, SpringDamper, TorsionSpring, Wrench
+from srm_mbs.mechanism import Anchor, ForceElement
+from srm_mbs.systems.loops import cross, support, world_jacobian
+
+COINCIDENT = 1e-9
+"""Distance over rest length below which the line between two points has no direction."""
+
+
+class _Evaluator(Protocol):
+    """One element, resolved against a model.  ``data`` holds placements, velocities and J."""
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+        """Add the element's generalised forces to ``tau`` (nv,)."""
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        """Its potential energy (J); ``data`` need hold the placements only."""
+
+
+class _Held:
+    """An anchor: a frame on a body."""
+
+    def __init__(self, model: pin.Model, anchor: Anchor) -> None:
+        self.joint, self.inside = anchor.resolve(model)
+        self.support = support(model, self.joint)
+
+    def placement(self, data: pin.Data) -> pin.SE3:
+        return data.oMi[self.joint] * self.inside if self.joint else self.inside
+
+    def velocity(self, data: pin.Data) -> pin.Motion:
+        """Spatial velocity of the body, in world axes at the world origin."""
+        joint = self.joint
+        return data.oMi[joint].act(data.v[joint]) if joint else pin.Motion.Zero()
+
+
+def _about_origin(force: FloatArray, moment: FloatArray, point: FloatArray) -> FloatArray:
+    """The wrench (6,) of a force at ``point`` and a moment, about the world origin."""
+    return np.concatenate([force, moment + cross(point, force)])
+
+
+def _point_velocity(body: pin.Motion, point: FloatArray) -> FloatArray:
+    out: FloatArray = body.linear + cross(body.angular, point)
+    return out
+
+
+class _SpringDamper:
+    def __init__(self, model: pin.Model, force: SpringDamper) -> None:
+        self.name = force.name
+        self.a, self.b = _Held(model, force.a), _Held(model, force.b)
+        self.support = self.a.support - self.b.support
+        self.stiffness, self.damping = force.stiffness, force.damping
+        self.rest_length = float(force.rest_length or 0.0)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+        at_a = self.a.placement(data).translation
+        at_b = self.b.placement(data).translation
+        apart = at_a - at_b
+        length = sqrt(apart @ apart)
+        if length < COINCIDENT * self.rest_length:
+            raise EvaluationError(
+                f"the two points of the force {self.name!r} coincide: its direction is not "
+                "determined"
+            )
+        # k (l - l0) apart/l, without dividing where l = l0 = 0.
+        force = -self.stiffness * apart
+        if self.rest_length:
+            force *= 1.0 - self.rest_length / length
+        if self.damping:
+            rate = _point_velocity(self.a.velocity(data), at_a)
+            rate -= _point_velocity(self.b.velocity(data), at_b)
+            # Points that meet move along the line that joins them.
+            along = apart * ((apart / length) @ rate / length) if length else rate
+            force -= self.damping * along
+        tau += (world_jacobian(data).T @ _about_origin(force, np.zeros(3), at_a)) * self.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        apart = self.a.placement(data).translation - self.b.placement(data).translation
+        return 0.5 * self.stiffness * (sqrt(apart @ apart) - self.rest_length) ** 2
+
+
+class _JointTorque:
+    def __init__(self, model: pin.Model, force: JointTorque) -> None:
+        joint = model.joints[model.getJointId(force.joint)]
+        self.own = slice(joint.idx_v, joint.idx_v + joint.nv)
+        self.torque = np.atleast_1d(np.array(force.torque))
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+        tau[self.own] += self.torque
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.0
+
+
+class _TorsionSpring:
+    def __init__(self, model: pin.Model, force: TorsionSpring) -> None:
+        joint = model.joints[model.getJointId(force.joint)]
+        self.in_q, self.in_v = joint.idx_q, joint.idx_v
+        self.stiffness, self.damping = force.stiffness, force.damping
+        self.rest_angle = force.rest_angle
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+        turned = q[self.in_q] - self.rest_angle
+        tau[self.in_v] -= self.stiffness * turned + self.damping * v[self.in_v]
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.5 * self.stiffness * float(q[self.in_q] - self.rest_angle) ** 2
+
+
+class _Wrench:
+    def __init__(self, model: pin.Model, force: Wrench) -> None:
+        self.at = _Held(model, force.at)
+        self.turns = force.frame == "link"
+        self.force, self.moment = np.array(force.force), np.array(force.moment)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+        at = self.at.placement(data)
+        force, moment = self.force, self.moment
+        if self.turns:
+            force, moment = at.rotation @ force, at.rotation @ moment
+        wrench = _about_origin(force, moment, at.translation)
+        tau += (world_jacobian(data).T @ wrench) * self.at.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.0
+
+
+class _Bushing:
+    def __init__(self, model: pin.Model, force: Bushing) -> None:
+        self.a, self.b = _Held(model, force.a), _Held(model, force.b)
+        self.support = self.a.support - self.b.support
+        self.stiffness, self.damping = np.array(force.stiffness), np.array(force.damping)
+        self.damped = bool(np.any(self.damping))
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+        Ta, Tb = self.a.placement(data), self.b.placement(data)
+        relative = Tb.actInv(Ta)
+        turn = pin.log3(relative.rotation)
+        # dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
+        L = pin.Jlog3(relative.rotation)
+        force = self.stiffness[:3] * relative.translation
+        moment = self.stiffness[3:] * turn
+        if self.damped:
+            # b's axes and origin move along: what is left is the motion seen from b.
+            W = self.a.velocity(data) - self.b.velocity(data)
+            rate = Tb.rotation.T @ _point_velocity(W, Ta.translation)
+            spin = L.T @ (Tb.rotation.T @ W.angular)
+            force = force + self.damping[:3] * rate
+            moment = moment + self.damping[3:] * spin
+        wrench = _about_origin(
+            -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment)), Ta.translation
+        )
+        tau += (world_jacobian(data).T @ wrench) * self.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        relative = self.b.placement(data).actInv(self.a.placement(data))
+        moved = np.concatenate([relative.translation, pin.log3(relative.rotation)])
+        return 0.5 * float(self.stiffness @ (moved * moved))
+
+
+_EVALUATORS = {
+    SpringDamper: _SpringDamper,
+    JointTorque: _JointTorque,
+    TorsionSpring: _TorsionSpring,
+    Wrench: _Wrench,
+    Bushing: _Bushing,
+}
+
+
+class ForceKinematics:
+    """All force elements of a mechanism.
+
+    Parameters
+    ----------
+    model, forces
+        The tree and its elements.
+    """
+
+    def __init__(self, model: pin.Model, forces: Sequence[ForceElement]) -> None:
+        self._nv = model.nv
+        self._elements: list[_Evaluator] = [
+            _EVALUATORS[type(force)](model, force) for force in forces
+        ]
+
+    def generalised(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
+        """tau (nv,) in N and N m at q (nq,), v (nv,).
+
+        ``data`` must hold placements, velocities and the world Jacobian at that state: of crba in
+        the WORLD convention and nonLinearEffects, or of forwardKinematics and
+        computeJointJacobians.
+
+        Raises
+        ------
+        EvaluationError
+            If the points of a spring with a rest length coincide.
+        """
+        tau = np.zeros(self._nv)
+        for element in self._elements:
+            element.add(tau, data, q, v)
+        return tau
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        """Potential energy (J) of springs and bushings; ``data`` must hold the placements."""
+        return sum(element.energy(data, q) for element in self._elements)

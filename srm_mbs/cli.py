@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -376,6 +377,32 @@ def plot(
     _check_output(path, "--out", FORMATS)
     solution.plot(path)
     typer.echo(f"written: {path}")
+
+
+@app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...]",
+    add_help_option=False,
+)
+@_reported()
+def benchmark(context: typer.Context) -> None:
+    """Measure run time against error beside other simulators (in a checkout only).
+
+    The options are those of 'python -m benchmarks.work_precision'.
+    """
+    harness = Path("benchmarks", "work_precision", "__main__.py")
+    if not harness.is_file():
+        raise InputError(
+            "the benchmark is not installed with the package, and there is none in this folder",
+            file=str(harness),
+            element="benchmark",
+            remedy="Run it at the top of a checkout of the source",
+        )
+    # A process of its own: it reads the number of threads before it loads anything.
+    command = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
+    status = subprocess.run(command, check=False).returncode
+    if status:
+        raise typer.Exit(status)
 
 
 def main() -> None:

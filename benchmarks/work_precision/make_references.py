@@ -1,0 +1,86 @@
+"""Compute the stored references again.
+
+    python -m benchmarks.work_precision.make_references [PROBLEM ...]
+
+One-degree problems: the reduced equation in extended precision, extrapolated midpoint rule of order
+16, with two step sizes.  Others: the index-1 equations from Pinocchio's kinematics by a dense KKT
+solve, Gauss collocation of order 12 with a projection after every step and two step sizes, and
+SciPy's DOP853 near round-off without one; their largest difference is the accuracy that is stored.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from benchmarks.work_precision.problems import PROBLEMS
+from benchmarks.work_precision.problems.base import Array, Problem
+from benchmarks.work_precision.references import (
+    Reference,
+    by_gauss,
+    by_scipy,
+    reduced_reference,
+    write,
+)
+from benchmarks.work_precision.trees import Equations
+
+SUBSTEPS = (10, 12)
+"""Steps from one sample to the next, of the two runs."""
+
+
+def reduced(problem: Problem) -> Reference:
+    """From the one-degree model."""
+    model = problem.reduced
+    if model is None:
+        raise ValueError(f"{problem.name} has no reduced model")
+    reference = reduced_reference(model.field, model.start, problem.times)
+    scipy = by_scipy(model.field, np.array(model.start), problem.times)
+    print(f"  SciPy near round-off differs by {np.abs(scipy - reference.observed).max():.1e}")
+    return reference
+
+
+def index_one(problem: Problem) -> Reference:
+    """From the index-1 equations of the peers' tree."""
+    tree = problem.tree
+    equations = Equations(tree)
+    nq = tree.model.nq
+
+    def field(t: float, y: Array) -> Array:
+        q, v = equations.normalised(y[:nq]), y[nq:]
+        return np.concatenate([equations.position_rate(q, v), equations.acceleration(q, v)[0]])
+
+    def project(y: Array) -> Array:
+        return np.concatenate(equations.projected(equations.normalised(y[:nq]), y[nq:]))
+
+    def observed(y: Array) -> Array:
+        return problem.observe(y[:, :nq], y[:, nq:])
+
+    start = np.concatenate([tree.q0, tree.v0])
+    runs = [observed(by_gauss(field, start, problem.times, k, project=project)) for k in SUBSTEPS]
+    other = observed(by_scipy(field, start, problem.times))
+    differences = [np.abs(run - runs[1]) for run in (runs[0], other)]
+    for difference in differences:
+        difference[:, problem.rates :] /= problem.rate_unit
+    print(f"  other step: {differences[0].max():.1e}; SciPy: {differences[1].max():.1e}")
+    return Reference(
+        runs[1],
+        float(max(difference.max() for difference in differences)),
+        "index-1 equations by a dense KKT solve, Gauss collocation of order 12 with projection; "
+        "SciPy's DOP853 near round-off, without, differs by no more than the accuracy",
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("problems", nargs="*", metavar="PROBLEM", help=", ".join(PROBLEMS))
+    for name in parser.parse_args().problems or PROBLEMS:
+        print(name, flush=True)
+        problem = PROBLEMS[name]()
+        reference = index_one(problem) if problem.reduced is None else reduced(problem)
+        path = write(name, reference)
+        print(f"  {path.name}: accuracy {reference.accuracy:.1e}")
+
+
+if __name__ == "__main__":
+    main()

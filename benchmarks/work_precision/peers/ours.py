@@ -1,0 +1,78 @@
+"""This package, with its defaults; the tableau and the backend are the variants."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+import srm_mbs as srm
+from benchmarks.work_precision.peers.base import (
+    Array,
+    Outcome,
+    Peer,
+    Run,
+    RunFailedError,
+    Runner,
+    Setting,
+)
+from benchmarks.work_precision.problems.base import Problem
+from srm_mbs.simulation import BACKENDS
+
+TOLERANCES = tuple(10.0**-k for k in range(4, 13))
+"""1e-4 is the loosest that ``simulate`` takes."""
+
+
+class Ours(Peer):
+    """``srm.simulate`` and its dense output at the samples."""
+
+    name = "ours"
+    title = "srm_mbs"
+    modules = ("srm_mbs",)
+
+    def variants(self) -> list[str]:
+        """``tableau, backend``; the Python backend apart where there is another."""
+        out = ["dop853, auto", "dopr54, auto"]
+        return [*out, "dop853, python"] if "kernel" in BACKENDS else out
+
+    def settings(self, problem: Problem) -> Sequence[Setting]:
+        return [Setting("rtol", tol, name) for name in self.variants() for tol in TOLERANCES]
+
+    def everyday(self, problem: Problem) -> Setting:
+        return Setting("rtol", 1e-8, "dop853, auto")
+
+    def prepare(self, problem: Problem) -> Runner:
+        mechanism = problem.mechanism
+        _ = mechanism.structure  # the analysis of the closures, done once per mechanism
+        times = problem.times
+        observe = problem.observe_ours or problem.observe
+
+        def at(setting: Setting) -> Run:
+            tableau, backend = setting.variant.split(", ")
+
+            def run() -> Outcome:
+                solution = srm.simulate(
+                    mechanism, problem.t_end, rtol=setting.value, tableau=tableau, backend=backend
+                )
+                if not solution.success:
+                    raise RunFailedError(solution.message)
+                q, v = solution(times)
+
+                def drift() -> float:
+                    return float(solution.at(times).drift[:, 0].max())
+
+                def energy() -> Array:
+                    return solution.at(np.concatenate([[0.0], times])).energy
+
+                stats = solution.stats
+                return Outcome(
+                    stats.evaluations,
+                    stats.steps,
+                    observed=lambda: observe(q, v),
+                    own_drift=drift,
+                    own_energy=energy,
+                )
+
+            return run
+
+        return at

@@ -1,0 +1,190 @@
+"""Cost per evaluation and per step against size, beside ``pin.constraintDynamics``.
+
+N-four-bars for loops, open chains for coordinates.  ``evaluation``: one evaluation with its rate in
+Python; ``run``: a whole run with the default backend over its evaluations.  The parts of an
+evaluation are Pinocchio's calls, and LAPACK's on matrices of the same size; the rest of it is
+Python, and what a run takes more than its evaluations is stepping.
+"""
+
+from __future__ import annotations
+
+import time
+import timeit
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg import lapack
+
+import srm_mbs as srm
+from benchmarks.work_precision import timing
+from benchmarks.work_precision.peers.pinocchio_dynamics import PinocchioDynamics
+from benchmarks.work_precision.problems.base import Problem
+from benchmarks.work_precision.problems.n_four_bars import n_four_bar
+from benchmarks.work_precision.records import Results
+from srm_mbs.systems.multibody import make_system
+
+LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
+LINKS = (3, 6, 12, 24, 48, 96)
+LONGEST_LOAD = 120.0
+"""CPU seconds: sizes whose load-time analysis would take longer are left out of our columns."""
+RTOL = 1e-8
+STEPS = 60
+"""About how many steps the measured runs take."""
+
+
+def per_call(call: Callable[[], Any], repeats: int, seconds: float = 0.02) -> float:
+    """Least CPU microseconds of one call."""
+    start = time.process_time()
+    call()
+    once = max(time.process_time() - start, 1e-7)
+    number = max(1, int(seconds / once))
+    best = min(timeit.repeat(call, number=number, repeat=repeats, timer=time.process_time))
+    return 1e6 * best / number
+
+
+def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
+    """Microseconds of an evaluation, of Pinocchio in it, and of LAPACK in it."""
+    system = make_system(mechanism)
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    model, data = mechanism.model, mechanism.model.createData()
+    q, v = np.array(mechanism.q0), np.array(mechanism.v0)
+    zero = np.zeros(model.nv)
+
+    def kinematics() -> None:
+        if system.has_constraints:
+            pin.crba(model, data, q, pin.Convention.WORLD)
+            pin.nonLinearEffects(model, data, q, v)
+        else:
+            pin.aba(model, data, q, v, zero)
+
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    M = np.array(data.M)
+    rank = mechanism.structure.rank
+    G = np.random.default_rng(0).standard_normal((int(mechanism.structure.kept.sum()), model.nv))
+
+    def algebra() -> None:
+        if not system.has_constraints:
+            return
+        U, _ = lapack.dpotrf(M, lower=0)
+        right = np.empty((model.nv, len(G) + 1), order="F")
+        right[:, :-1] = G.T
+        white = lapack.dtrtrs(U, right, lower=0, trans=1)[0]
+        packed, _, tau, _, _ = lapack.dgeqp3(white[:, :-1])
+        lapack.dorgqr(packed[:, :rank], tau[:rank])
+        lapack.dtrtrs(packed[:rank, :rank], zero[:rank], lower=0, trans=1)
+        lapack.dtrtrs(U, right[:, 0], lower=0, trans=0)
+
+    return {
+        "evaluation": per_call(lambda: system.evaluate(0.0, state).rate(), repeats),
+        "pinocchio": per_call(kinematics, repeats),
+        "lapack": per_call(algebra, repeats),
+    }
+
+
+def run_cost(mechanism: srm.Mechanism, backend: str, repeats: int) -> tuple[float, float]:
+    """CPU microseconds per evaluation and per step of whole runs of about ``STEPS`` steps."""
+    probe = srm.simulate(mechanism, 0.5, rtol=RTOL, backend=backend)
+    t_end = 0.5 * STEPS / max(probe.stats.steps, 1)
+    solution = srm.simulate(mechanism, t_end, rtol=RTOL, backend=backend)
+    cpu, _ = timing.repeated(
+        lambda: srm.simulate(mechanism, t_end, rtol=RTOL, backend=backend), repeats
+    )
+    stats = solution.stats
+    return 1e6 * cpu.least / stats.evaluations, 1e6 * cpu.least / max(stats.steps, 1)
+
+
+def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
+    found = parts(mechanism, repeats)
+    python, _ = run_cost(mechanism, "python", repeats)
+    auto, step = run_cost(mechanism, "auto", repeats)
+    evaluation = min(found["evaluation"], python)
+    return {
+        "run, per evaluation (us)": auto,
+        "run, per step (us)": step,
+        "Python run, per evaluation (us)": python,
+        "Pinocchio (us)": found["pinocchio"],
+        "LAPACK (us)": found["lapack"],
+        "of a Python run: Pinocchio": found["pinocchio"] / python,
+        "LAPACK": found["lapack"] / python,
+        "Python in evaluations": (evaluation - found["pinocchio"] - found["lapack"]) / python,
+        "stepping": (python - evaluation) / python,
+    }
+
+
+def chain(links: int) -> srm.Mechanism:
+    """An open chain of equal bars, released from a bent position."""
+    model = pin.Model()
+    model.name = f"chain_{links}"
+    parent = 0
+    length = 1.0 / links
+    bar = pin.Inertia(length, np.array([length / 2.0, 0.0, 0.0]), np.eye(3) * length**3 / 12.0)
+    for k in range(links):
+        offset = np.array([length if k else 0.0, 0.0, 0.0])
+        parent = model.addJoint(parent, pin.JointModelRY(), pin.SE3(np.eye(3), offset), f"link_{k}")
+        model.appendBodyToJoint(parent, bar, pin.SE3.Identity())
+        model.addBodyFrame(f"link_{k}", parent, pin.SE3.Identity(), 0)
+    return srm.Mechanism(model, q0=np.full(links, 0.3 / links), v0=np.zeros(links))
+
+
+NOT_OURS = (
+    "run, per evaluation (us)",
+    "run, per step (us)",
+    "Python run, per evaluation (us)",
+    "Pinocchio (us)",
+    "LAPACK (us)",
+    "of a Python run: Pinocchio",
+    "LAPACK",
+    "Python in evaluations",
+    "stepping",
+)
+
+
+def _theirs(problem: Problem, repeats: int) -> float:
+    dynamics = PinocchioDynamics(problem)
+    q, v = problem.tree.q0, problem.tree.v0
+    return per_call(lambda: dynamics.acceleration(q, v), repeats)
+
+
+def measure_scaling(
+    results: Results, *, repeats: int, thin: bool, say: Callable[[str], None]
+) -> None:
+    """Fill ``results.scaling``: rows by number of loops, and by number of links."""
+    loops: list[dict[str, Any]] = []
+    results.scaling["Closed loops, N-four-bar"] = loops
+    load = 0.0
+    for n in LOOPS[:2] if thin else LOOPS:
+        problem = n_four_bar(n)
+        row: dict[str, Any] = {"loops": n, "nv": 2 * n + 1}
+        if load * 8.0 <= LONGEST_LOAD:
+            load = timing.once(lambda problem=problem: problem.mechanism.structure)[0]
+            row["load and analysis (s)"] = load
+            ours = _ours(problem.mechanism, repeats)
+        else:
+            row["load and analysis (s)"] = None
+            ours = dict.fromkeys(NOT_OURS)
+        row |= ours
+        theirs = _theirs(problem, repeats) if row["load and analysis (s)"] is not None else None
+        row["constraintDynamics (us)"] = theirs
+        per_evaluation = row["run, per evaluation (us)"]
+        row["ours / constraintDynamics"] = per_evaluation / theirs if theirs else None
+        loops.append(row)
+        say(f"scaling: N = {n}: {per_evaluation} us per evaluation, constraintDynamics {theirs} us")
+    links: list[dict[str, Any]] = []
+    results.scaling["Open chains, coordinates"] = links
+    for n in LINKS[:2] if thin else LINKS:
+        mechanism = chain(n)
+        row = {"nv": n, **_ours(mechanism, repeats)}
+        data = mechanism.model.createData()
+        q, v, zero = np.array(mechanism.q0), np.array(mechanism.v0), np.zeros(n)
+        theirs = per_call(
+            lambda model=mechanism.model, data=data, q=q, v=v, zero=zero: pin.aba(
+                model, data, q, v, zero
+            ),
+            repeats,
+        )
+        row["aba (us)"] = theirs
+        row["ours / aba"] = row["run, per evaluation (us)"] / theirs
+        links.append(row)
+        say(f"scaling: {n} links: {row['run, per evaluation (us)']:.1f} us, aba {theirs:.1f} us")

@@ -1,0 +1,316 @@
+"""The work-precision benchmark, thinned: schema, counting rule, plots from JSON, missing peers."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from benchmarks.work_precision import plots, records, tables, threads, timing
+from benchmarks.work_precision.counting import Point, cheapest
+from benchmarks.work_precision.harness import attempt, errors_of, measure_problem
+from benchmarks.work_precision.peers import PEERS
+from benchmarks.work_precision.peers.base import Peer, Setting
+from benchmarks.work_precision.problems import PROBLEMS
+from benchmarks.work_precision.records import Measurement, Results
+from benchmarks.work_precision.references import by_extrapolation, by_gauss, by_scipy
+from benchmarks.work_precision.reliability import summary
+from benchmarks.work_precision.trees import Equations
+from srm_mbs.cli import app
+from srm_mbs.systems.multibody import make_system
+
+ROOT = Path(__file__).parent.parent
+
+
+def quiet(text: str) -> None:
+    pass
+
+
+class Absent(type(PEERS["mujoco"])):  # type: ignore[misc]
+    """A peer whose package nobody has."""
+
+    name = "absent"
+    modules = ("no_such_simulator",)
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    """One problem, us, the floor and a peer, a setting of every sweep; and a peer not installed."""
+    out = Results({"processor": "some"}, {"pin": pin.__version__}, {"repeats": 2})
+    peers: list[Peer] = [PEERS["ours"], PEERS["reduced"], PEERS["pinocchio_dop853"], Absent()]
+    said: list[str] = []
+    measure_problem(
+        PROBLEMS["slider_crank_regular"](),
+        peers,
+        out,
+        repeats=2,
+        choose=lambda settings: settings[1:7:3],
+        say=said.append,
+    )
+    out.settings["said"] = said
+    return out
+
+
+def test_a_measurement_has_error_drift_energy_evaluations_and_times_of_every_repeat(
+    results: Results, tmp_path: Path
+) -> None:
+    results.save(tmp_path / "results.json")
+    data = json.loads((tmp_path / "results.json").read_text())
+    assert data["schema"] == records.SCHEMA
+    problem = data["problems"]["slider_crank_regular"]
+    assert problem["reference_accuracy"] < 1e-11
+    assert (problem["nv"], problem["degrees_of_freedom"], problem["loops"]) == (2, 1, 1)
+    rows = [row for row in data["measurements"] if row["peer"] == "ours"]
+    assert len(rows) >= 2
+    for row in rows:
+        assert row["status"] == "ok"
+        assert row["evaluations"] > row["steps"] > 10
+        assert 0.0 < row["error"] < 10.0
+        assert 0.0 <= row["drift"] < 1e-3
+        assert 0.0 <= row["energy"] < 1.0
+        for clock in ("cpu", "wall"):
+            assert len(row[clock]["all"]) == 2
+            assert row[clock]["least"] == min(row[clock]["all"])
+            assert row[clock]["least"] <= row[clock]["median"] <= max(row[clock]["all"])
+    assert {row["peer"] for row in data["preparations"]} == {
+        "ours",
+        "reduced",
+        "pinocchio_dop853",
+    }
+
+
+def test_a_peer_that_is_not_installed_is_skipped_with_a_message(results: Results) -> None:
+    (skipped,) = [entry for entry in results.skipped if entry.peer == "absent"]
+    assert skipped.reason == "no_such_simulator is not installed"
+    assert any("absent" in line and "not installed" in line for line in results.settings["said"])
+    assert not any(row.peer == "absent" for row in results.measurements)
+
+
+def test_plots_and_tables_are_made_from_the_file_alone(results: Results, tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    results.save(path)
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from benchmarks.work_precision import plots, records, tables\n"
+        f"results = records.load(Path({str(path)!r}))\n"
+        f"print(*plots.draw(results, Path({str(tmp_path)!r})), sep='\\n')\n"
+        f"tables.write(results, Path({str(tmp_path)!r}))\n"
+        "assert 'benchmarks.work_precision.harness' not in sys.modules\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    (picture,) = run.stdout.split()
+    pixels = np.array(Image.open(picture).convert("L"))
+    assert pixels.std() > 5.0
+    text = (tmp_path / "tables.md").read_text()
+    for words in ("Ours beside the best peer", "slider_crank_regular", "hand-reduced ODE", "absent"):
+        assert words in text
+
+
+def test_a_setting_counts_only_if_every_tighter_one_reaches_the_level() -> None:
+    lucky = [
+        Point(1e-3, 1e-7, 1.0),
+        Point(1e-4, 1e-2, 2.0),
+        Point(1e-5, 1e-7, 3.0),
+        Point(1e-6, 1e-8, 4.0),
+    ]
+    found = cheapest(lucky, 1e-6)
+    assert found is not None
+    assert found.tightness == 1e-5
+    failed = [*lucky[:3], Point(1e-6, None, 0.0)]
+    assert cheapest(failed, 1e-6) is None
+    assert cheapest(lucky, 1e-8) is lucky[3]
+    assert cheapest(lucky[::-1], 1e-6) is lucky[2]
+    assert cheapest([], 1e-3) is None
+
+
+def test_ratios_take_our_default_against_the_best_variant_of_the_peers() -> None:
+    def row(peer: str, variant: str, tol: float, error: float, cost: float) -> Measurement:
+        times = {"least": cost, "median": cost, "all": [cost]}
+        return Measurement(
+            "p", peer, variant, "rtol", tol, "ok", error=error, cpu=times, wall=times
+        )
+
+    made = Results({}, {}, {}, problems={"p": {}}, peers={"ours": "", "reduced": "", "mujoco": ""})
+    made.measurements = [
+        row("ours", "dopr54, auto", 1e-4, 1e-9, 0.1),
+        row("ours", "dop853, auto", 1e-4, 1e-4, 2.0),
+        row("mujoco", "soft", 1e-3, 1e-4, 9.0),
+        row("mujoco", "hard", 1e-2, 1e-4, 1.0),
+        row("mujoco", "hard", 1e-3, 1e-1, 5.0),
+        row("reduced", "", 1e-3, 1e-4, 0.5),
+    ]
+    (ratios,) = tables.ratio_rows(made, 1e-3)
+    assert ratios["peer"].variant == "soft"
+    assert ratios["against_peer"] == 4.5
+    assert ratios["against_floor"] == 4.0
+    (ratios,) = tables.ratio_rows(made, 1e-6)
+    assert ratios["ours"] is None
+    assert ratios["against_peer"] is None
+
+
+def test_files_of_another_schema_are_refused(results: Results, tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    replace(results, schema=records.SCHEMA + 1).save(path)
+    with pytest.raises(ValueError, match="schema 2"):
+        records.load(path)
+
+
+def test_failed_runs_count_as_wrong_and_leave_median_or_worst_open() -> None:
+    assert summary([1e-9, 1e-3, 5.0]) == {"right": 2, "median": 1e-3, "worst": 5.0}
+    assert summary([1e-9, 1e-9, None]) == {"right": 2, "median": 1e-9, "worst": None}
+    assert summary([None, None, 1e-9]) == {"right": 1, "median": None, "worst": None}
+
+
+@pytest.mark.parametrize("name", [name for name in PROBLEMS if not name.endswith("_40")])
+def test_the_equations_of_the_peers_are_ours(name: str) -> None:
+    problem = PROBLEMS[name]()
+    tree = problem.tree
+    equations = Equations(tree)
+    mechanism = problem.mechanism
+    ours = make_system(mechanism).evaluate(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
+    if tree.closures:
+        g, G = equations.gaps(tree.q0)
+        assert np.abs(g).max() < 1e-12
+        assert np.abs(G @ tree.v0).max() < 1e-10 * max(1.0, np.abs(tree.v0).max())
+    theirs, _ = equations.acceleration(tree.q0, tree.v0)
+    nv = mechanism.model.nv
+    acceleration = ours.rate()[nv:]
+    if name.startswith("slider_crank"):  # another tree: the crank is in both
+        acceleration, theirs = acceleration[:1], theirs[:1]
+    scale = np.abs(acceleration).max() + 1.0
+    assert np.abs(acceleration - theirs).max() < 1e-9 * scale
+
+
+@pytest.mark.parametrize(
+    ("peer", "error"),
+    [
+        ("pinocchio_dop853", 1e-5),
+        ("pinocchio_dop853_baumgarte", 1e-4),
+        ("pinocchio_rk4_baumgarte", 1e-4),
+        ("pinocchio_rk4_projected", 1e-4),
+        ("mujoco", 1e-2),
+        ("sundials_ida", 1e-2),
+        ("scipy_dae_radau", 1e-4),
+    ],
+)
+def test_every_peer_simulates_the_spatial_robot(peer: str, error: float) -> None:
+    chosen = PEERS[peer]
+    if chosen.missing():
+        pytest.skip(f"{chosen.missing()} is not installed")
+    whole = PROBLEMS["walking_robot"]()
+    problem = replace(
+        whole,
+        t_end=0.1,
+        reference_of=lambda: replace(whole.reference, observed=whole.reference.observed[9:10]),
+    )
+    setting = chosen.everyday(problem)
+    if setting.kind == "rtol":
+        setting = replace(setting, value=1e-6)
+    else:
+        setting = Setting("step", 1e-3, setting.variant, setting.gain, 1)
+    outcome = attempt(problem, chosen.prepare(problem), setting)
+    assert not isinstance(outcome, str), outcome
+    q, v = outcome[0].states()
+    difference = np.abs(problem.observe(q, v)[-1] - problem.reference.observed[0])
+    assert difference.max() < error
+
+
+def test_references_agree_with_independent_integrators() -> None:
+    field = lambda t, y: np.array([y[1], -np.sin(y[0])])  # noqa: E731
+    times = np.linspace(0.0, 5.0, 6)[1:]
+    start = np.array([1.0, 0.5])
+    one = by_scipy(field, start, times)
+    two = by_extrapolation(field, start.astype(np.longdouble), times, 8)
+    three = by_gauss(field, start, times, 8)
+    assert np.abs(one - two).max() < 1e-12
+    assert np.abs(three - two).max() < 1e-12
+    whirl = PROBLEMS["slider_crank_whirl"]().reference.observed[-1]
+    np.testing.assert_allclose(whirl, [25.8858770871720776, 2.07434062447342553], atol=1e-12)
+
+
+def test_more_than_one_thread_is_refused() -> None:
+    environment = {"OMP_NUM_THREADS": "4"}
+    assert not threads.single_threaded(environment)
+    assert all(environment[name] == "1" for name in threads.VARIABLES)
+    assert threads.single_threaded(environment)
+    threads.check(1.0, 1.0)
+    with pytest.raises(RuntimeError, match="several threads"):
+        threads.check(2.0, 1.0)
+
+
+def test_times_are_those_of_the_calls() -> None:
+    calls: list[int] = []
+    cpu, wall = timing.repeated(lambda: calls.append(0), 7)
+    assert len(calls) == len(cpu.all) == len(wall.all) == 7
+    assert cpu.least == min(cpu.all) <= cpu.median
+
+
+def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["benchmark", "--out", "x"])
+    assert result.exit_code == 2
+    assert "checkout" in result.output
+
+
+def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
+    arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
+    chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]
+    run = subprocess.run(
+        [sys.executable, "-m", "srm_mbs.cli", "benchmark", *arguments, *chosen],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "[1/1]" in run.stdout
+    assert "written:" in run.stdout
+    results = records.load(tmp_path / "results.json")
+    assert {row.peer for row in results.measurements} == {"ours", "pinocchio_dop853"}
+    assert (tmp_path / "work_precision_pendulum_chain.png").is_file()
+    wrong = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "srm_mbs.cli",
+            "benchmark",
+            "--out",
+            str(tmp_path),
+            "--repeats",
+            "1",
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert wrong.returncode == 2
+    assert "at least 5 repeats" in wrong.stderr
+
+
+def test_energy_is_compared_with_the_start() -> None:
+    problem = PROBLEMS["pendulum_chain"]()
+    for name in ("ours", "pinocchio_dop853"):
+        peer = PEERS[name]
+        setting = replace(peer.everyday(problem), value=1e-8)
+        outcome = attempt(problem, peer.prepare(problem), setting)
+        assert not isinstance(outcome, str)
+        error, drift, energy = errors_of(problem, outcome[0])
+        assert error < 1e-3
+        assert drift == 0.0
+        assert energy is not None
+        assert 0.0 < energy < 1e-5
+    assert plots.STYLES.keys() == PEERS.keys()

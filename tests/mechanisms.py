@@ -137,11 +137,30 @@ def rescaled(
         x, y, z = anchor.xyz
         return replace(anchor, xyz=(x * length, y * length, z * length))
 
+    def pushed(element: srm.ForceElement) -> srm.ForceElement:
+        force = mass * length / time**2
+        if isinstance(element, srm.JointTorque):  # of a hinge
+            return replace(element, torque=float(np.float64(element.torque) * force * length))
+        assert isinstance(element, srm.SpringDamper)
+        return replace(
+            element,
+            a=moved(element.a),
+            b=moved(element.b),
+            stiffness=element.stiffness * (force / length),
+            damping=element.damping * (force / length * time),
+            rest_length=element.rest_length * length,  # type: ignore[operator]
+        )
+
     loops = tuple(replace(loop, a=moved(loop.a), b=moved(loop.b)) for loop in mechanism.loops)
     translation = mechanism.structure.units.coordinate != 1.0
     unit = np.where(translation, length, 1.0)
     return srm.Mechanism(
-        model, loops, q0=mechanism.q0 * unit, v0=mechanism.v0 * unit / time, name=mechanism.name
+        model,
+        loops,
+        q0=mechanism.q0 * unit,
+        v0=mechanism.v0 * unit / time,
+        forces=tuple(pushed(force) for force in mechanism.forces),
+        name=mechanism.name,
     )
 
 

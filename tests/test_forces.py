@@ -485,6 +485,33 @@ def test_a_bushing_is_linear_at_small_rotations() -> None:
     )
 
 
+# --- units --------------------------------------------------------------------------------------
+
+
+def test_at_rest_without_gravity_forces_give_the_unit_of_rates() -> None:
+    """The pull of a spring on one body; the other, and directions across it, do not count."""
+    model = two_free_bodies()
+    spring = srm.SpringDamper(srm.Anchor("one", xyz=(0.5, 0.0, 0.0)), GROUND, 300.0, 1.0, 0.2)
+    q = pin.neutral(model)
+    q[:3] = np.array(GROUND.xyz) - np.array([2.5, 0.0, 0.0])  # along the rod, through its centre
+    resting = srm.Mechanism(model, forces=(spring,), q0=q)
+    units = resting.structure.units
+    acceleration = 300.0 * (2.0 - 0.2) / 1.0
+    assert units.rate == pytest.approx(np.sqrt(acceleration / units.length), rel=1e-12)
+    moving = resting.with_state(q, np.full(12, 3.0))
+    expected = np.median([3.0 / units.length] * 6 + [3.0] * 6)
+    assert moving.structure.units.rate == pytest.approx(expected)
+    heavy = model.copy()
+    heavy.gravity.linear = np.array([0.0, 0.0, -9.81])
+    falling = srm.Mechanism(heavy, forces=(spring,), q0=q).structure.units
+    assert falling.rate == pytest.approx(np.sqrt(9.81 / units.length))
+
+
+def test_forces_that_cannot_be_evaluated_at_the_start_leave_the_unit_of_rates_at_one() -> None:
+    spring = srm.SpringDamper(srm.Anchor("ball"), srm.Anchor("world"), 8.0, 0.0, 0.5)
+    assert srm.Mechanism(point_on_slides(0.0), forces=(spring,)).structure.units.rate == 1.0
+
+
 # --- points that coincide -----------------------------------------------------------------------
 
 

@@ -64,6 +64,19 @@ def test_singular_passages_are_the_same_in_other_units(scale: dict[str, float]) 
     assert scaled.joint("crank")[0][-1] == pytest.approx(plain.joint("crank")[0][-1], abs=1e-5)
 
 
+@pytest.mark.parametrize("scale", ROUNDED, ids=str)
+def test_a_mechanism_driven_by_forces_takes_the_same_steps_in_other_units(
+    scale: dict[str, float],
+) -> None:
+    """Without gravity and at rest the unit of rates comes from the forces."""
+    mechanism = srm.load("squeezing_mechanism")
+    plain = srm.simulate(mechanism, 0.01, rtol=1e-7)
+    time = scale.get("time", 1.0)
+    scaled = srm.simulate(rescaled(mechanism, **scale), 0.01 * time, rtol=1e-7)
+    assert len(scaled.t) == len(plain.t)
+    assert np.allclose(relative_times(scaled, scale), plain.t, rtol=1e-4)
+
+
 UNITS = [{"length": 1000.0, "mass": 1e-6, "time": 1000.0}, {"length": 0.1, "mass": 1e3}]
 
 

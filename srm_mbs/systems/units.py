@@ -13,8 +13,14 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import LoopClosure, Mechanism
+from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.loops import world_jacobian
+from srm_mbs.systems.projection import cholesky, unwhiten, whiten
+
+ROUNDING = 1e-12
+"""Accelerations below this part of the largest are rounding of zero."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +35,9 @@ class Units:
         1 rad for angles, ``length`` for translations.
     rate
         Characteristic rate (1/s): sqrt(g / length); without gravity the median of the initial
-        rates over their units, as far as they are not zero; 1 if all are.  A fast rotor does not
-        loosen what is asked of the slow rest.
+        rates over their units, as far as they are not zero; at rest that of sqrt(|a| / unit), with
+        the accelerations a that the force elements give the open tree; 1 if there are none.  A
+        median, so that a fast rotor does not loosen what is asked of the slow rest.
     """
 
     length: float
@@ -70,7 +77,27 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
     angular = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
     coordinate = np.where(angular, 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
-    moving = np.abs(v[v != 0.0]) / coordinate[v != 0.0]
     if rate == 0.0:
-        rate = float(np.median(moving)) if moving.size else 1.0
+        rates = np.abs(v) / coordinate
+        if not rates.any() and mechanism.forces:
+            pulled = np.abs(_acceleration_by_forces(mechanism, q)) / coordinate
+            rates = np.sqrt(np.where(pulled > ROUNDING * pulled.max(), pulled, 0.0))
+        rates = rates[rates > 0.0]
+        rate = float(np.median(rates)) if rates.size else 1.0
     return Units(length, coordinate, rate)
+
+
+def _acceleration_by_forces(mechanism: Mechanism, q: FloatArray) -> FloatArray:
+    """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
+    model = mechanism.model
+    data = model.createData()
+    rest = np.zeros(model.nv)
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    pin.nonLinearEffects(model, data, q, rest)
+    try:
+        tau = ForceKinematics(model, mechanism.forces).generalised(data, q, rest)
+        U = cholesky(data.M)
+    except EvaluationError:  # a run from here says why
+        return rest
+    out: FloatArray = unwhiten(U, whiten(U, tau))
+    return out

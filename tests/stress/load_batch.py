@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
+from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.loops import LoopKinematics
 
 
@@ -23,6 +24,7 @@ def fingerprint(mechanism: srm.Mechanism) -> dict[str, Any]:
     data = model.createData()
     rng = np.random.default_rng(0)
     rows = LoopKinematics(model, mechanism.loops)
+    forces = ForceKinematics(model, mechanism.forces)
     tree: list[Any] = [joint.shortname() for joint in model.joints]
     loops: list[Any] = []
     for _ in range(3):
@@ -31,7 +33,8 @@ def fingerprint(mechanism: srm.Mechanism) -> dict[str, Any]:
         pin.crba(model, data, q, pin.Convention.WORLD)
         pin.nonLinearEffects(model, data, q, v)
         rows.update(data)
-        force = data.nle + model.damping * v
+        force = data.nle + model.damping * v + model.friction * np.tanh(v)
+        force -= forces.generalised(data, q, v)
         tree += [np.triu(data.M).ravel().tolist(), force.tolist()]
         loops += [rows.g.tolist(), rows.G.ravel().tolist(), rows.bias.tolist()]
     defaults = mechanism.defaults

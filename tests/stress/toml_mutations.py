@@ -27,7 +27,9 @@ from tests.stress.urdf_mutations import misspelt
 Path = tuple[str | int, ...]
 ANYTHING = (TREE, LOOPS, START, NAMES, DEFAULTS)
 ZERO = [0.0, 0.0, 0.0]
-DEFAULT = {"base": "fixed", "gravity": [0.0, 0.0, -9.81], "xyz": ZERO, "rpy": ZERO, "loop": []}
+DEFAULT = {
+    "base": "fixed", "gravity": [0.0, 0.0, -9.81], "xyz": ZERO, "rpy": ZERO, "loop": [], "force": []
+}  # fmt: skip
 """Optional keys whose default can be written out."""
 WRONG: dict[type, list[Any]] = {
     str: [3, True, ["x"], {}, "no such word"],
@@ -134,15 +136,16 @@ class TomlMutator:
         return must_be_refused()
 
     def duplicate(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:
-        """A [[loop]] twice has one name twice; any other key twice is no TOML."""
+        """A [[loop]] or [[force]] twice has one name twice; any other key twice is no TOML."""
         held, key = holder(document, path), path[-1]
         if isinstance(key, int):
             held.insert(key, copy.deepcopy(held[key]))
             if rng.random() < 0.5:
                 return "duplicated", must_be_refused(), None, None
             held[key]["name"] = "another"
-            return "duplicated under another name", legal(LOOPS, NAMES), None, None
-        if key == "loop":
+            changes = (TREE, START) if path[0] == "force" else (LOOPS, NAMES)
+            return "duplicated under another name", legal(*changes), None, None
+        if key in ("loop", "force"):
             return None
         held["MARK"] = held[key]
         text = document_text(document).replace('"MARK"', json.dumps(key))
@@ -173,7 +176,7 @@ class TomlMutator:
         if (path[-1], new) == ("link", "frame"):
             return legal()
         if {path[-1], new} == {"xyz", "rpy"}:
-            return legal(LOOPS, START)
+            return legal(TREE if path[0] == "force" else LOOPS, START)
         return must_be_refused()
 
     def retype(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:

@@ -143,9 +143,9 @@ def touched(reach: float, tableau: str, tol: float = 1e-8) -> tuple[srm.Solution
 @TABLEAUS
 @pytest.mark.parametrize("reach", [0.05, 0.01, 1e-3])
 def test_a_linkage_that_turns_just_beyond_passes_twice(tableau: str, reach: float) -> None:
-    """At reach 1e-3 sigma stays below 1e-3 in between, where multipliers are predicted."""
+    """At reach 1e-3 sigma stays below 1e-3 in between."""
     solution, error = touched(reach, tableau)
-    assert error < (1e-6 if reach == 1e-3 else 1e-7)
+    assert error < 1e-7
     q, _ = solution(np.array([crossing.time for crossing in solution.crossings]))
     assert len(q) == 2
     assert np.abs(q[:, 2] - TOP).max() < 1e-6
@@ -162,16 +162,20 @@ def test_a_linkage_that_turns_just_before_passes_nowhere(tableau: str, reach: fl
 
 
 @TABLEAUS
-def test_where_branches_are_tangent_the_motion_stays_on_its_own(tableau: str) -> None:
-    """State and rates are the same on both branches; the smooth continuation is kept, at a loss of
-    accuracy: the error is some thousand tolerances."""
-    solution, error = touched(0.0, tableau)
-    assert error < 1e-4
+@pytest.mark.parametrize("tol", [1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11])
+def test_where_branches_are_tangent_the_motion_stays_on_its_own(tableau: str, tol: float) -> None:
+    """State and rates are the same on both branches; the smooth continuation is kept.  What
+    rounding leaves to solve for there bounds the accuracy."""
+    solution, error = touched(0.0, tableau, tol)
+    assert error < max(2.0 * tol, 1e-6)
     assert len(solution.crossings) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="where sigma touches zero, tight tolerances end the run")
 @TABLEAUS
-def test_where_branches_are_tangent_errors_fall_with_the_tolerance(tableau: str) -> None:
-    _, error = touched(0.0, tableau, 1e-10)
-    assert error < 1e-6
+@pytest.mark.parametrize("tol", [1e-9, 1e-10, 1e-11])
+def test_where_a_linkage_turns_just_beyond_tight_tolerances_are_kept(
+    tableau: str, tol: float
+) -> None:
+    solution, error = touched(1e-3, tableau, tol)
+    assert error < 1e-8
+    assert len(solution.crossings) == 2

@@ -21,7 +21,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import ErrorNorm, Memory
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
-from srm_mbs.methods.zone import ZONE_LARGEST, zone_from
+from srm_mbs.methods.zone import FEWEST, ZONE_LARGEST, zone_from
 from srm_mbs.systems.base import System, Terms, Zone
 
 WATCHED = 0.05
@@ -61,6 +61,9 @@ class BranchStages:
         Whether the step is next to a singular configuration.
     zone
         The zone of the step.
+    excused
+        sigma below which a direct solve errs by more than the tolerance, if such are made because
+        predictions err by more; else 0.
     projected
         Whether any stage was moved.
     """
@@ -75,6 +78,7 @@ class BranchStages:
     end: float
     near: bool = field(init=False)
     zone: Zone | None = field(init=False)
+    excused: float = field(init=False)
     projected: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -82,10 +86,19 @@ class BranchStages:
         reach = NEAR * self.sigma_change if self.sigma_change > 0.0 else WATCHED
         self.near = self.memory.sigma < reach
         threshold = ZONE_LARGEST
+        lingering = False
+        self.excused = 0.0
         if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
-            threshold = self.known_from(ZONE_LARGEST)
+            threshold = self.known_from(ZONE_LARGEST, 1.0)
+            lingering = threshold < ZONE_LARGEST and self.lingers(threshold)
+            uncertain = self.uncertainty()
+            if uncertain > 1.0 and not lingering:
+                # A prediction that errs by more than the tolerance is no better than a direct
+                # solve that does.
+                self.excused = threshold
+                threshold = self.known_from(ZONE_LARGEST, uncertain)
         self.zone = zone_from(self.history, threshold, self.end)
-        if self.zone is not None and threshold < ZONE_LARGEST and self.lingers(threshold):
+        if self.zone is not None and lingering:
             self.zone = replace(self.zone, predict=lambda _: None)
 
     def __call__(
@@ -152,8 +165,11 @@ class BranchStages:
     ) -> FloatArray:
         """``weights`` (n,) and what rounding does to the error estimate of a step of ``scheme``
         with ``sigmas`` (s + 1,) at its stages."""
-        # Below the threshold of the zone nothing is solved for directly.
-        lowest = max(float(sigmas[1:].min()), 0.0 if self.zone is None else self.zone.threshold)
+        # Below the threshold of the zone nothing is solved for directly.  Where that lies lower
+        # than the tolerance asks for, shorter steps predict better: rounding is no excuse.
+        least = 0.0 if self.zone is None else self.zone.threshold
+        direct = min((sigma for sigma in sigmas[1:].tolist() if sigma >= least), default=np.inf)
+        lowest = max(direct, self.excused)
         if scheme.error is None or not 0.0 < lowest < NEAR * self.sigma_change:
             return weights
         noise = self.rounding(lowest, self.sigma_change, self.projected)
@@ -172,8 +188,18 @@ class BranchStages:
         error[part] = self.h * (threshold * np.abs(a) + speed * np.abs(v))
         return self.norm(error, self.weights) < HELD
 
-    def known_from(self, longest: float) -> float:
-        """sigma from which the direct solve errs by less than the tolerance; at most ``longest``.
+    def uncertainty(self) -> float:
+        """How far the multiplier predicted for the end of the step may be off, over the tolerance;
+        0 where there are too few nodes to tell."""
+        if self.history is None or len(self.history.times) < FEWEST:
+            return 0.0
+        error = np.zeros_like(self.weights)
+        error[self.system.multiplier_part] = self.h * self.history.uncertainty(self.end)
+        return self.norm(error, self.weights)
+
+    def known_from(self, longest: float, allowed: float) -> float:
+        """sigma from which the direct solve errs by less than ``allowed`` tolerances; at most
+        ``longest``.
 
         Without a tolerance (fixed steps): ``longest``.
         """
@@ -182,4 +208,4 @@ class BranchStages:
         part = self.system.multiplier_part
         error = self.rounding(1.0, self.sigma_change, False)
         error[part] += self.h * ROUNDING * np.abs(self.memory.rate[part])
-        return float(min(longest, np.sqrt(self.norm(error, self.weights))))
+        return float(min(longest, np.sqrt(self.norm(error, self.weights) / allowed)))

@@ -125,18 +125,21 @@ def find_bifurcations(
     found = []
     for first, final in _ranges(marked, steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
-        states = watched.states(t)
         sigma = watched.smallest(t)
         k = int(np.argmin(sigma))
-        singular = nearest_singular(watched.geometry, states[k][0], watched.rank, WITHIN)
+        closest = float(t[k])
+        if 0 < k < SAMPLES - 1:
+            closest, _ = watched.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])
+        q = watched.q(closest)
+        singular = nearest_singular(watched.geometry, q, watched.rank, WITHIN)
         if singular is None:
             continue
-        distance = float(np.linalg.norm(watched.geometry.difference(singular, states[k][0])))
+        distance = float(np.linalg.norm(watched.geometry.difference(singular, q)))
         stayed = final > first or first in held
         stopped = bool(stops and final == last)
         if not (stayed or stopped or distance < UNDECIDED * rtol):
             continue
-        begin, end = (float(t[0]), float(t[-1])) if stayed else (float(t[k]), float(t[k]))
+        begin, end = (float(t[0]), float(t[-1])) if stayed else (closest, closest)
         # The way it came is told from where the motion was faster.
         passage = passage_at(watched, steps, begin, float(t[-1] - t[0]) / (final + 1 - first))
         found.append(Bifurcation(begin, end, distance, stopped, passage))

@@ -94,7 +94,9 @@ def split_step(
     magnitude = system.magnitudes(x)
     normals: FloatArray | None = None
     if history is not None:
-        correction = theta * terms.correction()
+        correction = terms.correction()
+        if theta != 1.0:
+            correction = theta * correction
         new_state = system.retract(x, -correction)
         end_rate = rate - system.rate_change(correction)
         multiplier = None
@@ -115,10 +117,11 @@ def split_step(
         gap = terms.gap()
     error_ratio = 0.0
     if scheme.error is not None:
-        error = h * np.abs(scheme.error @ rates)
+        error = h * (scheme.error @ rates)
         weights = norm.weights(np.maximum(memory.magnitude, magnitude))
         if history is not None and branch is not None:
-            if sigma_change > COUNT_UNCERTAINTY_ABOVE:
+            if weak_stages and sigma_change > COUNT_UNCERTAINTY_ABOVE:
+                error = np.abs(error)
                 for j in weak_stages:
                     if j < s:
                         uncertainty = history.uncertainty(t + c[j] * h)

@@ -166,8 +166,9 @@ class SingularityPlacement:
             slope = 0.0
         elif result.quiet:
             sigmas, (k, c) = result.sigmas, self._middle
-            start = float(sigmas[0])
-            slope = max(abs(sigmas[-1] - start), abs(sigmas[k] - start) / c if c else 0.0) / h
+            start = sigmas.item(0)
+            middle = abs(sigmas.item(k) - start) / c if c else 0.0
+            slope = max(abs(sigmas.item(-1) - start), middle) / h
         else:
             slope = sigma_slope(self._inverse, result.sigmas, h)
             if self._redone < MAX_REDONE:

@@ -30,7 +30,7 @@ from srm_mbs.stepping.events import EventWatch, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.rate_guard import RateGuard
 from srm_mbs.stepping.remarks import drift, turns
-from srm_mbs.stepping.singular_times import Placing, placed
+from srm_mbs.stepping.singular_times import Placing, placed, suspected
 from srm_mbs.stepping.stepsize import Verdict, initial_step
 from srm_mbs.systems.dae import DaeSystem
 from srm_mbs.systems.interpolation import lagrange_weights
@@ -392,7 +392,9 @@ def solve_dae(
         t_eval=times,
         events=None if watch is None else watch.found(),
         status=record.status,
-        message=record.message + turns(wrappers, "x' turned", MENDED) + drift(record.steps, norm),
+        message=record.message
+        + turns(suspected(wrappers), "x' turned", MENDED)
+        + drift(record.steps, norm),
         stats=stats,
     )
     if raise_on_failure and not solution.success:

@@ -159,6 +159,22 @@ def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> Floa
     return inside
 
 
+def check_embedded(scheme: ButcherTableau, step: float | None) -> None:
+    """Refuse step-size control for a scheme without an embedded pair.
+
+    Raises
+    ------
+    InputError
+        If ``step`` is None and the scheme has no embedded pair.
+    """
+    if step is None and scheme.controller_order is None:
+        raise InputError(
+            f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
+            element="tableau",
+            remedy="Give step=, or use tvd32, dopr54 or dop853",
+        )
+
+
 def step_size_control(
     scheme: ButcherTableau,
     t0: float,
@@ -173,12 +189,7 @@ def step_size_control(
     InputError
         If the scheme has no embedded pair.
     """
+    check_embedded(scheme, step)
     if step is not None:
         return FixedStep(t0, t_end, step)
-    if scheme.controller_order is None:
-        raise InputError(
-            f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
-            element="tableau",
-            remedy="Give step=, or use tvd32, dopr54 or dop853",
-        )
-    return PIControl(t_end, first_step(), scheme.controller_order)
+    return PIControl(t_end, first_step(), scheme.controller_order or 1)

@@ -107,6 +107,7 @@ class Solution:
         scheme: ButcherTableau,
         steps: StepData,
         *,
+        dense: DenseOutput | None = None,
         t_eval: FloatArray | None,
         attempts: NDArray[np.void],
         events: tuple[list[FloatArray], list[FloatArray]] | None = None,
@@ -125,7 +126,7 @@ class Solution:
         self.stats = stats
         self.settings = settings
         self._system = system
-        self._dense = DenseOutput(system, scheme, steps)
+        self._dense = DenseOutput(system, scheme, steps) if dense is None else dense
         # q and v are views: writing to them would change the dense output.
         steps.states.setflags(write=False)
         steps.times.setflags(write=False)
@@ -188,6 +189,7 @@ class Solution:
             self._system,
             self.scheme,
             self.steps,
+            dense=self._dense,
             t_eval=np.clip(times, self.steps.times[0], self.steps.end),
             attempts=self.attempts,
             events=self._events,

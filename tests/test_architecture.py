@@ -15,13 +15,13 @@ PACKAGE = Path(srm_mbs.__file__).parent
 
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
-    ("arrays", "errors", "semi_explicit"),
+    ("_kernel", "arrays", "errors", "semi_explicit"),
     ("closures",),
     ("mechanism",),
     ("coordinates", "forces", "systems"),
     ("methods",),
     ("stepping",),
-    ("closing",),
+    ("closing", "kernel"),
     ("assembly", "solution"),
     ("loading",),
     ("storage",),

@@ -113,7 +113,12 @@ def test_plots_and_tables_are_made_from_the_file_alone(results: Results, tmp_pat
     pixels = np.array(Image.open(picture).convert("L"))
     assert pixels.std() > 5.0
     text = (tmp_path / "tables.md").read_text()
-    for words in ("Ours beside the best peer", "slider_crank_regular", "hand-reduced ODE", "absent"):
+    for words in (
+        "Ours beside the best peer",
+        "slider_crank_regular",
+        "hand-reduced ODE",
+        "absent",
+    ):
         assert words in text
 
 

@@ -345,7 +345,7 @@ def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> Non
         (("simulate", "four_bar", "--method", "rattle"), "error: method: "),
         (("simulate", "four_bar", "--tableau", "rk5"), "error: tableau: "),
         (("simulate", "four_bar", "--tableau", "erk4"), "error: tableau: "),
-        (("simulate", "four_bar", "--backend", "kernel"), "error: backend: "),
+        (("simulate", "four_bar", "--backend", "fortran"), "error: backend: "),
         (("plot", "nonsense.npz"), "error: nonsense.npz: there is no such file"),
         (("play", "nonsense.npz"), "error: nonsense.npz: there is no such file"),
         (("plot", "none/run.npz"), "error: none/run.npz: there is no such file"),

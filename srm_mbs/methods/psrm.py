@@ -96,13 +96,14 @@ class PSRM:
             )
         checked_regulariser(self.T)
         self._interpolant()
-        self._regularisation  # noqa: B018 - bad eps is refused now
+        self.regularisation  # noqa: B018 - bad eps is refused now
 
     def _interpolant(self) -> DenseExtension | str:
         return interpolant(self.scheme, self.interpolation, (*INTERPOLATIONS, "stages"))
 
     @cached_property
-    def _regularisation(self) -> Regularisation | None:
+    def regularisation(self) -> Regularisation | None:
+        """eps as a function of the step; None for eps -> 0."""
         if self.eps is not None:
             return parse_eps(self.eps)
         if self.correction == "split":
@@ -114,7 +115,7 @@ class PSRM:
     @cached_property
     def _sweeps(self) -> IteratedSweeps | None:
         """What makes the steps of all forms but the split one."""
-        if self.correction == "split" or self._regularisation is None:
+        if self.correction == "split" or self.regularisation is None:
             return None
         fused = self.correction == "fused"
         first = First.FUSED if fused else First.EXACT
@@ -123,7 +124,7 @@ class PSRM:
             First.HELD if self.prediction == "simple" else first,
             1,
             fused,
-            self._regularisation,
+            self.regularisation,
             self._interpolant(),
         )
 
@@ -144,7 +145,7 @@ class PSRM:
         """One step; see :class:`~srm_mbs.methods.base.Method`."""
         if self._sweeps is not None:
             return self._sweeps.step(system, t, h, state, memory, norm)
-        eps = self._regularisation
+        eps = self.regularisation
         theta = 1.0 if eps is None else -math.expm1(-h / eps(h))
         return split_step(system, self.scheme, t, h, state, memory, norm, theta)
 

@@ -29,7 +29,8 @@ would magnify their rounding."""
 CLOSE = 1.0
 """A step is close to a singular configuration if its smallest sigma is below CLOSE times the change
 of sigma over a step."""
-_PROBES = np.array([0.25, 0.5, 0.75])
+PROBES = np.array([0.25, 0.5, 0.75])
+"""Fractions of the step at which polynomials are compared."""
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
@@ -54,7 +55,7 @@ class HermiteStep:
         self._start = steps.states[step]
         self._h = steps.times[step + 1] - steps.times[step]
         polynomials = [self._through(count) for count in NODES]
-        values = [polynomial(_PROBES) for polynomial in polynomials]
+        values = [polynomial(PROBES) for polynomial in polynomials]
         changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
         self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
 

@@ -6,6 +6,8 @@ it, the values follow a polynomial of low degree.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
@@ -20,6 +22,18 @@ def misfit(basis: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
     return float(np.linalg.norm(basis @ coefficients - values)), np.asarray(
         coefficients, dtype=np.float64
     )
+
+
+def real_roots(p0: float, p1: float, p2: float = 0.0) -> list[float]:
+    """Real roots of p0 + p1 x + p2 x^2, ascending."""
+    if p2 == 0.0:
+        return [-p0 / p1] if p1 else []
+    discriminant = p1 * p1 - 4.0 * p2 * p0
+    if discriminant < 0.0:
+        return []
+    # Of the two forms of a root, the one that does not cancel.
+    q = -0.5 * (p1 + math.copysign(math.sqrt(discriminant), p1))
+    return sorted([q / p2, p0 / q]) if q else [0.0]
 
 
 def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
@@ -46,9 +60,10 @@ def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
         error, coefficients = misfit(basis, signed)
         if not error < best:
             continue
-        for root in np.roots(coefficients):
-            if abs(root.imag) < 1e-9 and c[k - 1] - 0.02 <= root.real <= after + 0.02:
-                best, zero = error, float(root.real)
+        for root in real_roots(*coefficients[::-1].tolist()):
+            if c[k - 1] - 0.02 <= root <= after + 0.02:
+                best, zero = error, root
+                break
     return zero
 
 

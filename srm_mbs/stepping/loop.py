@@ -12,6 +12,8 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.stepping.dense import StepData, step_data
 from srm_mbs.stepping.events import EventWatch
 from srm_mbs.stepping.stepsize import StepSizeControl, Verdict
 from srm_mbs.systems.base import System
@@ -34,6 +36,9 @@ correction closes it."""
 LOST = 1e-2
 """Closure error after the correction, in row units, from which a run is meaningless."""
 
+BELOW_ROUND_OFF = "a step this short is below the round-off of the time"
+NOT_FINITE = "the state is no longer finite"
+
 
 @dataclass(frozen=True)
 class Attempt:
@@ -48,6 +53,8 @@ class Attempt:
 @dataclass
 class RunRecord:
     """Everything a run produced, complete at any moment it is stopped.
+
+    The compiled kernel makes its own kind (:mod:`srm_mbs.kernel`).
 
     Attributes
     ----------
@@ -76,6 +83,10 @@ class RunRecord:
     message: str = ""
     stop: float | None = None
     wall_time: float = 0.0
+
+    def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
+        """The accepted steps as arrays."""
+        return step_data(self.t0, self.x0, self.times, self.steps, scheme, tangent_size, self.stop)
 
 
 Tick = Callable[[float, float, FloatArray], None]
@@ -122,7 +133,7 @@ def integrate(
     record = RunRecord(t0, state.copy())
     smallest = SMALLEST_STEP * abs(t_end - t0)
     started = time.perf_counter()
-    closures = _Closures(system, norm)
+    closures = Closures(system, norm)
     t, x = t0, state
     trouble = ""
     redone = False
@@ -135,16 +146,12 @@ def integrate(
             h = proposal.h
             if not h > max(smallest, 4.0 * np.spacing(abs(t))):
                 if not (record.attempts and record.attempts[-1].t == t):
-                    trouble = "a step this short is below the round-off of the time"
-                _fail(record, t, h, memory, trouble, control.adaptive)
+                    trouble = BELOW_ROUND_OFF
+                fail(record, t, h, memory.sigma, trouble, control.adaptive)
                 break
             if len(record.times) % WATCHED_STEPS == 0 and _stands_still(record, t, t_end):
                 covered = t - record.times[-WATCHED_STEPS]
-                reason = (
-                    f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; what acts on "
-                    "the mechanism changes too fast or is not smooth"
-                )
-                _fail(record, t, h, memory, reason, control.adaptive)
+                fail(record, t, h, memory.sigma, standstill(covered), control.adaptive)
                 break
             result: StepResult | None
             try:
@@ -159,13 +166,13 @@ def integrate(
                 ratio = np.inf if result is None else result.error_ratio
                 record.attempts.append(Attempt(t, h, ratio, verdict))
                 if not control.adaptive and verdict is Verdict.REJECTED:
-                    _fail(record, t, h, memory, trouble or "the state is no longer finite", False)
+                    fail(record, t, h, memory.sigma, trouble or NOT_FINITE, False)
                     break
                 continue
             trouble = ""
             reason = closures.trouble(result)
             if reason:
-                _fail(record, t, h, memory, reason, control.adaptive)
+                fail(record, t, h, memory.sigma, reason, control.adaptive)
                 break
             result.placement = placement
             method.accept(memory, result)
@@ -177,7 +184,7 @@ def integrate(
                 record.status, record.stop, record.message = "event", stop.time, stop.message
                 break
             if tick is not None:
-                _tell(tick, t, h, x)
+                tell(tick, t, h, x)
         else:
             record.status = "finished"
             record.message = f"The run reached t = {t_end:.6g} s."
@@ -195,6 +202,14 @@ def integrate(
     return record
 
 
+def standstill(covered: float) -> str:
+    """What is wrong where WATCHED_STEPS steps covered only ``covered`` (s)."""
+    return (
+        f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; what acts on the mechanism "
+        "changes too fast or is not smooth"
+    )
+
+
 def _stands_still(record: RunRecord, t: float, t_end: float) -> bool:
     """Whether the last steps covered so little that the run would never end."""
     if len(record.times) < WATCHED_STEPS:
@@ -202,7 +217,7 @@ def _stands_still(record: RunRecord, t: float, t_end: float) -> bool:
     return t - record.times[-WATCHED_STEPS] < STANDSTILL * (t_end - record.t0)
 
 
-def _tell(tick: Tick, t: float, h: float, x: FloatArray) -> None:
+def tell(tick: Tick, t: float, h: float, x: FloatArray) -> None:
     """Call ``tick``; what it raises must not lose the run."""
     try:
         tick(t, h, x)
@@ -210,7 +225,7 @@ def _tell(tick: Tick, t: float, h: float, x: FloatArray) -> None:
         raise ControllerError(f"the progress callback raised {error!r} at t = {t:.6g} s") from error
 
 
-class _Closures:
+class Closures:
     """Looks at whether the loops stay closed; almost always without computing anything."""
 
     def __init__(self, system: System, norm: ErrorNorm) -> None:
@@ -242,14 +257,23 @@ class _Closures:
         return ""
 
 
-def _fail(
-    record: RunRecord, t: float, h: float, memory: Memory, trouble: str, adaptive: bool
-) -> None:
+def fail(record: RunRecord, t: float, h: float, sigma: float, trouble: str, adaptive: bool) -> None:
+    """Mark ``record`` as failed at ``t`` with the step ``h`` and say why.
+
+    Parameters
+    ----------
+    sigma
+        At ``t``.
+    trouble
+        Why; empty if no step was short enough for the error estimate.
+    adaptive
+        Whether steps follow a tolerance.
+    """
     record.status = "failed"
     reason = trouble or "the error estimate stays above the tolerance however small the step"
     near = (
-        f" The closures are close to a singular configuration (sigma = {memory.sigma:.1e})."
-        if memory.sigma < 0.05
+        f" The closures are close to a singular configuration (sigma = {sigma:.1e})."
+        if sigma < 0.05
         else ""
     )
     record.message = (

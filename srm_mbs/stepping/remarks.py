@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from srm_mbs.methods.base import ErrorNorm, StepResult
-from srm_mbs.stepping.guard import BranchGuard
-from srm_mbs.stepping.singular_times import Placing
 
 TOLD = 5
 """Times listed."""
@@ -14,17 +12,18 @@ DRIFTED = 10.0
 """Constraint error over tolerance from which a run says so."""
 
 
-def turns(wrappers: Sequence[Placing], what: str, remedy: str) -> str:
+def turns(times: Sequence[float], what: str, remedy: str) -> str:
     """A sentence naming the times at which the motion may have changed its branch.
 
     Parameters
     ----------
+    times
+        Of the guard's suspects (s).
     what
         "the velocity turned".
     remedy
         A sentence.
     """
-    times = [t for w in wrappers if isinstance(w, BranchGuard) for t in w.told()]
     if not times:
         return ""
     listed = ", ".join(f"{t:.6g}" for t in times[:TOLD]) + (", ..." if len(times) > TOLD else "")

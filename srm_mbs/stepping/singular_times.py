@@ -14,6 +14,8 @@ together what a user chose, for mechanisms and DAEs alike.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
@@ -213,6 +215,11 @@ class HalvedStep(SlopeOfSigma):
 
 Placing = SingularityPlacement | SlopeOfSigma | AvoidTimes | BranchGuard
 """A control that counts, in ``placed`` and ``replaced``, what it did."""
+
+
+def suspected(wrappers: Sequence[Placing]) -> list[float]:
+    """Times (s) up to which the motion may have changed its branch, by the guard among them."""
+    return [t for wrapper in wrappers if isinstance(wrapper, BranchGuard) for t in wrapper.told()]
 
 
 def placed(

@@ -33,7 +33,8 @@ def _bernoulli_terms(count: int) -> tuple[float, ...]:
 
 # 14 terms reach round-off for 1.5 rad (each gains (angle / 2 pi)^2) with room to spare for the
 # stages that lie beyond the step's own rotation.
-_SERIES = _bernoulli_terms(14)
+SERIES = _bernoulli_terms(14)
+"""B_2n / (2n)! of dexp^-1."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def dexp_inverse(joint: GroupJoint, u: FloatArray, v: FloatArray) -> FloatArray:
     ad = joint.ad(u)
     w = ad @ v
     out: FloatArray = v + 0.5 * w
-    for coefficient in _SERIES:
+    for coefficient in SERIES:
         w = ad @ w
         term = coefficient * w
         out += term

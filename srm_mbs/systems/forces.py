@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +21,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.forces import Bushing, JointTorque, SpringDamper, TorsionSpring, Wrench
 from srm_mbs.mechanism import Anchor, ForceElement
-from srm_mbs.systems.loops import cross, support, world_jacobian
+from srm_mbs.systems.loops import cross, placement_numbers, support, world_jacobian
 
 COINCIDENT = 1e-9
 """Distance over rest length below which the line between two points has no direction."""
@@ -36,6 +36,9 @@ class _Evaluator(Protocol):
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         """Its potential energy (J); ``data`` need hold the placements only."""
 
+    def constants(self) -> dict[str, Any]:
+        """What the compiled kernel needs of it; ``kind`` numbers the kinds as forces.hpp does."""
+
 
 class _Held:
     """An anchor: a frame on a body."""
@@ -43,6 +46,9 @@ class _Held:
     def __init__(self, model: pin.Model, anchor: Anchor) -> None:
         self.joint, self.inside = anchor.resolve(model)
         self.support = support(model, self.joint)
+
+    def constants(self) -> tuple[int, FloatArray]:
+        return self.joint, placement_numbers(self.inside)
 
     def placement(self, data: pin.Data) -> pin.SE3:
         return data.oMi[self.joint] * self.inside if self.joint else self.inside
@@ -97,6 +103,17 @@ class _SpringDamper:
         apart = self.a.placement(data).translation - self.b.placement(data).translation
         return 0.5 * self.stiffness * (sqrt(apart @ apart) - self.rest_length) ** 2
 
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 0,
+            "a": self.a.constants(),
+            "b": self.b.constants(),
+            "support": self.support,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "rest": self.rest_length,
+        }
+
 
 class _JointTorque:
     def __init__(self, model: pin.Model, force: JointTorque) -> None:
@@ -109,6 +126,9 @@ class _JointTorque:
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.0
+
+    def constants(self) -> dict[str, Any]:
+        return {"kind": 1, "in_v": self.own.start, "numbers": self.torque.astype(float)}
 
 
 class _TorsionSpring:
@@ -124,6 +144,16 @@ class _TorsionSpring:
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.5 * self.stiffness * float(q[self.in_q] - self.rest_angle) ** 2
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 2,
+            "in_q": self.in_q,
+            "in_v": self.in_v,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "rest": self.rest_angle,
+        }
 
 
 class _Wrench:
@@ -142,6 +172,15 @@ class _Wrench:
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.0
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 3,
+            "a": self.at.constants(),
+            "support": self.at.support,
+            "turns": self.turns,
+            "numbers": np.concatenate([self.force, self.moment]).astype(float),
+        }
 
 
 class _Bushing:
@@ -175,6 +214,15 @@ class _Bushing:
         relative = self.b.placement(data).actInv(self.a.placement(data))
         moved = np.concatenate([relative.translation, pin.log3(relative.rotation)])
         return 0.5 * float(self.stiffness @ (moved * moved))
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 4,
+            "a": self.a.constants(),
+            "b": self.b.constants(),
+            "support": self.support,
+            "numbers": np.concatenate([self.stiffness, self.damping]).astype(float),
+        }
 
 
 _EVALUATORS = {
@@ -221,3 +269,7 @@ class ForceKinematics:
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         """Potential energy (J) of springs and bushings; ``data`` must hold the placements."""
         return sum(element.energy(data, q) for element in self._elements)
+
+    def constants(self) -> list[dict[str, Any]]:
+        """What the compiled kernel needs of each element."""
+        return [element.constants() for element in self._elements]

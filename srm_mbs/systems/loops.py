@@ -17,6 +17,7 @@ with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -36,6 +37,11 @@ def world_jacobian(data: pin.Data) -> FloatArray:
     """The joint Jacobian (6, nv) in world axes; Pinocchio hands out (6,) where nv = 1."""
     J: FloatArray = data.J
     return J if J.ndim == 2 else J[:, None]
+
+
+def placement_numbers(placement: pin.SE3) -> FloatArray:
+    """Rotation, row by row, then translation (12,)."""
+    return np.concatenate([placement.rotation.ravel(), placement.translation])
 
 
 def support(model: pin.Model, joint: int) -> FloatArray:
@@ -69,6 +75,18 @@ class _LoopRows:
         self.position_slice = slice(start, start + len(self.directions))
         self.alignment_start = start + len(self.directions)
         self.count = len(self.directions) + len(self.alignments)
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "joint_a": self.joint_a,
+            "joint_b": self.joint_b,
+            "in_a": placement_numbers(self.in_a),
+            "in_b": placement_numbers(self.in_b),
+            "directions": np.ascontiguousarray(self.directions, dtype=float).ravel(),
+            "alignments": np.array([np.concatenate(pair) for pair in self.alignments]).ravel(),
+            "support": self.support,
+            "first_row": self.position_slice.start,
+        }
 
 
 class LoopKinematics:
@@ -111,6 +129,10 @@ class LoopKinematics:
         self.g = np.zeros(m)
         self.G = np.zeros((m, model.nv))
         self.bias = np.zeros(m)
+
+    def constants(self) -> list[dict[str, Any]]:
+        """What the compiled kernel needs of each closure."""
+        return [loop.constants() for loop in self._loops]
 
     def update(self, data: pin.Data, with_bias: bool = True) -> None:
         """Evaluate g and G, and Gdot v unless ``with_bias`` is false.

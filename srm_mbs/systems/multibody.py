@@ -22,11 +22,12 @@ from srm_mbs.systems.base import Terms, Zone
 from srm_mbs.systems.charts import (
     LARGEST_ROTATION,
     ROTATION_PER_STEP,
+    SERIES,
     dexp_inverse,
     group_joints,
     planar_translation,
 )
-from srm_mbs.systems.forces import ForceKinematics
+from srm_mbs.systems.forces import COINCIDENT, ForceKinematics
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import Projection
 from srm_mbs.systems.units import row_units
@@ -78,15 +79,24 @@ class _Mechanics:
         """Whether a controller acts."""
         return self._controller is not None
 
+    def count(self, evaluations: int, factorisations: int) -> None:
+        """Count what the compiled kernel did for this system."""
+        self.evaluations += evaluations
+
     def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Views (q, v) of a state."""
         return state[: self.nq], state[self.nq :]
 
-    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
-        """Controller and joint damping (nv,); None if there is neither."""
-        force = None if self._damping is None else -self._damping * v
+    def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) of the controller, which gets copies of ``q`` and ``v``.
+
+        Raises
+        ------
+        ControllerError
+            If it raises, or returns anything but nv finite numbers.
+        """
         if self._controller is None:
-            return force
+            return np.zeros(self.nv)
         try:
             tau = np.asarray(self._controller(t, q.copy(), v.copy()), dtype=float)
         except Exception as error:
@@ -96,7 +106,36 @@ class _Mechanics:
                 f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
                 f"it must return {self.nv} finite generalised forces"
             )
+        return np.ascontiguousarray(tau)
+
+    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
+        """Controller and joint damping (nv,); None if there is neither."""
+        force = None if self._damping is None else -self._damping * v
+        if self._controller is None:
+            return force
+        tau = self.controlled_force(t, q, v)
         return tau if force is None else tau + force
+
+    def constants(self) -> dict[str, Any]:
+        """Everything that does not change, for the compiled kernel (:mod:`srm_mbs.kernel`)."""
+        return {
+            "loops": [],
+            "rows": 0,
+            "structural_rank": 0,
+            "sigma_ref": 1.0,
+            "gap_scale": np.zeros(0),
+            "unit": self._unit,
+            "position_of": [int(i) for i in self._position_of],
+            "damping": self._damping,
+            "friction": None,
+            "friction_speed": 1.0,
+            "forces": [] if self._forces is None else self._forces.constants(),
+            "coincident": COINCIDENT,
+            "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
+            "series": np.array(SERIES),
+            "largest_rotation": LARGEST_ROTATION,
+            "rotation_per_step": ROTATION_PER_STEP,
+        }
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """(q (+) dq, v + dv)."""
@@ -338,6 +377,22 @@ class ClosedSystem(_Mechanics):
         self._gap_scale = (structure.row_scale / unit)[structure.kept]
         self.projection = Projection(structure.rank, structure.sigma_ref)
         self._terms = _ClosedTerms(self.projection, self.loops, self._gap_scale)
+
+    def constants(self) -> dict[str, Any]:
+        """As for open mechanisms, and the closures."""
+        structure = self.mechanism.structure
+        return super().constants() | {
+            "loops": self.loops.constants(),
+            "rows": len(self.loops.g),
+            "structural_rank": structure.rank,
+            "sigma_ref": structure.sigma_ref,
+            "gap_scale": self._gap_scale,
+        }
+
+    def count(self, evaluations: int, factorisations: int) -> None:
+        """Count what the compiled kernel did for this system."""
+        super().count(evaluations, factorisations)
+        self.projection.factorisations += factorisations
 
     @property
     def factorisations(self) -> int:

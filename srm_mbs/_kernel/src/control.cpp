@@ -1,0 +1,368 @@
+#include "control.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include "linear.hpp"
+
+namespace srm {
+
+namespace {
+
+constexpr double inf = std::numeric_limits<double>::infinity();
+constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+
+std::vector<double> with_end(const Scheme& scheme) {
+    std::vector<double> out(scheme.c);
+    out.push_back(1.0);
+    return out;
+}
+
+// max_j |sigma_j - sigma_0| / (c_j h) over the stages (1/s).
+double sigma_slope(const std::vector<double>& abscissae, const std::vector<double>& sigmas,
+                   double h) {
+    double out = 0.0;
+    for (std::size_t j = 0; j < sigmas.size(); ++j)
+        if (abscissae[j] > 0.0)
+            out = std::max(out, std::abs(sigmas[j] - sigmas[0]) * (1.0 / abscissae[j]));
+    return out / h;
+}
+
+// A step of at most h that neither passes `end` nor leaves a sliver before it.
+Proposal until(double t, double h, double end) {
+    const double remaining = end - t;
+    if (h >= remaining * (1.0 - 1e-12)) return {remaining, end};
+    if (2.0 * h > remaining) h = 0.5 * remaining;
+    return {h, t + h};
+}
+
+}  // namespace
+
+Proposal PIControl::propose(double t, double limit, Memory&) {
+    return until(t, std::min(h_, limit), t_end_);
+}
+
+Verdict PIControl::judge(const Proposal& proposal, const StepResult* result) {
+    const ControlConstants& c = constants_;
+    double xi = result ? result->error_ratio : c.failed_evaluation;
+    if (!(xi < c.failed_evaluation)) xi = c.failed_evaluation;
+    const double k = order_;
+    if (xi > 1.0) {
+        h_ = proposal.h * std::max(c.min_factor, c.safety * std::pow(xi, -1.0 / k));
+        just_rejected_ = true;
+        return Verdict::rejected;
+    }
+    double factor = c.safety * std::pow(std::max(xi, c.xi_floor), -c.integral / k) *
+                    std::pow(xi_old_, c.proportional / k);
+    factor = std::min(c.max_factor, std::max(c.min_factor, factor));
+    if (just_rejected_) factor = std::min(factor, 1.0);
+    h_ = proposal.h * factor;
+    xi_old_ = std::max(xi, c.xi_old_floor);
+    just_rejected_ = false;
+    return Verdict::accepted;
+}
+
+Proposal FixedStep::propose(double t, double limit, Memory&) {
+    double target = t0_ + static_cast<double>(index_) * step_;
+    if (target > t_end_ - 1e-9 * step_) target = t_end_;
+    if (limit < target - t) return {limit, t + limit};
+    return {target - t, target};
+}
+
+Verdict FixedStep::judge(const Proposal& proposal, const StepResult* result) {
+    if (!result || !finite(result->state.data(), static_cast<int>(result->state.size())))
+        return Verdict::rejected;
+    while (proposal.t_new >= t0_ + static_cast<double>(index_) * step_ * (1.0 - 1e-14)) ++index_;
+    return Verdict::accepted;
+}
+
+Gaps::Gaps(const Scheme& scheme, double clearance) {
+    centre_ = scheme.gap_centres[0];
+    clearance_ = clearance * scheme.gap_half_widths[0];
+    first_ = 1.0;
+    for (double c : scheme.c)
+        if (c > 0.0) first_ = std::min(first_, c);
+    std::vector<std::pair<double, double>> wide;
+    for (std::size_t i = 0; i < scheme.gap_centres.size(); ++i)
+        if (scheme.gap_half_widths[i] > clearance_)
+            wide.emplace_back(scheme.gap_centres[i],
+                              scheme.gap_centres[i] + scheme.gap_half_widths[i] - clearance_);
+    std::sort(wide.begin(), wide.end());
+    for (const auto& [centre, end] : wide) {
+        wide_centres_.push_back(centre);
+        wide_ends_.push_back(end);
+    }
+}
+
+double Gaps::longest_step(double distance, double h) const {
+    const double position = distance / h;
+    if (position >= 1.0 + centre_) return h;
+    if (position <= 0.5 * first_) return h;
+    for (std::size_t i = 0; i < wide_ends_.size(); ++i)
+        if (position <= wide_ends_[i]) return distance / std::max(position, wide_centres_[i]);
+    return distance / (1.0 + centre_);
+}
+
+bool Gaps::ends_on(double distance, double h) const {
+    return std::abs(distance / h - 1.0) < clearance_;
+}
+
+double Gaps::step_over(double distance) const { return distance / wide_ends_.back(); }
+
+SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner, const Scheme& scheme,
+                                           double t_end, const ControlConstants& constants)
+    : inner_(std::move(inner)),
+      constants_(constants),
+      t_end_(t_end),
+      gaps_(scheme, constants.clearance),
+      abscissae_(with_end(scheme)),
+      zero_(nan) {
+    adaptive = inner_->adaptive;
+    middle_ = 0;
+    for (std::size_t k = 1; k < abscissae_.size(); ++k)
+        if (std::abs(abscissae_[k] - 0.5) < std::abs(abscissae_[middle_] - 0.5))
+            middle_ = static_cast<int>(k);
+}
+
+Proposal SingularityPlacement::propose(double t, double limit, Memory& memory) {
+    if (redo_ > 0.0) limit = std::min(limit, redo_);
+    if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.sigma_change / slope_);
+    memory.sigma_slope = slope_;
+    const Proposal proposal = inner_->propose(t, limit, memory);
+    if (!(redo_ > 0.0) && zero_ > t) {
+        const double h = placed_step(zero_ - t, proposal.h, t);
+        if (h != proposal.h) {
+            ++placed;
+            return {h, t + h, true};
+        }
+    }
+    return proposal;
+}
+
+double SingularityPlacement::placed_step(double distance, double h, double t) const {
+    if (t + h >= t_end_ && gaps_.ends_on(distance, h)) return h;  // the run ends there
+    if (adaptive) return gaps_.longest_step(distance, h);
+    // A fixed step may cross its grid point where that is singular: it could only creep up.
+    if (!gaps_.ends_on(distance, h)) return distance < h ? gaps_.longest_step(distance, h) : h;
+    const double over = gaps_.step_over(distance);
+    return t + over <= t_end_ ? over : h;
+}
+
+// A better step length if a stage or the end came too close, else NaN.
+double SingularityPlacement::better_step(double h, const std::vector<double>& sigmas,
+                                         double slope, bool last) const {
+    const double reach =
+        std::min(constants_.too_close * std::max(slope_, slope) * h, 0.5 * sigmas[0]);
+    double lowest = inf, lowest_movable = inf;
+    for (std::size_t j = 0; j < sigmas.size(); ++j) {
+        lowest = std::min(lowest, sigmas[j]);
+        const double c = abscissae_[j];
+        if (c > 0.0 && (!last || c < 1.0)) lowest_movable = std::min(lowest_movable, sigmas[j]);
+    }
+    if (!(lowest < reach) || !(lowest_movable < reach)) return nan;
+    const double zero = zero_within(abscissae_, sigmas);
+    if (!(zero > 0.0)) return nan;
+    return gaps_.longest_step(zero * h, 0.98 * h);
+}
+
+Verdict SingularityPlacement::judge(const Proposal& proposal, const StepResult* result) {
+    const double h = proposal.h;
+    double slope = 0.0;
+    if (result && result->quiet) {
+        const std::vector<double>& sigmas = result->sigmas;
+        const double start = sigmas[0], c = abscissae_[middle_];
+        slope = std::max(std::abs(sigmas.back() - start),
+                         c > 0.0 ? std::abs(sigmas[middle_] - start) / c : 0.0) / h;
+    } else if (result) {
+        slope = sigma_slope(abscissae_, result->sigmas, h);
+        if (redone_ < constants_.max_redone) {
+            const double better =
+                better_step(h, result->sigmas, slope, proposal.t_new >= t_end_);
+            if (0.0 < better && better < h) {
+                redo_ = better;
+                ++redone_;
+                ++replaced;
+                return Verdict::replaced;
+            }
+        }
+    }
+    const Verdict verdict = inner_->judge(proposal, result);
+    redo_ = 0.0;
+    redone_ = 0;
+    if (verdict == Verdict::accepted && result) {
+        slope_ = std::max(slope, 0.5 * slope_);
+        zero_ = result->quiet
+                    ? nan
+                    : result->t + h * zero_ahead(abscissae_[middle_], result->sigmas[0],
+                                                 result->sigmas[middle_],
+                                                 result->sigmas.back(), constants_.ahead);
+    }
+    return verdict;
+}
+
+SlopeOfSigma::SlopeOfSigma(std::unique_ptr<Control> inner, const Scheme& scheme)
+    : inner_(std::move(inner)), abscissae_(with_end(scheme)) {
+    adaptive = inner_->adaptive;
+}
+
+Proposal SlopeOfSigma::propose(double t, double limit, Memory& memory) {
+    memory.sigma_slope = slope_;
+    return inner_->propose(t, limit, memory);
+}
+
+Verdict SlopeOfSigma::judge(const Proposal& proposal, const StepResult* result) {
+    const Verdict verdict = inner_->judge(proposal, result);
+    if (verdict == Verdict::accepted && result)
+        slope_ = std::max(sigma_slope(abscissae_, result->sigmas, proposal.h), 0.5 * slope_);
+    return verdict;
+}
+
+BranchGuard::BranchGuard(std::unique_ptr<Control> inner, const System& system,
+                         const ControlConstants& constants)
+    : inner_(std::move(inner)), system_(system), constants_(constants), work_(2 * system.nv) {
+    adaptive = inner_->adaptive;
+}
+
+Proposal BranchGuard::propose(double t, double limit, Memory& memory) {
+    const Proposal proposal = inner_->propose(t, std::min(limit, limit_), memory);
+    placed = inner_->placed;
+    return proposal;
+}
+
+// Whether the velocity of a step next to a singular configuration took another direction.
+bool BranchGuard::turned(const StepResult& result) const {
+    const auto [low, high] = std::minmax_element(result.sigmas.begin(), result.sigmas.end());
+    if (!(2.0 * *low < *high)) return false;
+    const int nv = system_.nv;
+    const double *start = result.rates.data(), *end = result.end_rate.data();
+    double *halfway = work_.data(), *jump = halfway + nv;
+    for (int i = 0; i < nv; ++i) {
+        halfway[i] = 0.5 * result.h * (start[nv + i] + end[nv + i]);
+        jump[i] = end[i] - start[i] - halfway[i];
+    }
+    const double size =
+        std::max({system_.size(start), system_.size(end), system_.size(halfway)});
+    return system_.size(jump) > constants_.turned * size;
+}
+
+Verdict BranchGuard::judge(const Proposal& proposal, const StepResult* result) {
+    const bool suspect = result && !result->quiet && turned(*result);
+    if (suspect && tries_ < constants_.guard_max_redone) {
+        limit_ = 0.5 * proposal.h;
+        ++tries_;
+        ++replaced;
+        return Verdict::replaced;
+    }
+    const long before = inner_->replaced;
+    const Verdict verdict = inner_->judge(proposal, result);
+    replaced += inner_->replaced - before;
+    if (verdict == Verdict::accepted && result) {
+        if (suspect) suspects.push_back(proposal.t_new);
+        limit_ = inf;
+        tries_ = 0;
+    }
+    return verdict;
+}
+
+namespace {
+
+// Residual norm of the least-squares polynomial (lowest power first) through (c, values); its
+// coefficients by Householder QR of the Vandermonde matrix.
+double misfit(const std::vector<double>& c, const std::vector<double>& values, int degree,
+              double* coefficients) {
+    const int rows = static_cast<int>(c.size()), columns = degree + 1;
+    std::vector<double> A(rows * columns), y(values), tau(columns);
+    for (int i = 0; i < rows; ++i)
+        for (int j = 0; j < columns; ++j) A[j * rows + i] = std::pow(c[i], j);
+    for (int k = 0; k < columns; ++k) {
+        double* a = &A[k * rows];
+        const double size = norm(a + k, rows - k);
+        const double beta = -std::copysign(size, a[k]);
+        const double head = a[k] - beta;
+        const auto reflect = [&](double* x) {
+            const double s =
+                (head * x[k] + dot(a + k + 1, x + k + 1, rows - k - 1)) / (-beta * head);
+            x[k] -= s * head;
+            add(-s, a + k + 1, x + k + 1, rows - k - 1);
+        };
+        for (int j = k + 1; j < columns; ++j) reflect(&A[j * rows]);
+        reflect(y.data());
+        a[k] = beta;
+    }
+    for (int k = columns - 1; k >= 0; --k) {
+        double sum = y[k];
+        for (int j = k + 1; j < columns; ++j) sum -= A[j * rows + k] * coefficients[j];
+        coefficients[k] = sum / A[k * rows + k];
+    }
+    return norm(&y[columns], rows - columns);
+}
+
+}  // namespace
+
+double zero_within(const std::vector<double>& abscissae, const std::vector<double>& sigmas) {
+    const int n = static_cast<int>(abscissae.size());
+    std::vector<int> order(n);
+    std::iota(order.begin(), order.end(), 0);
+    std::stable_sort(order.begin(), order.end(),
+                     [&](int a, int b) { return abscissae[a] < abscissae[b]; });
+    std::vector<double> c(n), sigma(n), values(n);
+    for (int i = 0; i < n; ++i) {
+        c[i] = abscissae[order[i]];
+        sigma[i] = sigmas[order[i]];
+    }
+    if (!(*std::max_element(sigma.begin(), sigma.end()) > 0.0)) return nan;
+    const int degree = n > 4 ? 2 : 1;
+    double best = inf, zero = nan;
+    for (int k = 1; k <= n; ++k) {
+        const double after = k < n ? c[k] : 1.1;
+        if (after <= c[k - 1]) continue;
+        for (int i = 0; i < n; ++i) values[i] = i < k ? sigma[i] : -sigma[i];
+        double p[3] = {0.0, 0.0, 0.0};
+        const double error = misfit(c, values, degree, p);
+        if (!(error < best)) continue;
+        double roots[2];
+        int found = 0;
+        if (p[2] == 0.0) {
+            if (p[1] != 0.0) roots[found++] = -p[0] / p[1];
+        } else {
+            const double discriminant = p[1] * p[1] - 4.0 * p[2] * p[0];
+            if (discriminant >= 0.0) {
+                const double q = -0.5 * (p[1] + std::copysign(std::sqrt(discriminant), p[1]));
+                roots[found++] = q / p[2];
+                if (q != 0.0) roots[found++] = p[0] / q;
+                if (found == 2 && roots[1] < roots[0]) std::swap(roots[0], roots[1]);
+            }
+        }
+        for (int i = 0; i < found; ++i) {
+            if (c[k - 1] - 0.02 <= roots[i] && roots[i] <= after + 0.02) {
+                best = error;
+                zero = roots[i];
+                break;
+            }
+        }
+    }
+    return zero;
+}
+
+double zero_ahead(double c, double start, double middle, double end, double ahead) {
+    if (!(end < start)) return nan;
+    const double line = start / (start - end);
+    const double within = line > ahead ? nan : line;
+    double zero = line;
+    if (0.1 < c && c < 0.9) {
+        // sigma = start + a x + b x^2 through (c, middle) and (1, end)
+        const double b = ((middle - start) / c - (end - start)) / (c - 1.0);
+        const double a = end - start - b;
+        const double root = a * a - 4.0 * b * start;
+        if (root >= 0.0 && a < 0.0) {
+            zero = 2.0 * start / (-a + std::sqrt(root));
+        } else if (a + 2.0 * b >= 0.0 || root < 0.0) {
+            return within;
+        }
+    }
+    if (1.0 < zero && zero < ahead) return zero;
+    return 1.0 < line && line < ahead && zero <= 1.0 ? line : nan;
+}
+
+}  // namespace srm

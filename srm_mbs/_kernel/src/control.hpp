@@ -1,0 +1,139 @@
+// Twin of srm_mbs/stepping/stepsize.py, placement.py, singular_times.py (SlopeOfSigma) and
+// guard.py: how long the next step is, and whether the last one stands.
+#pragma once
+
+#include <limits>
+#include <memory>
+#include <vector>
+
+#include "step.hpp"
+
+namespace srm {
+
+enum class Verdict { accepted = 0, rejected = 1, replaced = 2 };
+
+struct Proposal {
+    double h, t_new;
+    bool placed = false;
+};
+
+// The constants of srm_mbs/stepping, passed in from Python.
+struct ControlConstants {
+    double safety, min_factor, max_factor, proportional, integral, xi_old_floor, xi_floor,
+        failed_evaluation;                                  // stepsize.py
+    double sigma_change, too_close, clearance, ahead;       // placement.py, kinks.py
+    int max_redone;
+    double turned;                                          // turning.py
+    int guard_max_redone;
+};
+
+class Control {
+public:
+    virtual ~Control() = default;
+    virtual Proposal propose(double t, double limit, Memory& memory) = 0;
+    // `result` is null if a stage could not be evaluated.
+    virtual Verdict judge(const Proposal& proposal, const StepResult* result) = 0;
+    bool adaptive = true;
+    long placed = 0, replaced = 0;
+};
+
+class PIControl : public Control {
+public:
+    PIControl(double t_end, double first_step, int order, const ControlConstants& constants)
+        : t_end_(t_end), h_(first_step), order_(order), constants_(constants) {}
+    Proposal propose(double t, double limit, Memory& memory) override;
+    Verdict judge(const Proposal& proposal, const StepResult* result) override;
+
+private:
+    double t_end_, h_;
+    int order_;
+    ControlConstants constants_;
+    double xi_old_ = 1.0;
+    bool just_rejected_ = false;
+};
+
+class FixedStep : public Control {
+public:
+    FixedStep(double t0, double t_end, double step) : t0_(t0), t_end_(t_end), step_(step) {
+        adaptive = false;
+    }
+    Proposal propose(double t, double limit, Memory& memory) override;
+    Verdict judge(const Proposal& proposal, const StepResult* result) override;
+
+private:
+    double t0_, t_end_, step_;
+    long index_ = 1;
+};
+
+// Where, as a fraction of the step, a zero of sigma does no harm.
+class Gaps {
+public:
+    Gaps(const Scheme& scheme, double clearance);
+    double longest_step(double distance, double h) const;
+    bool ends_on(double distance, double h) const;
+    double step_over(double distance) const;
+
+private:
+    double centre_, clearance_, first_;
+    std::vector<double> wide_centres_, wide_ends_;  // ascending
+};
+
+class SingularityPlacement : public Control {
+public:
+    SingularityPlacement(std::unique_ptr<Control> inner, const Scheme& scheme, double t_end,
+                         const ControlConstants& constants);
+    Proposal propose(double t, double limit, Memory& memory) override;
+    Verdict judge(const Proposal& proposal, const StepResult* result) override;
+
+private:
+    double placed_step(double distance, double h, double t) const;
+    double better_step(double h, const std::vector<double>& sigmas, double slope, bool last) const;
+
+    std::unique_ptr<Control> inner_;
+    ControlConstants constants_;
+    double t_end_;
+    Gaps gaps_;
+    std::vector<double> abscissae_;
+    int middle_;
+    double slope_ = 0.0, zero_, redo_ = 0.0;
+    int redone_ = 0;
+};
+
+// Only the slope of sigma.
+class SlopeOfSigma : public Control {
+public:
+    SlopeOfSigma(std::unique_ptr<Control> inner, const Scheme& scheme);
+    Proposal propose(double t, double limit, Memory& memory) override;
+    Verdict judge(const Proposal& proposal, const StepResult* result) override;
+
+private:
+    std::unique_ptr<Control> inner_;
+    std::vector<double> abscissae_;
+    double slope_ = 0.0;
+};
+
+class BranchGuard : public Control {
+public:
+    BranchGuard(std::unique_ptr<Control> inner, const System& system,
+                const ControlConstants& constants);
+    Proposal propose(double t, double limit, Memory& memory) override;
+    Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    std::vector<double> suspects;
+
+private:
+    bool turned(const StepResult& result) const;
+
+    std::unique_ptr<Control> inner_;
+    const System& system_;
+    ControlConstants constants_;
+    double limit_ = std::numeric_limits<double>::infinity();
+    int tries_ = 0;
+    mutable std::vector<double> work_;
+};
+
+// Where in (0, 1 + a little] a step passes a zero of sigma; NaN if it does not.
+double zero_within(const std::vector<double>& abscissae, const std::vector<double>& sigmas);
+// Where sigma will vanish, in steps from the start of the last one; NaN if not soon.
+double zero_ahead(double c, double start, double middle, double end, double ahead);
+
+}  // namespace srm

@@ -1,0 +1,125 @@
+#include "forces.hpp"
+
+#include <cmath>
+
+#include <pinocchio/spatial.hpp>
+
+#include "errors.hpp"
+#include "workspace.hpp"
+
+namespace srm {
+
+namespace {
+
+using Eigen::Vector3d;
+using pinocchio::Motion;
+using pinocchio::SE3;
+using Vector6 = Eigen::Matrix<double, 6, 1>;
+
+SE3 placement(const Held& held, const pinocchio::Data& data) {
+    const SE3 inside = pinocchio_model::placement(held.placement);
+    return held.joint ? data.oMi[held.joint] * inside : inside;
+}
+
+// Spatial velocity of the body, in world axes at the world origin.
+Motion velocity(const Held& held, const pinocchio::Data& data) {
+    return held.joint ? data.oMi[held.joint].act(data.v[held.joint]) : Motion::Zero();
+}
+
+Vector3d point_velocity(const Motion& body, const Vector3d& point) {
+    return body.linear() + body.angular().cross(point);
+}
+
+// tau += (J_a - J_b)^T W for a force at `point` and a moment.
+void add_wrench(const ForceElement& e, const pinocchio::Data& data, const Vector3d& force,
+                const Vector3d& moment, const Vector3d& point, double* tau) {
+    Vector6 wrench;
+    wrench << force, moment + point.cross(force);
+    for (std::size_t k = 0; k < e.columns.size(); ++k)
+        tau[e.columns[k]] += e.signs[k] * data.J.col(e.columns[k]).dot(wrench);
+}
+
+void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
+                   double* tau) {
+    const Vector3d at_a = placement(e.a, data).translation();
+    const Vector3d at_b = placement(e.b, data).translation();
+    const Vector3d apart = at_a - at_b;
+    const double length = apart.norm();
+    if (length < coincident * e.rest) throw EvaluationError{Failure::coincident};
+    // k (l - l0) apart/l, without dividing where l = l0 = 0.
+    Vector3d force = -e.stiffness * apart;
+    if (e.rest != 0.0) force *= 1.0 - e.rest / length;
+    if (e.damping != 0.0) {
+        const Vector3d rate = point_velocity(velocity(e.a, data), at_a) -
+                              point_velocity(velocity(e.b, data), at_b);
+        // Points that meet move along the line that joins them.
+        const Vector3d along =
+            length != 0.0 ? Vector3d(apart * ((apart / length).dot(rate) / length)) : rate;
+        force -= e.damping * along;
+    }
+    add_wrench(e, data, force, Vector3d::Zero(), at_a, tau);
+}
+
+void wrench(const ForceElement& e, const pinocchio::Data& data, double* tau) {
+    const SE3 at = placement(e.a, data);
+    Vector3d force(e.numbers[0], e.numbers[1], e.numbers[2]);
+    Vector3d moment(e.numbers[3], e.numbers[4], e.numbers[5]);
+    if (e.turns) {
+        force = at.rotation() * force;
+        moment = at.rotation() * moment;
+    }
+    add_wrench(e, data, force, moment, at.translation(), tau);
+}
+
+void bushing(const ForceElement& e, const pinocchio::Data& data, double* tau) {
+    const SE3 Ta = placement(e.a, data), Tb = placement(e.b, data);
+    const SE3 relative = Tb.actInv(Ta);
+    const Vector3d turn = pinocchio::log3(relative.rotation());
+    // dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
+    Eigen::Matrix3d L;
+    pinocchio::Jlog3(relative.rotation(), L);
+    const Eigen::Map<const Vector3d> k_shift(&e.numbers[0]), k_turn(&e.numbers[3]);
+    Vector3d force = k_shift.cwiseProduct(relative.translation());
+    Vector3d moment = k_turn.cwiseProduct(turn);
+    const Eigen::Map<const Vector3d> d_shift(&e.numbers[6]), d_turn(&e.numbers[9]);
+    if (!d_shift.isZero(0.0) || !d_turn.isZero(0.0)) {
+        // b's axes and origin move along: what is left is the motion seen from b.
+        const Motion W = velocity(e.a, data) - velocity(e.b, data);
+        const Vector3d rate =
+            Tb.rotation().transpose() * point_velocity(W, Ta.translation());
+        const Vector3d spin = L.transpose() * (Tb.rotation().transpose() * W.angular());
+        force += d_shift.cwiseProduct(rate);
+        moment += d_turn.cwiseProduct(spin);
+    }
+    const Vector3d acting = Tb.rotation() * force, turning = Tb.rotation() * (L * moment);
+    add_wrench(e, data, -acting, -turning, Ta.translation(), tau);
+}
+
+}  // namespace
+
+void add_forces(const std::vector<ForceElement>& elements, double coincident,
+                const pinocchio_model::Workspace& work, const double* q, const double* v,
+                double* tau) {
+    for (const ForceElement& e : elements) {
+        switch (e.kind) {
+            case ForceKind::spring_damper:
+                spring_damper(e, coincident, work.data, tau);
+                break;
+            case ForceKind::joint_torque:
+                for (std::size_t k = 0; k < e.numbers.size(); ++k)
+                    tau[e.in_v + static_cast<int>(k)] += e.numbers[k];
+                break;
+            case ForceKind::torsion_spring:
+                tau[e.in_v] -= e.stiffness * (q[e.in_q] - e.rest) + e.damping * v[e.in_v];
+                break;
+            case ForceKind::wrench:
+                wrench(e, work.data, tau);
+                break;
+            case ForceKind::bushing:
+                bushing(e, work.data, tau);
+                break;
+        }
+    }
+}
+
+}  // namespace srm

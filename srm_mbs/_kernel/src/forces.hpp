@@ -1,0 +1,39 @@
+// Twin of srm_mbs/systems/forces.py: generalised forces of the force elements.
+#pragma once
+
+#include <string>
+#include <vector>
+
+namespace pinocchio_model {
+struct Workspace;
+}
+
+namespace srm {
+
+enum class ForceKind { spring_damper, joint_torque, torsion_spring, wrench, bushing };
+
+// An anchor: a frame on a body.
+struct Held {
+    int joint = 0;
+    double placement[12];  // rotation row-major, translation
+};
+
+// One element; which numbers count depends on its kind.
+struct ForceElement {
+    ForceKind kind;
+    Held a, b;                    // a is the only anchor of a wrench
+    std::vector<int> columns;     // velocity components that move a against b
+    std::vector<double> signs;
+    double stiffness = 0.0, damping = 0.0, rest = 0.0;
+    int in_q = 0, in_v = 0;
+    bool turns = false;           // a wrench in the axes of its link
+    std::vector<double> numbers;  // torque; force and moment; stiffness (6) and damping (6)
+};
+
+// Adds the generalised forces at q, v to tau (nv,); placements, velocities and the world Jacobian
+// must be at hand.  Throws EvaluationError.
+void add_forces(const std::vector<ForceElement>& elements, double coincident,
+                const pinocchio_model::Workspace& work, const double* q, const double* v,
+                double* tau);
+
+}  // namespace srm

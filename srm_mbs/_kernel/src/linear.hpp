@@ -1,0 +1,56 @@
+// Dense linear algebra on small column-major arrays.
+//
+// Mechanisms have a few to a few dozen coordinates: loops over plain arrays beat any library's
+// set-up cost there.  Matrices are column-major, as in LAPACK.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+
+namespace srm {
+
+// Four partial sums, so that the compiler may use vector registers.
+inline double dot(const double* a, const double* b, int n) {
+    double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+    int i = 0;
+    for (; i + 4 <= n; i += 4) {
+        s0 += a[i] * b[i];
+        s1 += a[i + 1] * b[i + 1];
+        s2 += a[i + 2] * b[i + 2];
+        s3 += a[i + 3] * b[i + 3];
+    }
+    for (; i < n; ++i) s0 += a[i] * b[i];
+    return (s0 + s1) + (s2 + s3);
+}
+
+// y += a x
+inline void add(double a, const double* x, double* y, int n) {
+    for (int i = 0; i < n; ++i) y[i] += a * x[i];
+}
+
+inline double norm(const double* a, int n) {
+    return std::sqrt(dot(a, a, n));
+}
+
+inline double largest(const double* a, int n) {
+    double out = 0.0;
+    for (int i = 0; i < n; ++i) out = std::max(out, std::abs(a[i]));
+    return out;
+}
+
+inline bool finite(const double* a, int n) {
+    for (int i = 0; i < n; ++i)
+        if (!std::isfinite(a[i])) return false;
+    return true;
+}
+
+inline void cross(const double* a, const double* b, double* out) {
+    const double x = a[1] * b[2] - a[2] * b[1];
+    const double y = a[2] * b[0] - a[0] * b[2];
+    const double z = a[0] * b[1] - a[1] * b[0];
+    out[0] = x;
+    out[1] = y;
+    out[2] = z;
+}
+
+}  // namespace srm

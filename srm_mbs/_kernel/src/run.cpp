@@ -1,0 +1,118 @@
+#include "run.hpp"
+
+#include <chrono>
+#include <cmath>
+
+#include "errors.hpp"
+#include "linear.hpp"
+
+namespace srm {
+
+namespace {
+constexpr double inf = std::numeric_limits<double>::infinity();
+// Steps between two looks at the clock.
+constexpr long clock_every = 16;
+}  // namespace
+
+Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control, LoopConstants constants,
+         Memory memory, const double* start, double t0, double t_end, double max_step,
+         Regularisation eps)
+    : system(system),
+      step(std::move(step_)),
+      control(std::move(control)),
+      memory(std::move(memory)),
+      state(start, start + system.nq + system.nv),
+      end_rate(2 * system.nv),
+      constants_(constants),
+      eps_(eps),
+      t0_(t0),
+      t_end_(t_end),
+      max_step_(max_step),
+      t_(t0),
+      smallest_(constants.smallest_step * std::abs(t_end - t0)),
+      seen_(constants.open) {}
+
+// Whether a step left the loops open; almost always without computing anything.
+bool Run::opens(const StepResult& r) {
+    const int n = static_cast<int>(r.correction.size());
+    if (n == 0) return false;
+    // Far from everything singular, a step within the tolerance has a correction to match.
+    if (r.quiet && 0.0 < r.error_ratio && r.error_ratio <= 1.0 && r.gap <= seen_) return false;
+    bool large = !(r.gap < constants_.lost);
+    for (int i = 0; i < n && !large; ++i)
+        large = !(std::abs(r.correction[i]) < constants_.large_correction * step.norm.one[i]);
+    // With every structural row in use the correction closes all rows, or the rank is wrong.
+    const bool unused = !r.in_zone && r.gap > 2.0 * seen_;
+    if (!(large || unused)) return false;
+    const double gap = system.closure_gap(r.state.data());
+    if (!(gap < constants_.lost) || (unused && gap > 0.5 * r.gap)) return true;
+    seen_ = std::max(seen_, r.gap);
+    return false;
+}
+
+void Run::record(const StepResult& r, double t_new, int placement) {
+    const auto append = [](std::vector<double>& to, const std::vector<double>& from) {
+        to.insert(to.end(), from.begin(), from.end());
+    };
+    if (r.in_zone) zones.push_back({count(), r.zone_threshold, memory.history});
+    times.push_back(t_new);
+    append(states, r.state);
+    append(rates, r.rates);
+    append(corrections, r.correction);
+    append(sigmas, r.sigmas);
+    ranks.push_back(r.rank);
+    error_ratios.push_back(r.error_ratio);
+    placements.push_back(placement);
+    held.push_back(r.held ? 1.0 : 0.0);
+    end_rate = r.end_rate;
+}
+
+Stop Run::advance(long steps, double seconds) {
+    using clock = std::chrono::steady_clock;
+    const auto started = clock::now();
+    const long last = steps > 0 ? count() + steps : std::numeric_limits<long>::max();
+    while (t_ < t_end_) {
+        const double limit = std::min(max_step_, system.step_limit(state.data()));
+        const Proposal proposal = control->propose(t_, limit, memory);
+        const double h = h_ = proposal.h;
+        const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
+        if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
+        const long made = count();
+        if (made >= constants_.watched_steps && made % constants_.watched_steps == 0 &&
+            t_ - times[made - constants_.watched_steps] <
+                constants_.standstill * (t_end_ - t0_))
+            return Stop::standstill;
+        const StepResult* result = nullptr;
+        try {
+            const double theta =
+                eps_.factor > 0.0
+                    ? -std::expm1(-h / (eps_.factor * std::pow(h, eps_.power)))
+                    : 1.0;
+            result = &step.make(t_, h, state.data(), memory, theta);
+        } catch (const EvaluationError&) {
+            trouble = true;
+        }
+        const Verdict verdict = control->judge(proposal, result);
+        const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
+        redone_ = verdict == Verdict::replaced;
+        if (verdict != Verdict::accepted || !result) {
+            attempts.push_back({t_, h, result ? result->error_ratio : inf,
+                                static_cast<int>(verdict)});
+            if (!control->adaptive && verdict == Verdict::rejected) return Stop::evaluation;
+            continue;
+        }
+        trouble = false;
+        if (opens(*result)) return Stop::closures;
+        record(*result, proposal.t_new, placement);
+        std::copy(result->state.begin(), result->state.end(), state.begin());
+        step.accept(memory);
+        t_ = proposal.t_new;
+        if (count() >= last) return t_ < t_end_ ? Stop::chunk : Stop::finished;
+        if (count() % clock_every == 0 &&
+            std::chrono::duration<double>(clock::now() - started).count() > seconds)
+            return t_ < t_end_ ? Stop::chunk : Stop::finished;
+    }
+    return Stop::finished;
+}
+
+}  // namespace srm

@@ -1,0 +1,79 @@
+// Twin of srm_mbs/stepping/loop.py: propose a step, make it, judge it, record it; in chunks.
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "control.hpp"
+
+namespace srm {
+
+enum class Stop {
+    chunk = 0,       // the chunk is full: call again
+    finished = 1,
+    too_short = 2,   // the step is below round-off
+    standstill = 3,  // the last steps covered almost nothing
+    closures = 4,    // the step made last opens the loops
+    evaluation = 5,  // a fixed step could not be evaluated
+};
+
+// The constants of srm_mbs/stepping/loop.py.
+struct LoopConstants {
+    double smallest_step, standstill, large_correction, open, lost;
+    int watched_steps;
+};
+
+struct Attempt {
+    double t, h, error_ratio;
+    int verdict;
+};
+
+// eps = factor h^power; factor 0: eps -> 0.
+struct Regularisation {
+    double factor = 0.0, power = 0.0;
+};
+
+// A zone that a step used, for its dense output.
+struct ZoneRecord {
+    long step;
+    double threshold;
+    History history;
+};
+
+class Run {
+public:
+    Run(System& system, SplitStep step, std::unique_ptr<Control> control, LoopConstants constants,
+        Memory memory, const double* state, double t0, double t_end, double max_step, Regularisation eps);
+
+    // Makes up to `steps` accepted steps, or as many as take `seconds`.
+    Stop advance(long steps, double seconds);
+
+    double t() const { return t_; }
+    double last_h() const { return h_; }
+    long count() const { return static_cast<long>(times.size()); }
+
+    System& system;
+    SplitStep step;
+    std::unique_ptr<Control> control;
+    Memory memory;
+    std::vector<double> state;
+
+    // Records of the accepted steps, one after the other.
+    std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios,
+        placements, held;
+    std::vector<double> end_rate;
+    std::vector<ZoneRecord> zones;
+    std::vector<Attempt> attempts;
+    bool trouble = false;  // the last attempt could not be evaluated
+
+private:
+    bool opens(const StepResult& result);
+    void record(const StepResult& result, double t_new, int placement);
+
+    LoopConstants constants_;
+    Regularisation eps_;
+    double t0_, t_end_, max_step_, t_, h_ = 0.0, smallest_, seen_;
+    bool redone_ = false;
+};
+
+}  // namespace srm

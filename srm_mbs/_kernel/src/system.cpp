@@ -1,0 +1,316 @@
+#include "system.hpp"
+
+#include <cmath>
+#include <limits>
+
+#include <pinocchio/algorithm/aba.hpp>
+#include <pinocchio/algorithm/crba.hpp>
+#include <pinocchio/algorithm/joint-configuration.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+
+#include "errors.hpp"
+#include "linear.hpp"
+#include "workspace.hpp"
+
+namespace srm {
+
+using pinocchio::Motion;
+using pinocchio::SE3;
+using pinocchio_model::placement;
+
+namespace {
+
+constexpr double overflow = 1e100;
+
+double distance(const double* x, int n) {
+    double sum = 0.0;
+    for (int i = 0; i < n; ++i) sum += std::abs(x[i]);
+    return sum;
+}
+
+}  // namespace
+
+System::System(const void* model, SystemData data, Controller controller)
+    : data_(std::move(data)),
+      controller_(std::move(controller)),
+      work_(std::make_unique<pinocchio_model::Workspace>(
+          *static_cast<const pinocchio::Model*>(model))) {
+    nq = work_->model.nq;
+    nv = work_->model.nv;
+    closed_ = data_.structural_rank > 0;
+    flat_ = nq == nv;
+    if (closed_)
+        projection_ = std::make_unique<Projection>(nv, data_.rows, data_.structural_rank,
+                                                   data_.sigma_ref);
+    g_.resize(data_.rows);
+    bias_.resize(data_.rows);
+    f_.resize(nv);
+    v_.resize(nv);
+    rate_.resize(nv);
+    prediction_.resize(nv);
+    white_.resize(nv);
+    acted_.resize(nv);
+}
+
+System::~System() = default;
+
+double System::sigma() const {
+    return closed_ ? projection_->sigma : std::numeric_limits<double>::infinity();
+}
+int System::rank() const { return closed_ ? projection_->rank : 0; }
+bool System::weak() const { return closed_ && projection_->weak; }
+bool System::held() const { return closed_ && projection_->held; }
+
+void System::update_loops(bool with_bias) {
+    const auto& data = work_->data;
+    const double* J = data.J.data();
+    for (const LoopRows& loop : data_.loops) {
+        const int ja = loop.joint_a, jb = loop.joint_b;
+        const SE3 in_a = placement(loop.in_a), in_b = placement(loop.in_b);
+        const SE3 Ta = ja ? data.oMi[ja] * in_a : in_a;
+        const SE3 Tb = jb ? data.oMi[jb] * in_b : in_b;
+        const SE3 H(Tb.rotation(), Ta.translation());
+        Motion W, B;
+        if (with_bias) {
+            // a_gf carries -gravity on every body and on the ground: it cancels here.
+            if (jb == 0) {
+                W = H.actInv(data.oMi[ja].act(data.v[ja]));
+                B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.a_gf[0]);
+            } else {
+                const Motion Va = data.oMi[ja].act(data.v[ja]), Vb = data.oMi[jb].act(data.v[jb]);
+                W = H.actInv(Va - Vb);
+                B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.oMi[jb].act(data.a_gf[jb]) -
+                             Vb.cross(Va));
+            }
+        }
+        int row = loop.first_row;
+        const int nv = this->nv;
+        double* const columns = closed_ ? projection_->columns() : nullptr;
+        const auto fill = [&](int row, const double* a) {
+            double* out = columns + row * nv;
+            std::fill(out, out + nv, 0.0);
+            for (std::size_t k = 0; k < loop.columns.size(); ++k) {
+                const int j = loop.columns[k];
+                const double* column = J + 6 * j;
+                out[j] = loop.signs[k] *
+                         (a[0] * column[0] + a[1] * column[1] + a[2] * column[2] +
+                          a[3] * column[3] + a[4] * column[4] + a[5] * column[5]);
+            }
+        };
+        if (!loop.directions.empty()) {
+            const Eigen::Vector3d p = Tb.actInv(Ta.translation());
+            Eigen::Vector3d acceleration = Eigen::Vector3d::Zero();
+            if (with_bias) acceleration = B.linear() + W.angular().cross(W.linear());
+            for (std::size_t k = 0; k < loop.directions.size(); k += 3, ++row) {
+                const Eigen::Map<const Eigen::Vector3d> d(&loop.directions[k]);
+                g_[row] = d.dot(p);
+                if (with_bias) bias_[row] = d.dot(acceleration);
+                Eigen::Matrix<double, 6, 1> a;
+                a.head<3>() = H.rotation() * d;
+                a.tail<3>() = H.translation().cross(a.head<3>());
+                fill(row, a.data());
+            }
+        }
+        if (!loop.alignments.empty()) {
+            const Eigen::Matrix3d R = Tb.rotation().transpose() * Ta.rotation();
+            for (std::size_t k = 0; k < loop.alignments.size(); k += 6, ++row) {
+                const Eigen::Map<const Eigen::Vector3d> u(&loop.alignments[k]);
+                const Eigen::Map<const Eigen::Vector3d> n(&loop.alignments[k + 3]);
+                const Eigen::Vector3d m = R * u;
+                g_[row] = n.dot(m);
+                if (with_bias) {
+                    const Eigen::Vector3d w = W.angular();
+                    bias_[row] = n.dot(B.angular().cross(m) + w.cross(w.cross(m)));
+                }
+                Eigen::Matrix<double, 6, 1> a;
+                a.head<3>().setZero();
+                a.tail<3>() = H.rotation() * m.cross(n);
+                fill(row, a.data());
+            }
+        }
+    }
+}
+
+void System::evaluate(double t, const double* state, const ZoneView& zone) {
+    ++evaluations;
+    if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    std::copy(state + nq, state + nq + nv, v_.begin());
+    std::fill(f_.begin(), f_.end(), 0.0);
+    if (!data_.damping.empty())
+        for (int i = 0; i < nv; ++i) f_[i] = -data_.damping[i] * v_[i];
+    if (controller_) {
+        controller_(t, state, state + nq, acted_.data());
+        for (int i = 0; i < nv; ++i) f_[i] += acted_[i];
+    }
+    for (std::size_t i = 0; i < data_.friction.size(); ++i)
+        f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    if (!closed_) {
+        if (!data_.forces.empty()) {
+            pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+            pinocchio::computeJointJacobians(w.model, w.data);
+            add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
+        }
+        std::copy(f_.begin(), f_.end(), w.tau.data());
+        pinocchio::aba(w.model, w.data, w.q, w.v, w.tau);
+        std::copy(w.data.ddq.data(), w.data.ddq.data() + nv, rate_.begin());
+        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
+        return;
+    }
+    pinocchio::crba(w.model, w.data, w.q, pinocchio::Convention::WORLD);
+    pinocchio::nonLinearEffects(w.model, w.data, w.q, w.v);
+    for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
+    if (!data_.forces.empty())
+        add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
+    update_loops(true);
+    Projection& p = *projection_;
+    p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);
+    predicted_ = false;
+    if (!p.weak || zone.history == nullptr) return;
+    predicted_ = zone.predicts && zone.history->predict_near(t, prediction_.data());
+    if (predicted_) return;
+    if (zone.normals == nullptr || zone.normal_count == 0)
+        throw EvaluationError{Failure::no_branch};
+    p.hold(zone.normals->data(), zone.normal_count);
+}
+
+// The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred.
+void System::completed(const double* white, double* out) const {
+    std::copy(white, white + nv, out);
+    if (!predicted_) return;
+    std::vector<double> x(prediction_);
+    projection_->whiten_velocity(x.data());
+    projection_->remove_normal(x.data());
+    for (int i = 0; i < nv; ++i) out[i] += x[i];
+}
+
+void System::rate(double* out) {
+    std::copy(v_.begin(), v_.end(), out);
+    if (!closed_) {
+        std::copy(rate_.begin(), rate_.end(), out + nv);
+        return;
+    }
+    completed(projection_->white_multiplier.data(), white_.data());
+    for (int i = 0; i < nv; ++i) out[nv + i] = projection_->white_force[i] - white_[i];
+    projection_->unwhiten(out + nv);
+}
+
+void System::multiplier(double* out) {
+    if (!closed_) {
+        std::fill(out, out + nv, 0.0);
+        return;
+    }
+    completed(projection_->white_multiplier.data(), out);
+    projection_->unwhiten(out);
+}
+
+void System::correction(double* out) {
+    if (!closed_) {
+        std::fill(out, out + 2 * nv, 0.0);
+        return;
+    }
+    projection_->normal(g_.data(), out);
+    projection_->unwhiten(out);
+    projection_->white_project(v_.data(), out + nv);
+    projection_->unwhiten(out + nv);
+}
+
+double System::gap() const {
+    double out = 0.0;
+    for (int i = 0; i < data_.rows; ++i) out = std::max(out, std::abs(g_[i] * data_.gap_scale[i]));
+    return out;
+}
+
+void System::normals(std::vector<double>& out, int& count) const {
+    count = rank();
+    out.resize(static_cast<std::size_t>(count) * nv);
+    if (count) projection_->normals(out.data());
+}
+
+void System::retract(const double* state, const double* delta, double* out) {
+    if (flat_) {
+        for (int i = 0; i < 2 * nv; ++i) out[i] = state[i] + delta[i];
+        return;
+    }
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    std::copy(delta, delta + nv, w.v.data());
+    pinocchio::integrate(w.model, w.q, w.v, w.q2);
+    double translation[2];
+    for (const GroupJoint& joint : data_.groups) {
+        if (joint.group != Group::se2) continue;
+        planar_translation(state + joint.position, delta + joint.start, translation);
+        w.q2[joint.position] = translation[0];
+        w.q2[joint.position + 1] = translation[1];
+    }
+    // state and out may be the same array.
+    for (int i = 0; i < nv; ++i) out[nq + i] = state[nq + i] + delta[nv + i];
+    std::copy(w.q2.data(), w.q2.data() + nq, out);
+}
+
+void System::difference(const double* start, const double* end, double* out) {
+    if (flat_) {
+        for (int i = 0; i < 2 * nv; ++i) out[i] = end[i] - start[i];
+        return;
+    }
+    auto& w = *work_;
+    for (int i = 0; i < nv; ++i) out[nv + i] = end[nq + i] - start[nq + i];
+    Eigen::VectorXd from = Eigen::Map<const Eigen::VectorXd>(start, nq);
+    const Eigen::VectorXd to = Eigen::Map<const Eigen::VectorXd>(end, nq);
+    Eigen::VectorXd step(nv);
+    pinocchio::difference(w.model, from, to, step);
+    std::copy(step.data(), step.data() + nv, out);
+    // The logarithm loses digits at small angles, the exponential does not.
+    std::vector<double> moved(nq + nv);
+    retract(start, out, moved.data());
+    from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
+    pinocchio::difference(w.model, from, to, step);
+    for (int i = 0; i < nv; ++i) out[i] += step[i];
+}
+
+void System::chart_rate(const double* delta, const double* rate, double* out) const {
+    std::copy(rate, rate + 2 * nv, out);
+    for (const GroupJoint& joint : data_.groups) {
+        if (joint.rotation(delta) > data_.largest_rotation)
+            throw EvaluationError{Failure::rotation};
+        joint.dexp_inverse(delta + joint.start, rate + joint.start, data_.series,
+                           out + joint.start);
+    }
+}
+
+double System::size(const double* positions) const {
+    double out = 0.0;
+    for (int i = 0; i < nv; ++i) out = std::max(out, std::abs(positions[i]) / data_.unit[i]);
+    return out;
+}
+
+void System::magnitudes(const double* state, double* out) const {
+    for (int i = 0; i < nv; ++i) {
+        const int k = data_.position_of[i];
+        out[i] = k < 0 ? data_.unit[i] : std::min(std::abs(state[k]), data_.unit[i]);
+        out[nv + i] = std::abs(state[nq + i]);
+    }
+}
+
+double System::step_limit(const double* state) const {
+    double speed = 0.0;
+    for (const GroupJoint& joint : data_.groups)
+        speed = std::max(speed, joint.rotation(state + nq));
+    return speed > 0.0 ? data_.rotation_per_step / speed
+                       : std::numeric_limits<double>::infinity();
+}
+
+double System::closure_gap(const double* state) {
+    if (!closed_) return 0.0;
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    pinocchio::crba(w.model, w.data, w.q, pinocchio::Convention::WORLD);
+    update_loops(false);
+    return gap();
+}
+
+}  // namespace srm

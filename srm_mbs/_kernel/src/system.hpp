@@ -1,0 +1,107 @@
+// Twin of srm_mbs/systems/multibody.py and loops.py: a mechanism as a system.
+//
+//     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0.
+//
+// A state is (q, v), a tangent (dq, dv).  The terms of the stage evaluated last are answered by
+// the system itself, each at its own cost.
+#pragma once
+
+#include <functional>
+#include <memory>
+#include <vector>
+
+#include "charts.hpp"
+#include "forces.hpp"
+#include "history.hpp"
+#include "projection.hpp"
+
+namespace srm {
+
+// Kept, scaled rows of one closure.
+struct LoopRows {
+    int joint_a, joint_b;
+    double in_a[12], in_b[12];  // placements: rotation (3, 3) row-major, translation
+    std::vector<double> directions;       // (k, 3)
+    std::vector<double> alignments;       // (l, 6): u in a, n in b
+    std::vector<int> columns;             // velocity components that move a against b
+    std::vector<double> signs;            // +1 where they move a, -1 where b
+    int first_row;
+};
+
+// (t, q, v) -> generalised forces (nv,), added to tau.
+using Controller = std::function<void(double, const double*, const double*, double*)>;
+
+struct SystemData {
+    std::vector<LoopRows> loops;
+    int rows = 0, structural_rank = 0;
+    double sigma_ref = 1.0;
+    std::vector<double> gap_scale;      // (rows,)
+    std::vector<double> unit;           // (nv,)
+    std::vector<int> position_of;       // (nv,), -1 on groups
+    std::vector<double> damping;        // (nv,) or empty
+    std::vector<double> friction;       // (nv,) or empty
+    double friction_speed = 1.0;
+    std::vector<ForceElement> forces;
+    double coincident = 0.0;
+    std::vector<GroupJoint> groups;
+    std::vector<double> series;         // of dexp^-1
+    double largest_rotation = 0.0, rotation_per_step = 0.0;
+};
+
+class System {
+public:
+    System(const void* model, SystemData data, Controller controller);
+    ~System();
+
+    // The zone of a stage; see srm_mbs/systems/base.py.  threshold < 0: none.
+    struct ZoneView {
+        double threshold = -1.0;
+        const History* history = nullptr;
+        bool predicts = true;  // false: hold the normals
+        const std::vector<double>* normals = nullptr;
+        int normal_count = 0;
+    };
+
+    void evaluate(double t, const double* state, const ZoneView& zone);
+
+    // Terms of the stage evaluated last.
+    bool constrained() const { return closed_; }
+    double sigma() const;
+    int rank() const;
+    bool weak() const;
+    bool held() const;
+    void rate(double* out);              // (2 nv,)
+    void multiplier(double* out);        // (nv,)
+    void correction(double* out);        // (2 nv,)
+    double gap() const;
+    void normals(std::vector<double>& out, int& count) const;
+
+    // The manifold.
+    void retract(const double* state, const double* delta, double* out);
+    void difference(const double* start, const double* end, double* out);
+    void chart_rate(const double* delta, const double* rate, double* out) const;
+    double size(const double* positions) const;  // of dq (nv,), in units
+    void magnitudes(const double* state, double* out) const;
+    double step_limit(const double* state) const;
+    double closure_gap(const double* state);
+
+    int nq, nv;
+    long evaluations = 0;
+    Projection& projection() { return *projection_; }
+    long factorisations() const { return closed_ ? projection_->factorisations : 0; }
+    const SystemData& data() const { return data_; }
+    const double* closure_errors() const { return g_.data(); }
+
+private:
+    void update_loops(bool with_bias);
+    void completed(const double* white, double* out) const;
+
+    SystemData data_;
+    Controller controller_;
+    std::unique_ptr<pinocchio_model::Workspace> work_;
+    std::unique_ptr<Projection> projection_;
+    bool closed_, flat_, predicted_ = false;
+    std::vector<double> g_, bias_, f_, v_, rate_, prediction_, white_, acted_;
+};
+
+}  // namespace srm

@@ -1,0 +1,24 @@
+// Pinocchio's model and data, and Eigen vectors of the kind that its compiled algorithms take.
+#pragma once
+
+#include <pinocchio/multibody.hpp>
+
+namespace pinocchio_model {
+
+struct Workspace {
+    explicit Workspace(const pinocchio::Model& model)
+        : model(model), data(model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv) {}
+    const pinocchio::Model& model;
+    pinocchio::Data data;
+    Eigen::VectorXd q, q2, v, tau;
+};
+
+// A placement from its rotation, row by row, and its translation.
+inline pinocchio::SE3 placement(const double* in) {
+    pinocchio::SE3 out;
+    out.rotation() = Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(in);
+    out.translation() = Eigen::Map<const Eigen::Vector3d>(in + 9);
+    return out;
+}
+
+}  // namespace pinocchio_model

@@ -1,0 +1,433 @@
+"""Runs on the compiled kernel: the twin of the default paths, in chunks.
+
+The kernel has the split PSRM with its stages, zone, placement, guard and step-size control, and
+dense output.  It gets every constant from the modules of the Python reference, hands back arrays,
+and leaves what is rare to Python: events, progress, and the sentences that say why a run stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._kernel import core, missing
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import ControllerError, EvaluationError, EventError
+from srm_mbs.methods import branch, split, zone
+from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.psrm import PSRM
+from srm_mbs.stepping import guard, hermite, kinks, loop, placement, stepsize, turning
+from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.stepping.events import EventWatch
+from srm_mbs.stepping.loop import RunRecord, Tick
+from srm_mbs.stepping.stepsize import Verdict
+from srm_mbs.systems.base import Zone
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+
+CHUNK = 0.1
+"""Seconds after which the kernel returns, so that Ctrl-C is heard."""
+PLACEMENTS = ("automatic", "off")
+_VERDICTS = (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.REPLACED)
+
+
+def obstacle(method: Method, placement: str, singular_times: FloatArray) -> str:
+    """Why the kernel cannot make a run: it is not there, or lacks an option; empty if it can."""
+    if core is None:
+        return missing
+    if not (isinstance(method, PSRM) and method.correction == "split"):
+        return "it has the split PSRM only"
+    if placement not in PLACEMENTS:
+        return f"it has no placement {placement!r}"
+    if len(singular_times):
+        return "it has no given singular times"
+    return ""
+
+
+_CONSTANTS = {
+    "watched": branch.WATCHED,
+    "near": branch.NEAR,
+    "far": split.FAR,
+    "ambiguous": branch.AMBIGUOUS,
+    "held": branch.HELD,
+    "rounding": branch.ROUNDING,
+    "zone_largest": zone.ZONE_LARGEST,
+    "count_uncertainty_above": zone.COUNT_UNCERTAINTY_ABOVE,
+    "hit": zone.HIT,
+    "projections": branch.PROJECTIONS,
+    "fewest": zone.FEWEST,
+    "gap_every": split.GAP_EVERY,
+    "safety": stepsize.SAFETY,
+    "min_factor": stepsize.MIN_FACTOR,
+    "max_factor": stepsize.MAX_FACTOR,
+    "proportional": stepsize.PROPORTIONAL,
+    "integral": stepsize.INTEGRAL,
+    "xi_old_floor": stepsize.XI_OLD_FLOOR,
+    "xi_floor": stepsize.XI_FLOOR,
+    "failed_evaluation": stepsize.FAILED_EVALUATION,
+    "sigma_change": placement.SIGMA_CHANGE,
+    "too_close": placement.TOO_CLOSE,
+    "clearance": placement.CLEARANCE,
+    "ahead": kinks.AHEAD,
+    "max_redone": placement.MAX_REDONE,
+    "turned": turning.TURNED,
+    "guard_max_redone": guard.MAX_REDONE,
+    "smallest_step": loop.SMALLEST_STEP,
+    "standstill": loop.STANDSTILL,
+    "large_correction": loop.LARGE_CORRECTION,
+    "open": loop.OPEN,
+    "lost": loop.LOST,
+    "watched_steps": loop.WATCHED_STEPS,
+}
+
+
+def compiled(system: ClosedSystem | OpenSystem) -> Any:
+    """The kernel's twin of ``system``, with a workspace of its own."""
+    controller = system.controlled_force if system.controlled else None
+    return core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
+
+
+def _history(history: MultiplierHistory | None) -> dict[str, Any] | None:
+    if history is None:
+        return None
+    normals = history.normals
+    return {
+        "times": np.ascontiguousarray(history.times),
+        "values": np.ascontiguousarray(history.values),
+        "known_until": history.known_until,
+        "known_below": history.known_below,
+        "normals": None if normals is None else np.ascontiguousarray(normals.T),
+    }
+
+
+def _history_from(data: dict[str, Any]) -> MultiplierHistory:
+    normals = data["normals"]
+    return MultiplierHistory(
+        data["times"],
+        data["values"],
+        data["known_until"],
+        data["known_below"],
+        None if normals is None else normals.T,
+    )
+
+
+def _memory_from(data: dict[str, Any]) -> Memory:
+    history = data["history"]
+    return Memory(
+        data["rate"],
+        data["sigma"],
+        data["magnitude"],
+        None if history is None else _history_from(history),
+        data["sigma_slope"],
+        data["steps"],
+    )
+
+
+class CompiledRun:
+    """A run of the kernel that can be advanced step by step.
+
+    Parameters
+    ----------
+    twin
+        From :func:`compiled`.
+    method, norm, memory, state
+        As for :func:`~srm_mbs.stepping.loop.integrate`.
+    t_end, step, first_step, max_step
+        End of the run, fixed step or None, first and longest step of step-size control (s).
+    placed
+        ``"automatic"`` or ``"off"``.
+    """
+
+    def __init__(
+        self,
+        twin: Any,
+        method: PSRM,
+        norm: ErrorNorm,
+        memory: Memory,
+        state: FloatArray,
+        t_end: float,
+        *,
+        step: float | None,
+        first_step: float,
+        max_step: float,
+        placed: str,
+    ) -> None:
+        scheme = method.scheme
+        gaps = np.array(scheme.gaps)
+        eps = method.regularisation
+        self._run = core.Run(  # type: ignore[union-attr]
+            twin,
+            {
+                "scheme": {
+                    "A": scheme.A,
+                    "b": scheme.b,
+                    "c": scheme.c,
+                    "error": scheme.error,
+                    "controller_order": scheme.controller_order or 1,
+                    "gap_centres": gaps[:, 0].copy(),
+                    "gap_half_widths": gaps[:, 1].copy(),
+                },
+                "constants": _CONSTANTS,
+                "norm": {
+                    "atol": np.ascontiguousarray(norm.atol),
+                    "one": np.ascontiguousarray(norm.one),
+                    "rtol": norm.rtol,
+                    "negligible": norm.negligible,
+                },
+                "memory": {
+                    "rate": np.ascontiguousarray(memory.rate),
+                    "magnitude": np.ascontiguousarray(memory.magnitude),
+                    "sigma": memory.sigma,
+                    "sigma_slope": memory.sigma_slope,
+                    "steps": memory.steps,
+                    "history": _history(memory.history),
+                },
+                "eps": None if eps is None else (eps.factor, eps.power),
+                "state": np.ascontiguousarray(state),
+                "t0": 0.0,
+                "t_end": t_end,
+                "step": 0.0 if step is None else step,
+                "first_step": first_step,
+                "max_step": max_step,
+                "placement": placed,
+            },
+        )
+
+    def advance(self, steps: int = 0) -> int:
+        """Make ``steps`` steps (0: as many as fit in CHUNK); the number of a :class:`Stop`."""
+        return int(self._run.advance(steps, CHUNK))
+
+    def last(self) -> StepResult:
+        """The step made last."""
+        data = dict(self._run.last())
+        threshold, history = data.pop("zone_threshold"), data.pop("history")
+        known = None if history is None else _history_from(history)
+        near = None if known is None else Zone(threshold, known.predict_near, known.normals)
+        return StepResult(zone=near, history=known, multiplier=None, **data)
+
+    def memory(self) -> Memory:
+        """What it carries to the next step."""
+        return _memory_from(self._run.memory())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+
+CHUNK_FULL, FINISHED, TOO_SHORT, STANDSTILL, CLOSURES, NOT_EVALUATED = range(6)
+"""Why the kernel returned: ``Stop`` in run.hpp."""
+
+
+@dataclass
+class CompiledRecord(RunRecord):
+    """A run of the kernel.
+
+    Attributes
+    ----------
+    run
+        What holds its steps.
+    suspects
+        Times (s) of steps that were kept although the velocity turned.
+    """
+
+    run: Any = None
+    suspects: list[float] = field(default_factory=list)
+    placed: int = 0
+    replaced: int = 0
+
+    def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
+        """The accepted steps as arrays."""
+        if self.run is None:
+            return super().data(scheme, tangent_size)
+        arrays = self.run.arrays()
+        zones = {
+            step: (threshold, _history_from(history))
+            for step, (threshold, history) in arrays.pop("zones").items()
+        }
+        times, states = arrays.pop("times"), arrays.pop("states")
+        return StepData(
+            times=np.concatenate([[self.t0], times]),
+            states=np.concatenate([self.x0[None], states]),
+            zones=zones,
+            stop=self.stop,
+            **arrays,
+        )
+
+
+def integrate(
+    system: ClosedSystem | OpenSystem,
+    twin: Any,
+    method: PSRM,
+    norm: ErrorNorm,
+    memory: Memory,
+    state: FloatArray,
+    t_end: float,
+    *,
+    step: float | None,
+    first_step: float,
+    max_step: float,
+    placed: str,
+    tick: Tick | None = None,
+    events: EventWatch | None = None,
+) -> CompiledRecord:
+    """As :func:`srm_mbs.stepping.loop.integrate`, from t = 0, on the kernel.
+
+    Parameters
+    ----------
+    system, twin
+        The mechanism, and what :func:`compiled` made of it.
+    step, first_step, max_step, placed
+        See :class:`CompiledRun`.
+    """
+    record = CompiledRecord(0.0, state.copy())
+    started = time.perf_counter()
+    run = record.run = CompiledRun(
+        twin,
+        method,
+        norm,
+        memory,
+        state,
+        t_end,
+        step=step,
+        first_step=first_step,
+        max_step=max_step,
+        placed=placed,
+    )
+    adaptive = step is None
+    one_by_one = tick is not None or events is not None
+    start = state
+    try:
+        if events is not None:
+            events.begin(0.0, state)
+        reason = CHUNK_FULL
+        while reason == CHUNK_FULL:
+            made = run.count
+            reason = run.advance(1 if one_by_one else 0)
+            if reason not in (CHUNK_FULL, FINISHED):
+                trouble = _trouble(reason, system, method, run, norm)
+                loop.fail(record, run.t, run.h, run.memory().sigma, trouble, adaptive)
+                break
+            if not one_by_one or run.count == made:
+                continue
+            result, t = run.last(), run.t
+            stop = None if events is None else events.after_step(start, result, t)
+            start = result.state
+            if stop is not None:
+                record.status, record.stop, record.message = "event", stop.time, stop.message
+                break
+            if tick is not None:
+                loop.tell(tick, t, result.h, result.state)
+        else:
+            record.status = "finished"
+            record.message = f"The run reached t = {t_end:.6g} s."
+    except KeyboardInterrupt:
+        record.status = "interrupted"
+        record.message = f"Interrupted at t = {run.t:.6g} s; everything up to there is kept."
+    except (ControllerError, EventError) as error:
+        record.status = "failed"
+        record.message = f"Stopped at t = {run.t:.6g} s: {error}. Everything up to there is kept."
+    record.attempts = [
+        loop.Attempt(t, h, ratio, _VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
+    ]
+    record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
+    system.count(twin.evaluations, twin.factorisations)
+    record.wall_time = time.perf_counter() - started
+    loop.log.info("%s", record.message)
+    return record
+
+
+def _trouble(
+    reason: int,
+    system: ClosedSystem | OpenSystem,
+    method: PSRM,
+    run: CompiledRun,
+    norm: ErrorNorm,
+) -> str:
+    """Why the kernel stopped, in the words of the reference, which repeats what failed."""
+    attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
+    if reason == STANDSTILL:
+        return loop.standstill(run.t - run.time_before(loop.WATCHED_STEPS))
+    if reason == CLOSURES:
+        return loop.Closures(system, norm).trouble(run.last())
+    if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
+        return loop.BELOW_ROUND_OFF
+    if run.trouble:
+        t, h = next((t, h) for t, h, ratio, _ in reversed(attempts) if np.isinf(ratio))
+        try:
+            method.step(system, t, h, run.state, run.memory(), norm)
+        except EvaluationError as error:
+            return str(error)
+    return loop.NOT_FINITE if reason == NOT_EVALUATED else ""
+
+
+class CompiledDenseOutput(DenseOutput):
+    """Dense output on the kernel, of the runs that it made.
+
+    Parameters
+    ----------
+    twin
+        From :func:`compiled`.
+    system, scheme, steps
+        As for :class:`~srm_mbs.stepping.dense.DenseOutput`.
+    """
+
+    def __init__(
+        self,
+        twin: Any,
+        system: ClosedSystem | OpenSystem,
+        scheme: ButcherTableau,
+        steps: StepData,
+    ) -> None:
+        super().__init__(system, scheme, steps)
+        self._mechanism_system = system
+        self._twin = twin
+        self._compiled: Any = None
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        """States (k, nx) at the times ``t`` (k,), in any order; see
+        :class:`~srm_mbs.stepping.dense.DenseOutput`."""
+        if self._steps.count < 2:  # a single step has no neighbours, but perhaps a zone
+            return super().__call__(t)
+        self.check(t)
+        if self._compiled is None:
+            self._compiled = self._compile()
+        before = self._twin.evaluations, self._twin.factorisations
+        try:
+            return self._compiled.states(np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
+        except ArithmeticError:
+            return super().__call__(t)  # which says why
+        finally:
+            done = self._twin.evaluations - before[0], self._twin.factorisations - before[1]
+            self._mechanism_system.count(*done)
+
+    def _compile(self) -> Any:
+        steps, extension = self._steps, self._extension
+        return core.DenseOutput(  # type: ignore[union-attr]
+            self._twin,
+            {
+                "rows": extension.rows,
+                "extra_A": extension.extra_A,
+                "extra_c": extension.extra_c,
+                "degree": len(extension.rows),
+                "n_rates": extension.n_rates,
+                "abscissae": self._abscissae,
+                "nodes": list(hermite.NODES),
+                "spacing": hermite.SPACING,
+                "close": hermite.CLOSE,
+                "probes": hermite.PROBES,
+                "count": steps.count,
+                "width": steps.rates.shape[1],
+                "corrected": steps.corrections.shape[1] > 0,
+                "zones": list(steps.zones),
+                **{
+                    name: np.ascontiguousarray(getattr(steps, name))
+                    for name in (
+                        "times", "states", "rates", "corrections", "sigmas", "end_rate",
+                    )
+                },
+            },
+        )  # fmt: skip

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 WORLD = "world"
 """Reserved link name: the fixed ground."""
+FRICTION_SPEED = 0.01
+"""Default of ``friction_speed``, rad/s or m/s."""
 
 
 def finite_numbers(values: Any, count: int, what: str, remedy: str) -> tuple[float, ...]:
@@ -314,7 +316,7 @@ class Mechanism:
     ----------
     model
         The spanning tree, gravity included; ``model.damping`` acts on the joints (N m s/rad,
-        N s/m).
+        N s/m), and ``model.friction`` F (N m, N) with -F tanh(v / friction_speed).
     loops
         Loop closures; names must be unique.
     q0 : (nq,), v0 : (nv,)
@@ -322,6 +324,9 @@ class Mechanism:
         assembles it; from a ``pin.Model`` in hand use :func:`srm_mbs.assemble`.
     forces
         Force elements (:mod:`srm_mbs.forces`); names must be unique.
+    friction_speed
+        Speed (rad/s, m/s) over which joint friction changes its sign: it is 76 % of F there.  A
+        joint held by friction creeps below it; small values make the equations stiff.
     name
         Name in messages and plots.
     source, defaults, notes
@@ -332,8 +337,8 @@ class Mechanism:
     ------
     InputError
         If names repeat, an anchor or the joint of a force is unknown, a shape does not fit, the
-        joints of the model are not in depth-first order, or it has joint friction or mimic joints,
-        which this version does not simulate.
+        joints of the model are not in depth-first order, joint friction is negative, or it has
+        mimic joints, which this version does not simulate.
     """
 
     model: pin.Model
@@ -341,6 +346,7 @@ class Mechanism:
     q0: FloatArray = None  # type: ignore[assignment]
     v0: FloatArray = None  # type: ignore[assignment]
     forces: tuple[ForceElement, ...] = ()
+    friction_speed: float = FRICTION_SPEED
     name: str = ""
     source: Source | None = None
     defaults: SimulationDefaults = field(default_factory=SimulationDefaults)
@@ -376,12 +382,20 @@ class Mechanism:
         _check_names("force", [force.name for force in self.forces])
         for force in self.forces:
             force.check(model)
-        if np.any(model.friction != 0.0):
+        if not (np.isfinite(model.friction).all() and np.all(model.friction >= 0.0)):
             raise InputError(
-                "joint friction is not simulated by this version",
+                "joint friction is negative or not finite",
                 element="model.friction",
-                remedy="Set it to zero; viscous damping acts",
+                remedy="Give values >= 0",
             )
+        speed = finite_numbers((self.friction_speed,), 1, "friction_speed", "Give rad/s or m/s")[0]
+        if speed <= 0.0:
+            raise InputError(
+                f"friction_speed = {speed:g} is not positive",
+                element="friction_speed",
+                remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
+            )
+        set_(self, "friction_speed", speed)
 
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""

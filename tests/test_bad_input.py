@@ -220,6 +220,11 @@ DESCRIPTION_FAULTS = {
     "two guesses": ("= -1.6", "= [1, 2]", ("initial.guess", "'knee'", "[1.0, 2.0]", "rad or m")),
     "two rates": ("= 2.0", "= [1, 2]", ("initial.v", "'hinge'", "[1.0, 2.0]", "rad/s or m/s")),
     "a list as initial": ("[initial]", "[[initial]]", ("initial", "a table is wanted")),
+    "zero friction speed": (
+        "lock = []",
+        "friction_speed = 0",
+        ("friction_speed", "greater than 0"),
+    ),
     "negative t_end": ("t_end = 1.0", "t_end = -1", ("simulation.t_end", "greater than 0")),
     "zero rtol": ("t_end = 1.0", "rtol = 0", ("simulation.rtol", "greater than 0")),
     "infinite t_end": ("t_end = 1.0", "t_end = inf", ("simulation.t_end", "finite number")),
@@ -517,8 +522,13 @@ URDF_FAULTS = {
     "negative velocity": ('velocity="1"', 'velocity="-2"', ("'hinge'", "velocity = -2", ">= 0")),
     "negative damping": ('"0.5"', '"-0.5"', ("'hinge'", "damping -0.5", ">= 0")),
     "nan damping": ('"0.5"', '"nan"', ("'hinge'", "damping", "'nan'")),
-    "friction": ('"0.5"', '"0.5" friction="0.1"', ("'hinge'", "friction (0.1)", "Set it to 0")),
-    "negative friction": ('"0.5"', '"0.5" friction="-1"', ("'hinge'", "friction (-1)")),
+    "negative friction": ('"0.5"', '"0.5" friction="-1"', ("'hinge'", "friction -1", ">= 0")),
+    "nan friction": ('"0.5"', '"0.5" friction="nan"', ("'hinge'", "friction", "'nan'")),
+    "friction of a floating joint": (
+        END,
+        joint_c("floating", '<dynamics friction="2"/>'),
+        ("'c'", "friction (2)", "floating", "Set it to 0"),
+    ),
     # the tree
     "no limit": (
         '<limit lower="-10" upper="10" effort="1" velocity="1"/>',

@@ -485,6 +485,88 @@ def test_a_bushing_is_linear_at_small_rotations() -> None:
     )
 
 
+# --- joint friction -----------------------------------------------------------------------------
+
+SPEED = 0.02
+
+
+def rubbing(friction: float, slope: float = 0.0, v0: float = 0.0, mass: float = 2.0) -> Any:
+    """A block on a slide that falls by ``slope`` (rad), with friction in N."""
+    model = pin.Model()
+    model.gravity.linear = 9.81 * np.array([np.sin(slope), 0.0, -np.cos(slope)])
+    model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(1, pin.Inertia(mass, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    model.friction = np.array([friction])
+    return srm.Mechanism(model, v0=[v0], friction_speed=SPEED)
+
+
+def test_friction_stops_a_block_as_its_formula_says() -> None:
+    """m v' = -F tanh(v/s): sinh(v/s) falls as exp(-F t/(m s)); before that, v falls by F/m t."""
+    F, m, v0 = 3.0, 2.0, 1.5
+    solution = srm.simulate(rubbing(F, v0=v0, mass=m), 1.2, rtol=1e-10)
+    t = solution.t
+    # ln sinh(v0/s) without overflow
+    exponent = v0 / SPEED - np.log(2.0) + np.log1p(-np.exp(-2.0 * v0 / SPEED)) - F * t / (m * SPEED)
+    expected = SPEED * np.arcsinh(np.exp(exponent))
+    np.testing.assert_allclose(solution.v[:, 0], expected, rtol=1e-7, atol=1e-9)
+    # Coulomb's law: the distance to the stop is v0^2 m/(2F), up to the smoothing.
+    assert solution.q[-1, 0] == pytest.approx(v0**2 * m / (2.0 * F), rel=1e-3)
+    assert np.all(np.diff(solution.energy) <= 1e-12)
+
+
+def test_friction_holds_a_block_on_a_slope_but_for_a_creep() -> None:
+    F, load = 5.0, 2.0 * 9.81 * np.sin(0.2)
+    assert load < F
+    solution = srm.simulate(rubbing(F, 0.2), 1.0, rtol=1e-8)
+    creep = SPEED * np.arctanh(load / F)
+    assert solution.v[-1, 0] == pytest.approx(creep, rel=1e-7)
+    assert solution.q[-1, 0] < creep
+
+
+def test_a_load_above_the_friction_accelerates_the_block() -> None:
+    F, load = 3.0, 2.0 * 9.81 * np.sin(0.2)
+    assert load > F
+    solution = srm.simulate(rubbing(F, 0.2), 2.0, rtol=1e-8)
+    slope = np.diff(solution.v[-2:, 0]) / np.diff(solution.t[-2:])
+    assert slope[0] == pytest.approx((load - F) / 2.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["four_bar", "pendulum_chain"])
+def test_friction_acts_beside_damping_on_open_and_closed_mechanisms(name: str) -> None:
+    mechanism = srm.load(name)
+    model = mechanism.model.copy()
+    model.friction = np.array([0.3, 0.0, 0.7])
+    model.damping = np.array([0.0, 0.2, 0.1])
+    v = mechanism.v0 + np.array([0.01, -0.02, 0.3])
+    rough = replace(mechanism, model=model, friction_speed=SPEED)
+    by_hand = -np.array([0.3, 0.0, 0.7]) * np.tanh(v / SPEED) - np.array([0.0, 0.2, 0.1]) * v
+    state = np.concatenate([mechanism.q0, v])
+    np.testing.assert_allclose(
+        make_system(rough).evaluate(0.0, state).rate(),
+        make_system(mechanism, lambda t, q, v: by_hand).evaluate(0.0, state).rate(),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+
+
+def test_negative_friction_and_senseless_speeds_are_refused() -> None:
+    with pytest.raises(srm.InputError, match=r"model\.friction: .*negative.*>= 0"):
+        rubbing(-1.0)
+    with pytest.raises(srm.InputError, match=r"model\.friction: .*not finite"):
+        rubbing(np.nan)
+    for speed in (0.0, -1.0, np.inf, "slow"):
+        with pytest.raises(srm.InputError, match="friction_speed"):
+            replace(rubbing(1.0), friction_speed=speed)
+
+
+def test_the_friction_speed_is_saved(tmp_path: Path) -> None:
+    solution = srm.simulate(rubbing(3.0, v0=1.0), 0.1)
+    solution.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz").mechanism
+    assert loaded.friction_speed == SPEED
+    np.testing.assert_array_equal(loaded.model.friction, [3.0])
+
+
 # --- units --------------------------------------------------------------------------------------
 
 

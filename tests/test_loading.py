@@ -263,6 +263,23 @@ def test_damping_goes_to_the_joint_that_has_it(tmp_path: Path) -> None:
         assert set(model.damping[joint.idx_v : joint.idx_v + joint.nv]) == {damping}
 
 
+@pytest.mark.parametrize("locked", ["", 'lock = ["track"]\n'])
+def test_friction_goes_to_the_joint_that_has_it(locked: str, tmp_path: Path) -> None:
+    text = zoo_urdf().replace('damping="0.7"', 'damping="0.7" friction="0.2"')
+    axle = '<axis xyz="0.0 5.0 0.0"/>'
+    assert axle in text
+    text = text.replace(axle, f'{axle}<dynamics friction="0.3"/>')
+    mechanism = srm.load(write(tmp_path, text, f"friction_speed = 0.05\n{locked}"))
+    track = [] if locked else [0.0]
+    np.testing.assert_array_equal(mechanism.model.friction, [0.2, *track, 0.3, 0.0, 0.0, 0.0])
+    assert mechanism.friction_speed == 0.05
+    (note,) = mechanism.notes
+    assert "v_s = 0.05" in note
+    assert "friction_speed" in note
+    bare = srm.load(tmp_path / "zoo.urdf")
+    assert bare.friction_speed == 0.01
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -820,17 +837,9 @@ def test_locking_the_root_joint_fixes_the_base(tmp_path: Path) -> None:
     assert locked.jointPlacements[1].translation[2] == pytest.approx(3.3)
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ('<dynamics damping="1.3"/>', '<dynamics damping="1.3" friction="2"/>'),
-        ('<dynamics damping="1.3"/>', '<mimic joint="shoulder" multiplier="2"/>'),
-    ],
-)
-def test_what_a_joint_would_do_does_not_matter_when_it_is_locked(
-    old: str, new: str, tmp_path: Path
-) -> None:
-    text = zoo_urdf().replace(old, new)
+def test_what_a_joint_would_do_does_not_matter_when_it_is_locked(tmp_path: Path) -> None:
+    mimic = '<mimic joint="shoulder" multiplier="2"/>'
+    text = zoo_urdf().replace('<dynamics damping="1.3"/>', mimic)
     with pytest.raises(srm.InputError, match="'track'"):
         srm.load(write(tmp_path, text))
     mechanism = srm.load(write(tmp_path, text, 'lock = ["track"]\n'))
@@ -966,7 +975,6 @@ def robots() -> list[Path]:
 
 # Why a published robot is refused: what the file asks for acts, and this version cannot do it.
 JUSTIFIED = {
-    "friction": re.compile(r"joint '.+': joint friction \(.+\) is not simulated.*Set it to 0"),
     "mimic": re.compile(r"joint '.+': <mimic> .* is not read.*lock"),
     "inertia": re.compile(r"link '.+': a principal moment of inertia is negative"),
     "empty": re.compile(r"<robot>: it has no name"),  # an empty file by a failed xacro run

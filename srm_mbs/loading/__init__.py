@@ -162,6 +162,15 @@ def _without_locked(
     return lock_joints(model, list(description.lock), frozen), q, v, guess
 
 
+def _friction_note(description: Description, model: pin.Model) -> tuple[str, ...]:
+    if not np.any(model.friction):
+        return ()
+    return (
+        "joint friction F acts as F tanh(v/v_s) with v_s = "
+        f"{description.friction_speed:g} rad/s or m/s; set it with friction_speed",
+    )
+
+
 def _unassembled(
     description: Description, source: Source
 ) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
@@ -178,10 +187,11 @@ def _unassembled(
         model,
         description.closures(),
         forces=description.force_elements(),
+        friction_speed=description.friction_speed,
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=built.notes,
+        notes=built.notes + _friction_note(description, model),
     )
     start = np.array(mechanism.q0)
     for where, values in (("initial.guess", guess), ("initial.q", q)):

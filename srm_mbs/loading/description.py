@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
-from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure
+from srm_mbs.mechanism import FRICTION_SPEED, Anchor, ForceElement, LoopClosure
 
 LARGEST = 1e30
 """Numbers beyond this have lost their meaning, and their squares may overflow."""
@@ -182,6 +182,7 @@ class Description(_Strict):
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]
     lock: list[StrictStr] = []
+    friction_speed: Annotated[Number, Field(gt=0)] = FRICTION_SPEED
     loop: list[LoopEntry] = []
     force: list[AnyForceEntry] = []
     initial: InitialEntry = InitialEntry()

@@ -147,7 +147,7 @@ def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> U
         ``fixed``, ``floating`` (root joint ``root_joint``, a free flyer) or ``planar`` (motion in
         the x-y plane of the world).
     locked
-        Joints that will be locked: friction and ``<mimic>`` do not matter there.
+        Joints that will be locked: ``<mimic>`` does not matter there.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """What a URDF says, checked before Pinocchio reads it.
 
 Pinocchio's parser drops what it does not know without a word: unknown elements, a second joint
-with the same child, joint friction, a whole <inertial> whose numbers are separated by a newline.
+with the same child, a whole <inertial> whose numbers are separated by a newline.
 Everything that would change the mechanism is therefore checked on the XML, and what is left of it
 holds nothing but what was checked, with the numbers written afresh.
 """
@@ -416,21 +416,13 @@ class UrdfChecker:
             return
         for key in dynamics.attrib:
             (value,) = self.numbers(dynamics, key, 1, where)
-            if key == "friction" and value != 0.0 and kind != "fixed" and not locked:
+            if value < 0.0:
+                raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
+            if value != 0.0 and kind in ("floating", "planar") and not locked:
                 raise self.fault(
                     where,
-                    f"joint friction ({value:g}) is not simulated by this version",
-                    "Set it to 0; viscous damping acts",
-                )
-            if key == "damping" and value < 0.0:
-                raise self.fault(where, f"the damping {value:g} is negative", "Give a value >= 0")
-            if key == "damping" and value != 0.0 and kind in ("floating", "planar") and not locked:
-                raise self.fault(
-                    where,
-                    f"the damping ({value:g}) of a {kind} joint is not simulated by this version",
+                    f"the {key} ({value:g}) of a {kind} joint is not simulated by this version",
                     "Set it to 0; that of one-degree joints acts",
                 )
-        # What is left acts nowhere: it is zero, or the joint does not move.
-        dynamics.attrib.pop("friction", None)
         if not dynamics.attrib:
             joint.remove(dynamics)

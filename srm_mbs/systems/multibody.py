@@ -1,9 +1,9 @@
 r"""A mechanism as a system: Pinocchio terms, closures, and the answers of a stage.
 
-    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0,   f = tau - nle(q, v) - damping v,
+    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0,   f = tau - nle(q, v),
 
-tau from the controller and the force elements.  Only this module, ``loops``, ``forces`` and the
-load-time analysis call Pinocchio algorithms.
+tau from controller, joint damping and friction, and force elements.  Only this module, ``loops``,
+``forces`` and the load-time analysis call Pinocchio algorithms.
 """
 
 from __future__ import annotations
@@ -57,6 +57,8 @@ class _Mechanics:
         self.evaluations = 0
         self._controller = controller
         self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
+        self._friction = self.model.friction.copy() if np.any(self.model.friction) else None
+        self._friction_speed = mechanism.friction_speed
         self._forces = ForceKinematics(self.model, mechanism.forces) if mechanism.forces else None
         self._groups = group_joints(self.model)
         self._planar = tuple(joint for joint in self._groups if joint.group == "se2")
@@ -109,8 +111,11 @@ class _Mechanics:
         return np.ascontiguousarray(tau)
 
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
-        """Controller and joint damping (nv,); None if there is neither."""
+        """Controller, joint damping and joint friction (nv,); None if there is none of them."""
         force = None if self._damping is None else -self._damping * v
+        if self._friction is not None:
+            rubbing = -self._friction * np.tanh(v / self._friction_speed)
+            force = rubbing if force is None else force + rubbing
         if self._controller is None:
             return force
         tau = self.controlled_force(t, q, v)
@@ -127,8 +132,8 @@ class _Mechanics:
             "unit": self._unit,
             "position_of": [int(i) for i in self._position_of],
             "damping": self._damping,
-            "friction": None,
-            "friction_speed": 1.0,
+            "friction": self._friction,
+            "friction_speed": float(self._friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
             "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],

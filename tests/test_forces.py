@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
+from srm_mbs.systems.forces import friction_time
 from srm_mbs.systems.multibody import make_system
 from tests.mechanisms import along_x, rod
 
@@ -547,6 +548,20 @@ def test_friction_acts_beside_damping_on_open_and_closed_mechanisms(name: str) -
         rtol=1e-12,
         atol=1e-12,
     )
+
+
+def test_the_time_of_friction_is_that_of_the_fastest_joint() -> None:
+    """A joint with more friction and less inertia sets it; alone it is m s/F."""
+    assert friction_time(rubbing(3.0)) == pytest.approx(2.0 * SPEED / 3.0)
+    assert friction_time(rubbing(0.0)) == np.inf
+    chain = srm.load("pendulum_chain")
+    model = chain.model.copy()
+    model.friction = np.array([0.3, 0.0, 0.7])
+    M = pin.crba(model, model.createData(), chain.q0)
+    M = np.triu(M) + np.triu(M, 1).T
+    fastest = np.abs(np.linalg.eigvals(np.linalg.solve(M, np.diag(model.friction)))).max() / SPEED
+    rough = replace(chain, model=model, friction_speed=SPEED)
+    assert friction_time(rough) == pytest.approx(1.0 / fastest, rel=1e-10)
 
 
 def test_negative_friction_and_senseless_speeds_are_refused() -> None:

@@ -21,6 +21,7 @@ from srm_mbs.loading import rebuild
 from srm_mbs.loading.bundled import models_folder
 from srm_mbs.loading.generated import n_four_bar as n_four_bar_texts
 from srm_mbs.simulation import simulate
+from srm_mbs.systems.forces import friction_time
 from srm_mbs.systems.loops import LoopKinematics
 
 load = cache(srm.load)
@@ -274,7 +275,8 @@ def test_friction_goes_to_the_joint_that_has_it(locked: str, tmp_path: Path) -> 
     np.testing.assert_array_equal(mechanism.model.friction, [0.2, *track, 0.3, 0.0, 0.0, 0.0])
     assert mechanism.friction_speed == 0.05
     (note,) = mechanism.notes
-    assert "v_s = 0.05" in note
+    assert "v_s = 0.05 rad/s" in note
+    assert f"{6.0 * friction_time(mechanism):.0e} s" in note
     assert "friction_speed" in note
     bare = srm.load(tmp_path / "zoo.urdf")
     assert bare.friction_speed == 0.01

@@ -34,6 +34,7 @@ from srm_mbs.loading.urdf import (
     undetermined_joint,
 )
 from srm_mbs.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.systems.forces import friction_time
 
 __all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]
 
@@ -162,12 +163,17 @@ def _without_locked(
     return lock_joints(model, list(description.lock), frozen), q, v, guess
 
 
-def _friction_note(description: Description, model: pin.Model) -> tuple[str, ...]:
-    if not np.any(model.friction):
+def _friction_note(mechanism: Mechanism) -> tuple[str, ...]:
+    try:
+        time = friction_time(mechanism)
+    except EvaluationError:  # in gimbal lock, which is reported elsewhere
+        return ()
+    if time == np.inf:
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
-        f"{description.friction_speed:g} rad/s or m/s; set it with friction_speed",
+        f"{mechanism.friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
+        f"{6.0 * time:.0e} s, in proportion to v_s: set it with friction_speed",
     )
 
 
@@ -191,7 +197,7 @@ def _unassembled(
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=built.notes + _friction_note(description, model),
+        notes=built.notes,
     )
     start = np.array(mechanism.q0)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
@@ -201,7 +207,8 @@ def _unassembled(
     for name, value in v.items():
         with _element("initial.v"):
             set_rate(mechanism, np.zeros(model.nv), name, value)
-    return replace(mechanism, q0=start), q, v
+    mechanism = replace(mechanism, q0=start)
+    return replace(mechanism, notes=mechanism.notes + _friction_note(mechanism)), q, v
 
 
 def rebuild(source: Source) -> Mechanism:

@@ -20,8 +20,9 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.forces import Bushing, JointTorque, SpringDamper, TorsionSpring, Wrench
-from srm_mbs.mechanism import Anchor, ForceElement
+from srm_mbs.mechanism import Anchor, ForceElement, Mechanism
 from srm_mbs.systems.loops import cross, placement_numbers, support, world_jacobian
+from srm_mbs.systems.projection import cholesky, whiten
 
 COINCIDENT = 1e-9
 """Distance over rest length below which the line between two points has no direction."""
@@ -223,6 +224,27 @@ class _Bushing:
             "support": self.support,
             "numbers": np.concatenate([self.stiffness, self.damping]).astype(float),
         }
+
+
+def friction_time(mechanism: Mechanism) -> float:
+    """Shortest time (s) in which friction stops a slow joint of the open tree at q0.
+
+    1 over the largest eigenvalue of M^-1 diag(F)/v_s; infinite without friction.  Steps of
+    explicit schemes stay below a few times it while a joint rests.
+
+    Raises
+    ------
+    EvaluationError
+        If the mass matrix is not positive definite.
+    """
+    model = mechanism.model
+    rough = np.flatnonzero(model.friction)
+    if not rough.size:
+        return np.inf
+    U = cholesky(pin.crba(model, model.createData(), mechanism.q0))
+    roots = np.zeros((model.nv, rough.size), order="F")
+    roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / mechanism.friction_speed)
+    return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)
 
 
 _EVALUATORS = {

@@ -306,7 +306,9 @@ def impasse(out: Path, thin: bool) -> list[Entry]:
             "the gap of two trajectories that were never restarted, which no step makes smaller. "
             "How many forced steps it takes is decided by their length, which print does not give: "
             "1e-4 s brings the accepted steps near to it. Why print rejects far more is not known: "
-            "a control that tries a larger step after each forced one would. "
+            f"counted as rejected, forced steps would make it {log.rejected + log.forced} here, "
+            "and fewer with the length that gives print's accepted steps; a control that tries a "
+            "larger step after each forced one would reject more. "
             "With the estimate within one sweep, from the accepted state, no step is forced. "
             "(The package itself accepts no tolerance looser than 1e-4.)",
         )

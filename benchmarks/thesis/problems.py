@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 import srm_mbs as srm
@@ -26,14 +24,9 @@ def problem_one(p: int) -> srm.SemiExplicitDAE:
     )
 
 
-def _constraint(t: float, x: Any) -> float:
-    """The order of its sums decides the last digit of y."""
-    return 0.5 * ((x[0] ** 2 + x[1] ** 2) - (np.exp(-2 * t) + np.sin(t) ** 2))
-
-
 def problem_two() -> srm.SemiExplicitDAE:
     """x = (exp(-t), sin t), y = exp(t)."""
-    return daes.problem_two(g=_constraint)
+    return daes.problem_two()
 
 
 START_TWO = daes.START_TWO

@@ -29,7 +29,7 @@ from srm_mbs.stepping.dense import DenseOutput, StepData, step_data
 from srm_mbs.stepping.events import EventWatch, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.rate_guard import RateGuard
-from srm_mbs.stepping.remarks import drift, turns
+from srm_mbs.stepping.remarks import drift, restarts, turns
 from srm_mbs.stepping.singular_times import Placing, placed, suspected
 from srm_mbs.stepping.stepsize import Verdict, initial_step
 from srm_mbs.systems.dae import DaeSystem
@@ -253,11 +253,13 @@ def solve_dae(
     method
         ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
         (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of
-        G B are passed by the split form, and by all restarted sweeps with T = (GB)^-1: at a
-        tolerance of 1e-4 with errors below 2e-4, at 1e-6 below 2e-6 (``tests/test_dae.py``).
-        Sweeps with own histories, whose first one is off the constraints by O(eps), leave on
-        another branch of g = 0, however small the step; so do sweeps that carry y, which is not
-        bounded there.  The message says so: x' is compared across every passage.
+        G B are passed by the split form, and by sweeps with T = (GB)^-1: restarted ones with
+        ``carry`` at a tolerance of 1e-4 with errors below 2e-4, at 1e-6 below 2e-6
+        (``tests/test_dae.py``); without it they turn off.  Sweeps with own histories, whose first
+        one is off the constraints by O(eps), would leave on another branch of g = 0; next to the
+        singularity they are restarted, and the message says when.  Sweeps that carry y, which is
+        not bounded there, do leave on another branch, however small the step.  The message says so:
+        x' is compared across every passage.
     tableau
         Runge-Kutta scheme for a method given by name.
     rtol
@@ -394,6 +396,7 @@ def solve_dae(
         status=record.status,
         message=record.message
         + turns(suspected(wrappers), "x' turned", MENDED)
+        + restarts(record.steps)
         + drift(record.steps, norm),
         stats=stats,
     )

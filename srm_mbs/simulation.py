@@ -37,7 +37,7 @@ from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
-from srm_mbs.stepping.remarks import drift, turns
+from srm_mbs.stepping.remarks import drift, restarts, turns
 from srm_mbs.stepping.singular_times import Placing, placed, suspected
 from srm_mbs.stepping.starting import start
 from srm_mbs.stepping.stepsize import (
@@ -414,6 +414,7 @@ def _collect(
         status=record.status,
         message=record.message
         + turns(suspects, "the velocity turned", MENDED)
+        + restarts(record.steps)
         + drift(record.steps, norm)
         + _limits_left(mechanism, dense),
         stats=stats,

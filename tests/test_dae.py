@@ -173,16 +173,42 @@ def test_adaptive_sweeps_pass_an_isolated_singularity_and_follow_the_tolerance(
 
 
 @pytest.mark.parametrize(
+    ("method", "options", "bound"),
+    [
+        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.02}, 1e-3),
+        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.01}, 2e-4),
+        (srm.SRM("erk4", 4, T="inverse"), {"step": 0.01}, 1e-4),
+        (srm.SRM("dopr54", 5, T="inverse"), {"step": 0.02}, 1e-3),
+        (srm.SRM("tvd32", 3, T="inverse"), {"rtol": 1e-4, "atol": 1e-4}, 1e-3),
+        (srm.SRM("tvd32", 3, T="inverse", eps=0.003), {"rtol": 1e-4, "atol": 1e-4}, 5e-5),
+    ],
+    ids=str,
+)
+def test_own_histories_are_restarted_next_to_a_singularity_and_pass(
+    method: Any, options: dict[str, Any], bound: float
+) -> None:
+    """Their first sweep is off by O(eps), on a level of g that turns off whatever the step."""
+    solution = srm.solve_dae(
+        passing_singularity(), (0.0, 3.0), START_PASSING, method=method, **options
+    )
+    assert solution.success, solution.message
+    assert "turned" not in solution.message
+    assert "gave up their own histories" in solution.message
+    assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < bound
+
+
+def test_own_histories_are_kept_where_nothing_is_singular() -> None:
+    method = srm.SRM("tvd32", 3, T="inverse", eps=0.02)
+    solution = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, method=method, step=0.01)
+    assert solution.success
+    assert "own histories" not in solution.message
+
+
+@pytest.mark.parametrize(
     ("method", "options"),
     [
-        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.02}),
-        (srm.SRM("erk4", 4, T="inverse"), {"step": 0.01}),
-        (srm.SRM("dopr54", 5, T="inverse"), {"step": 0.02}),
-        pytest.param(
-            srm.SRM("tvd32", 3, T="inverse"),
-            {"rtol": 1e-4, "atol": 1e-4},
-            marks=pytest.mark.stress,
-        ),
+        (srm.PSRM("tvd32", "simple"), {"step": 0.01}),
+        (srm.SRM("tvd32", 3, T="inverse", eps=0.01, restart=True), {"step": 0.01}),
         pytest.param(
             srm.PSRM("dopr54", correction="sweep"),
             {"rtol": 1e-4, "atol": 1e-4},
@@ -192,7 +218,7 @@ def test_adaptive_sweeps_pass_an_isolated_singularity_and_follow_the_tolerance(
     ids=str,
 )
 def test_a_wrong_branch_is_never_silent(method: Any, options: dict[str, Any]) -> None:
-    """Own histories, and sweeps that carry the unbounded y, do not pass: the message says it."""
+    """Sweeps that carry the unbounded y, or start every step from 0, do not pass: they say it."""
     solution = srm.solve_dae(
         passing_singularity(), (0.0, 3.0), START_PASSING, method=method, **options
     )

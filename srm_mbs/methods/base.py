@@ -72,6 +72,10 @@ class SweepNode:
         The regularisation (s) of that rate.
     history
         Its multipliers at recent step ends outside the zone; None where sweeps need no zone.
+    off
+        How far it is off the closures, in units.
+    given
+        With own histories, y_0: the constant multiplier that the first sweep is given; None for 0.
     """
 
     state: FloatArray
@@ -79,6 +83,8 @@ class SweepNode:
     rate: FloatArray | None
     eps: float
     history: MultiplierHistory | None
+    off: float = 0.0
+    given: FloatArray | None = None
 
 
 @dataclass
@@ -148,6 +154,8 @@ class StepResult:
         at the end, over tolerance; else 0.
     off
         For methods with sweeps: how far any of them is off the closures at the end, in units.
+    restarted
+        Whether sweeps with own histories started from the accepted state in this step.
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
@@ -178,6 +186,7 @@ class StepResult:
     sweeps: tuple[SweepNode, ...] = ()
     drift_ratio: float = 0.0
     off: float = 0.0
+    restarted: bool = False
     placement: str = ""
     quiet: bool = False
     gap: float = 0.0

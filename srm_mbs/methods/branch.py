@@ -28,7 +28,8 @@ WATCHED = 0.05
 """sigma below which, or within NEAR steps of which, a step looks out for singular
 configurations."""
 NEAR = 4.0
-"""Steps that start with sigma below NEAR |d sigma / dt| h are looked at."""
+"""Steps that start with sigma below NEAR |d sigma / dt| h are looked at; of sweeps, which keep
+their constraint errors for about eps, those below NEAR |d sigma / dt| max(h, eps)."""
 PROJECTIONS = 4
 """Newton steps at most; the error squares each time."""
 AMBIGUOUS = 0.1
@@ -54,6 +55,8 @@ class BranchStages:
         What the zone of the step predicts from; None for sweeps that need no zone.
     end
         End of the step (s).
+    memory_span
+        How long the method keeps a constraint error, eps (s); 0 if every step removes it.
 
     Attributes
     ----------
@@ -76,6 +79,7 @@ class BranchStages:
     sigma_change: float
     history: MultiplierHistory | None
     end: float
+    memory_span: float = 0.0
     near: bool = field(init=False)
     zone: Zone | None = field(init=False)
     excused: float = field(init=False)
@@ -83,7 +87,10 @@ class BranchStages:
 
     def __post_init__(self) -> None:
         # All stages of a step or none: a mixture of both loses the order.
-        reach = NEAR * self.sigma_change if self.sigma_change > 0.0 else WATCHED
+        # By time, not by steps alone: errors kept over many short steps grow like 1/sigma^2 in the
+        # multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
+        spans = max(1.0, self.memory_span / self.h)
+        reach = NEAR * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED
         self.near = self.memory.sigma < reach
         threshold = ZONE_LARGEST
         lingering = False

@@ -12,7 +12,8 @@ that at its start, counts as well.  Both parts vanish with the step.  Sweeps wit
 off the closures by what their histories left, which no step mends: their runs report it.
 
 Next to a singular configuration the algebra of all sweeps is evaluated on the branch
-(:class:`~srm_mbs.methods.sweeps.OnBranch`).
+(:class:`~srm_mbs.methods.sweeps.OnBranch`), and own histories that are too far off the closures to
+tell the branch are restarted from the accepted state.
 
 The zone serves the exact prediction only.  Multipliers of sweeps carry their initial layers and
 errors of order eps; extrapolated, they stalled runs that pass without (measured).
@@ -29,7 +30,7 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult, SweepNode
-from srm_mbs.methods.branch import BranchStages
+from srm_mbs.methods.branch import AMBIGUOUS, NEAR, BranchStages
 from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.regularisation import Regularisation, real_stability_limit
@@ -129,9 +130,11 @@ class IteratedSweeps:
         eps = max(self.eps(h), EPS_SHRINKS * memory.sweeps[-1].eps)
         if not (math.isfinite(eps) and eps > 0.0):
             raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
+        memory, restarted = self._gathered(system, memory, h * memory.sigma_slope)
         kept = memory.sweeps[-1].history
         weights = norm.weights(memory.magnitude)
-        stages = BranchStages(system, memory, norm, weights, h, h * memory.sigma_slope, kept, t + h)
+        change = h * memory.sigma_slope
+        stages = BranchStages(system, memory, norm, weights, h, change, kept, t + h, eps)
         make = self._own_sweeps if self.own_history else self._restarted_sweeps
         runs = make(system, t, h, eps, memory, stages)
         last = runs[-1]
@@ -140,7 +143,9 @@ class IteratedSweeps:
         magnitude = system.magnitudes(last.state)
         error_ratio, drift_ratio = self._estimate(t, h, eps, magnitude, stages, last)
         ends = runs if self.own_history else runs[-1:]
-        sweeps = tuple(self._end(node, run, t + h, eps) for node, run in zip(memory.sweeps, ends))
+        sweeps = tuple(
+            self._end(system, node, run, t + h, eps) for node, run in zip(memory.sweeps, ends)
+        )
         weak = any(run.weak for run in runs)
         return StepResult(
             t=t,
@@ -158,7 +163,8 @@ class IteratedSweeps:
             magnitude=magnitude,
             sweeps=sweeps,
             drift_ratio=drift_ratio,
-            off=max(0.0 if run.off is None else system.size(run.off) for run in ends),
+            off=max(node.off for node in sweeps),
+            restarted=restarted,
         )
 
     def _estimate(
@@ -209,7 +215,9 @@ class IteratedSweeps:
     ) -> list[Sweep]:
         """Every sweep from its own state; the fused form is its one sweep with another equation."""
         fused = self.first is First.FUSED
-        previous = np.zeros((len(nodes_of(self.scheme).c), system.multiplier_size))
+        given = memory.sweeps[0].given
+        first = np.zeros(system.multiplier_size) if given is None else given
+        previous = np.tile(first, (len(nodes_of(self.scheme).c), 1))
         near, zone = _on_branch(stages, eps), stages.zone
         runs: list[Sweep] = []
         for k, node in enumerate(memory.sweeps):
@@ -303,14 +311,31 @@ class IteratedSweeps:
                 )
         return runs
 
-    def _end(self, node: SweepNode, run: Sweep, t: float, eps: float) -> SweepNode:
+    def _gathered(self, system: System, memory: Memory, change: float) -> tuple[Memory, bool]:
+        """``memory`` with own histories restarted where they could change the branch, and whether.
+
+        The first sweeps are off the closures by eps (yhat - y_0), a part of sigma next to a
+        singular configuration: there they follow a neighbouring level of g, which turns off.  All
+        sweeps then start again from the accepted state, with its multiplier for y_0: no initial
+        layer, and they are off by eps times the change of yhat since.
+        """
+        if not (self.own_history and self.first is First.ZERO and system.carries_yhat):
+            return memory, False
+        off = max(node.off for node in memory.sweeps)
+        if not off > AMBIGUOUS * max(0.0, memory.sigma - NEAR * change):
+            return memory, False
+        last = memory.sweeps[-1]
+        node = replace(last, rate=None, given=last.multiplier)
+        return replace(memory, sweeps=(node,) * len(memory.sweeps)), True
+
+    def _end(self, system: System, node: SweepNode, run: Sweep, t: float, eps: float) -> SweepNode:
         multiplier = run.multipliers[self.scheme.n_stages]
         history = node.history
         if history is not None and run.exact is not None:
             history = history.extended(t, run.exact)
-        return SweepNode(
-            run.state, multiplier, run.end_rate if self.own_history else None, eps, history
-        )
+        off = 0.0 if run.off is None else system.size(run.off)
+        rate = run.end_rate if self.own_history else None
+        return SweepNode(run.state, multiplier, rate, eps, history, off, node.given)
 
     def _check_closures(
         self, system: System, t: float, state: FloatArray, h: float, eps: float

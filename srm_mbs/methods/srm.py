@@ -41,7 +41,7 @@ class SRM:
     to t = 40 through its passages, errors 1e-3 and 4e-5 at tolerances of 1e-4 and 1e-5; four-bar
     to t = 5, 5e-3 and 4e-4.  Sweeps with their own history drift apart, and the last one is off the
     closures by a power of eps that no step mends: the message says how far.  With a fixed eps of
-    0.01 and 0.003 s at 1e-4 and 1e-5 the slider-crank has errors of 1e-3 and 3e-5, but the four-bar
+    0.01 and 0.003 s at 1e-4 and 1e-5 the slider-crank has errors of 6e-4 and 2e-5, but the four-bar
     0.6 with 0.003 s at 1e-4; with eps = h every change of the step is an initial layer, which takes
     nine times the steps of restarted sweeps.
 
@@ -55,7 +55,9 @@ class SRM:
         Regularisation parameter: seconds, or ``"h"``, ``"5h"``, ``"h^(2/3)"`` with the step h (s).
         Explicit schemes need h/eps below their real stability limit.
     restart
-        False: every sweep keeps its own trajectory for the whole run, as in the thesis.  True:
+        False: every sweep keeps its own trajectory for the whole run, as in the thesis; but next
+        to singular configurations, where the first sweeps are too far off the closures to tell the
+        branch, all start again from the accepted state, y_0 being its multiplier.  True:
         every step starts all sweeps from the accepted state of the last one.  With step-size
         control use True.
     carry

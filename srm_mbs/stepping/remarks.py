@@ -44,3 +44,15 @@ def drift(steps: Sequence[StepResult], norm: ErrorNorm) -> str:
         "are accurate to a power of eps. Use restarted sweeps (restart=True, carry=True), a "
         "smaller eps, or PSRM."
     )
+
+
+def restarts(steps: Sequence[StepResult]) -> str:
+    """A sentence about sweeps with own histories that did not keep them."""
+    times = [step.t for step in steps if step.restarted]
+    if not times:
+        return ""
+    return (
+        f" Next to singular configurations the sweeps gave up their own histories in {len(times)} "
+        f"steps, first at t = {times[0]:.6g} s: they were too far off the constraints to tell the "
+        "branch, and started again from the accepted state."
+    )

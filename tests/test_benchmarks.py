@@ -19,7 +19,7 @@ from benchmarks.work_precision.counting import Point, cheapest
 from benchmarks.work_precision.harness import attempt, errors_of, measure_problem
 from benchmarks.work_precision.peers import PEERS
 from benchmarks.work_precision.peers.base import Peer, Setting
-from benchmarks.work_precision.problems import PROBLEMS
+from benchmarks.work_precision.problems import PROBLEMS, andrews
 from benchmarks.work_precision.records import Measurement, Results
 from benchmarks.work_precision.references import by_extrapolation, by_gauss, by_scipy
 from benchmarks.work_precision.reliability import summary
@@ -319,3 +319,22 @@ def test_energy_is_compared_with_the_start() -> None:
         assert energy is not None
         assert 0.0 < energy < 1e-5
     assert plots.STYLES.keys() == PEERS.keys()
+
+
+def test_the_reference_of_the_squeezing_mechanism_ends_as_published() -> None:
+    # DAE test set of CWI and Bari: beta, theta, gamma, phi, delta, omega, epsilon at 0.03 s (rad)
+    published = np.array(
+        [
+            15.81077119629904,
+            -15.75637105984298,
+            0.04082224013073101,
+            -0.5347301163226948,
+            0.5244099658805304,
+            0.5347301163226948,
+            1.048080741042263,
+        ]
+    )
+    problem = PROBLEMS["squeezing_mechanism"]()
+    assert problem.reference.accuracy < 1e-11
+    ours = problem.reference.observed[-1][:7]
+    assert np.abs(ours - published[andrews.TREE_ORDER]).max() < 2e-9

@@ -14,7 +14,7 @@ import argparse
 
 import numpy as np
 
-from benchmarks.work_precision.problems import PROBLEMS
+from benchmarks.work_precision.problems import PROBLEMS, andrews
 from benchmarks.work_precision.problems.base import Array, Problem
 from benchmarks.work_precision.references import (
     Reference,
@@ -71,13 +71,42 @@ def index_one(problem: Problem) -> Reference:
     )
 
 
+def squeezing(problem: Problem) -> Reference:
+    """From the printed equations of the squeezing mechanism, in its own angles."""
+    tree = problem.tree
+    order = np.argsort(andrews.TREE_ORDER)
+    start = andrews.project(np.concatenate([tree.q0[order], tree.v0[order]]))
+    field = andrews.field
+    runs = [
+        andrews.in_tree_order(y)
+        for y in (
+            by_gauss(field, start, problem.times, SUBSTEPS[1], project=andrews.project),
+            by_gauss(field, start, problem.times, SUBSTEPS[0], project=andrews.project),
+            by_scipy(field, start, problem.times),
+        )
+    ]
+    differences = [np.abs(run - runs[0]) for run in runs[1:]]
+    for difference in differences:
+        difference[:, problem.rates :] /= problem.rate_unit
+    print(f"  other step: {differences[0].max():.1e}; SciPy: {differences[1].max():.1e}")
+    return Reference(
+        runs[0],
+        float(max(difference.max() for difference in differences)),
+        "index-1 equations as printed in the DAE test set, Gauss collocation of order 12 with "
+        "projection; SciPy's DOP853 near round-off, without, differs by no more than the accuracy",
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("problems", nargs="*", metavar="PROBLEM", help=", ".join(PROBLEMS))
     for name in parser.parse_args().problems or PROBLEMS:
         print(name, flush=True)
         problem = PROBLEMS[name]()
-        reference = index_one(problem) if problem.reduced is None else reduced(problem)
+        if name == "squeezing_mechanism":
+            reference = squeezing(problem)
+        else:
+            reference = index_one(problem) if problem.reduced is None else reduced(problem)
         path = write(name, reference)
         print(f"  {path.name}: accuracy {reference.accuracy:.1e}")
 

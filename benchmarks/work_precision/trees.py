@@ -10,6 +10,7 @@ and Gdot v from classical accelerations at v' = 0.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +39,10 @@ class PointClosure:
 
 @dataclass(frozen=True)
 class Spring:
-    """Linear spring (N/m, rest length m) from point ``at`` of ``joint`` to ``ground`` (m)."""
+    """Linear spring (N/m, rest length m) from point ``at`` of ``joint`` to ``ground`` (m).
+
+    The joint is a hinge on the ground.
+    """
 
     joint: int
     at: tuple[float, float, float]
@@ -85,6 +89,46 @@ def tree_of(mechanism: Mechanism, rows: tuple[int, ...] = (0, 1, 2)) -> Tree:
     return Tree(model, tuple(closures), mechanism.q0.copy(), mechanism.v0.copy())
 
 
+class _HingedSpring:
+    """A spring on a body that is hinged on the ground: its torque in plain numbers.
+
+    The point moves on p = a + b cos q + c sin q.
+    """
+
+    def __init__(self, model: pin.Model, spring: Spring) -> None:
+        joint = model.joints[spring.joint]
+        if model.parents[spring.joint] != 0 or joint.nq != 1:
+            raise ValueError("a spring is on a body that is not hinged on the ground")
+        self.index, self._coordinate = joint.idx_v, joint.idx_q
+        self._spring = spring
+        data = model.createData()
+        points = []
+        for angle in (0.0, 0.5 * np.pi, np.pi):
+            q = pin.neutral(model)
+            q[joint.idx_q] = angle
+            pin.forwardKinematics(model, data, q)
+            points.append(data.oMi[spring.joint].act(np.array(spring.at)))
+        start, quarter, half = points
+        centre = 0.5 * (start + half)
+        ground = np.array(spring.ground)
+        self._arms = list(
+            zip(*(x.tolist() for x in (centre - ground, start - centre, quarter - centre)))
+        )
+
+    def torque(self, q: Array) -> float:
+        """Torque (N m) on the hinge."""
+        angle = float(q[self._coordinate])
+        cosine, sine = math.cos(angle), math.sin(angle)
+        square = moment = 0.0
+        for a, b, c in self._arms:
+            along = a + b * cosine + c * sine
+            square += along * along
+            moment += along * (c * cosine - b * sine)
+        length = math.sqrt(square)
+        spring = self._spring
+        return -spring.stiffness * (length - spring.rest) / length * moment
+
+
 @dataclass
 class Equations:
     """Evaluates a tree; mutable, one per run."""
@@ -114,6 +158,7 @@ class Equations:
             self._pairs.append((*frames, list(closure.rows)))
         self.data = model.createData()
         self.m = sum(len(closure.rows) for closure in tree.closures)
+        self._springs = [_HingedSpring(model, spring) for spring in tree.springs]
         self._zero = np.zeros(model.nv)
         self._damping = model.damping.copy() if np.any(model.damping) else None
         self.constant = self._zero if tree.torque is None else tree.torque
@@ -124,17 +169,10 @@ class Equations:
         if self.passive:
             return self._zero
         tau = self.constant if self._damping is None else self.constant - self._damping * v
-        if self.tree.springs:
-            model, data = self.model, self.data
-            pin.computeJointJacobians(model, data, q)
-            for spring in self.tree.springs:
-                placement = data.oMi[spring.joint]
-                lever = placement.rotation @ np.array(spring.at)
-                along = placement.translation + lever - np.array(spring.ground)
-                length = np.sqrt(along @ along)
-                force = along * (-spring.stiffness * (length - spring.rest) / length)
-                J = pin.getJointJacobian(model, data, spring.joint, AXES)
-                tau = tau + J[:3].T @ force + J[3:].T @ np.cross(lever, force)
+        if self._springs:
+            tau = tau.copy()
+            for spring in self._springs:
+                tau[spring.index] += spring.torque(q)
         return tau
 
     def position_rate(self, q: Array, v: Array) -> Array:

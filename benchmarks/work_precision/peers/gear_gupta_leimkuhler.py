@@ -11,11 +11,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.trees import Equations
 
 Array = Any
+DIFFERENCE = 1e-7
+"""Step of the differences, relative to values above 1."""
 
 
 class Stabilised:
@@ -51,6 +54,32 @@ class Stabilised:
         out[n : n + m] = G @ v
         out[n + m :] = g
         return out
+
+    def jacobians(self, t: float, y: Array, rate: Array) -> tuple[Array, Array]:
+        """dF/dy by differences in (q, v), and dF/dy' as it stands, both (size, size).
+
+        The solvers' own differences lose the multipliers, whose values are zero, in the rates
+        beside them.
+        """
+        nq, nv, m, equations = self.nq, self.nv, self.m, self.equations
+        n = nq + nv
+        by_state = np.zeros((y.size, y.size))
+        here = self.residual(t, y, rate)
+        moved = y.copy()
+        for j in range(n):
+            moved[j] += DIFFERENCE * max(1.0, abs(y[j]))
+            by_state[:, j] = (self.residual(t, moved, rate) - here) / (moved[j] - y[j])
+            moved[j] = y[j]
+        q = equations.normalised(np.ascontiguousarray(y[:nq]))
+        by_rate = np.zeros((y.size, y.size))
+        by_rate[:nq, :nq] = np.eye(nq)
+        by_rate[nq:n, nq:n] = pin.crba(self.equations.model, self.equations.data, q)
+        if m:
+            _, G = equations.gaps(q)
+            turned = np.array([equations.position_rate(q, row) for row in G])
+            by_rate[:nq, n + m :] = turned.T
+            by_rate[nq:n, n : n + m] = G.T
+        return by_state, by_rate
 
     def states(self, y: Array) -> tuple[Array, Array]:
         """(q, v) from y (n, nq + nv + 2 m)."""

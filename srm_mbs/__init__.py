@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         TorsionSpring,
         Wrench,
     )
+    from srm_mbs.kernel import backend
     from srm_mbs.loading import bundled_models, load, n_four_bar
     from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure, Mechanism
     from srm_mbs.methods.butcher import ButcherTableau
@@ -66,6 +67,7 @@ _HOME = {
     "TorsionSpring": "forces",
     "Wrench": "forces",
     "assemble": "assembly",
+    "backend": "kernel",
     "bundled_models": "loading",
     "load": "loading",
     "load_solution": "storage",
@@ -100,6 +102,7 @@ __all__ = [
     "TorsionSpring",
     "Wrench",
     "assemble",
+    "backend",
     "bundled_models",
     "load",
     "load_solution",

@@ -316,6 +316,10 @@ def info(model: Model) -> None:
         typer.echo()
         _table(force_rows(mechanism), ("force", "type", "acts on", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
+    if srm_mbs.backend() == "python":
+        from srm_mbs.kernel import missing
+
+        notes = (*notes, f"the compiled kernel is missing: {missing}")
     if notes:
         typer.echo()
     for note in notes:

@@ -36,6 +36,14 @@ PLACEMENTS = ("automatic", "off")
 _VERDICTS = (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.REPLACED)
 
 
+def backend() -> str:
+    """What ``backend="auto"`` takes where it can: ``"kernel"`` or ``"python"``.
+
+    ``srm-mbs info`` says why the kernel is missing where it is.
+    """
+    return "python" if core is None else "kernel"
+
+
 def obstacle(method: Method, placement: str, singular_times: FloatArray) -> str:
     """Why the kernel cannot make a run: it is not there, or lacks an option; empty if it can."""
     if core is None:
@@ -116,6 +124,17 @@ def _history_from(data: dict[str, Any]) -> MultiplierHistory:
     )
 
 
+def _memory(memory: Memory) -> dict[str, Any]:
+    return {
+        "rate": np.ascontiguousarray(memory.rate),
+        "magnitude": np.ascontiguousarray(memory.magnitude),
+        "sigma": memory.sigma,
+        "sigma_slope": memory.sigma_slope,
+        "steps": memory.steps,
+        "history": _history(memory.history),
+    }
+
+
 def _memory_from(data: dict[str, Any]) -> Memory:
     history = data["history"]
     return Memory(
@@ -179,14 +198,7 @@ class CompiledRun:
                     "rtol": norm.rtol,
                     "negligible": norm.negligible,
                 },
-                "memory": {
-                    "rate": np.ascontiguousarray(memory.rate),
-                    "magnitude": np.ascontiguousarray(memory.magnitude),
-                    "sigma": memory.sigma,
-                    "sigma_slope": memory.sigma_slope,
-                    "steps": memory.steps,
-                    "history": _history(memory.history),
-                },
+                "memory": _memory(memory),
                 "eps": None if eps is None else (eps.factor, eps.power),
                 "state": np.ascontiguousarray(state),
                 "t0": 0.0,
@@ -199,8 +211,27 @@ class CompiledRun:
         )
 
     def advance(self, steps: int = 0) -> int:
-        """Make ``steps`` steps (0: as many as fit in CHUNK); the number of a :class:`Stop`."""
+        """Make ``steps`` steps (0: as many as fit in CHUNK); why it returned (CHUNK_FULL, ...)."""
         return int(self._run.advance(steps, CHUNK))
+
+    def attempt_from(
+        self, t: float, state: FloatArray, memory: Memory, control: dict[str, Any]
+    ) -> tuple[int, Verdict | None]:
+        """One attempt from where the reference stands, for comparison with it.
+
+        Parameters
+        ----------
+        t, state, memory
+            Before the attempt.
+        control
+            What step-size control remembers; the keys are those of ``ControlState`` in control.hpp.
+
+        Returns
+        -------
+        Why it returned (CHUNK_FULL, ...), and the verdict; None if no step was made.
+        """
+        stop, verdict = self._run.attempt_from(t, state, _memory(memory), control)
+        return stop, None if verdict < 0 else _VERDICTS[verdict]
 
     def last(self) -> StepResult:
         """The step made last."""

@@ -105,14 +105,14 @@ class Anchor:
         if self.link == WORLD:
             return 0, offset
         if self.link is not None:
-            names = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
-            known = self.link in names
+            known = model.existFrame(self.link, pin.FrameType.BODY)
             index = model.getFrameId(self.link, pin.FrameType.BODY) if known else -1
         else:
-            names = [f.name for f in model.frames]
-            index = next((i for i, n in enumerate(names) if n == self.frame), -1)
+            index = next((i for i, f in enumerate(model.frames) if f.name == self.frame), -1)
         if index < 0:
             kind = "link" if self.link is not None else "frame"
+            body = pin.FrameType.BODY
+            names = [f.name for f in model.frames if kind == "frame" or f.type == body]
             shown = ", ".join(sorted(set(names) - {"universe"} | {WORLD}))
             raise InputError(f"there is no {kind} {self.where!r}", remedy=f"Known: {shown}")
         frame = model.frames[index]
@@ -408,11 +408,19 @@ class Mechanism:
     def structure(self) -> Structure:
         """Rank, redundancy and scales of the closures, found once by the walk of docs/notation.md.
 
-        The only upward import of the package: the analysis evaluates the mechanism.
+        An upward import: the analysis evaluates the mechanism.
         """
         from srm_mbs.systems.structure import analyse
 
         return analyse(self)
+
+    @cached_property
+    def initial_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Closure errors g and G v (rows,) at the initial state, in m and rad, and per second."""
+        from srm_mbs.systems.loops import closure_errors
+
+        g, c = closure_errors(self.model, self.loops, self.q0[None], self.v0[None])
+        return g[0], c[0]
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -424,7 +432,7 @@ class Mechanism:
         """Names of the closure rows that are zero wherever the loops are closed; left out."""
         return self.structure.redundant_rows
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the moving joints, in Pinocchio's order."""
         return tuple(self.model.names)[1:]

@@ -45,7 +45,6 @@ from srm_mbs.stepping.stepsize import (
     Verdict,
     initial_step,
 )
-from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, make_system
 from srm_mbs.systems.units import row_units
 
@@ -114,18 +113,18 @@ def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, F
 
 def _check_consistent(mechanism: Mechanism) -> None:
     """Refuse a start that violates the closures or their rates."""
-    q0, v0 = mechanism.q0, mechanism.v0
-    g, c = closure_errors(mechanism.model, mechanism.loops, q0[None], v0[None])
+    v0 = mechanism.v0
+    g, c = mechanism.initial_errors
     units = mechanism.structure.units
     unit = row_units(mechanism.loops, units.length)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
-        errors = np.abs(values[0]) / unit
+        errors = np.abs(values) / unit
         worst = int(np.argmax(errors))
         if errors[worst] > limit:
             raise InputError(
                 f"the initial state violates the closures: row "
-                f"{mechanism.structure.row_names[worst]} by {values[0, worst]:.1e}",
+                f"{mechanism.structure.row_names[worst]} by {values[worst]:.1e}",
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
             )
@@ -337,6 +336,7 @@ def simulate(
         controller is not None,
         placement,
         tuple(avoided.tolist()),
+        "kernel" if on_kernel else "python",
     )
     solution = _collect(
         mechanism, system, method, record, wrappers, watch, times, settings, norm, twin

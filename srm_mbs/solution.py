@@ -68,6 +68,7 @@ class Settings:
     controlled: bool
     placement: str = "automatic"
     singular_times: tuple[float, ...] = ()
+    backend: str = "python"
 
 
 ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])

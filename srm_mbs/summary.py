@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 
+from srm_mbs.kernel import backend
 from srm_mbs.mechanism import Anchor, Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.systems.loops import closure_errors
@@ -23,6 +24,7 @@ JOINT_TYPES = {
     "Spherical": "ball",
 }
 """Pinocchio's joint types as URDF calls them."""
+BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
 def run_rows(solution: Solution) -> list[tuple[str, str]]:
@@ -32,6 +34,7 @@ def run_rows(solution: Solution) -> list[tuple[str, str]]:
     rows = [
         ("mechanism", solution.mechanism.name),
         ("status", solution.status),
+        ("computed by", BACKENDS[solution.settings.backend]),
         ("end time", f"{solution.t[-1]:.6g} s"),
         ("steps", f"{stats.steps}"),
         ("rejected steps", f"{stats.rejected}"),
@@ -63,6 +66,7 @@ def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
         ("rank", f"{structure.rank}"),
         ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
         ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
+        ("runs on", BACKENDS[backend()]),
     ]
 
 

@@ -75,8 +75,9 @@ def test_states_of_events_are_those_of_the_dense_output(
     assert solution.q_events is not None
     assert solution.v_events is not None
     q, v = solution(times(solution))
-    assert np.array_equal(solution.q_events[0], q)
-    assert np.array_equal(solution.v_events[0], v)
+    # To round-off: a compiled run is read by the kernel, its events are located in Python.
+    assert np.abs(solution.q_events[0] - q).max() < 1e-14
+    assert np.abs(solution.v_events[0] - v).max() < 1e-14
     assert np.abs(v[:, 0]).max() < 1e-14
 
 

@@ -121,8 +121,10 @@ def find_bifurcations(
     last = steps.count - 1
     stops = failed and steps.sigmas[last].min() < LOOKED_AT
     marked = sorted(held | turning | ({last} if stops else set()))
+    found: list[Bifurcation] = []
+    if not marked:
+        return ()
     watched = Watched(system, dense)
-    found = []
     for first, final in _ranges(marked, steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
         sigma = watched.smallest(t)

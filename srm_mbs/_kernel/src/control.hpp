@@ -27,9 +27,21 @@ struct ControlConstants {
     int guard_max_redone;
 };
 
+// What a control remembers from step to step, for comparison with the reference.
+struct ControlState {
+    double h = 0.0, xi_old = 1.0;
+    bool just_rejected = false;
+    long index = 1;
+    double slope = 0.0, zero = std::numeric_limits<double>::quiet_NaN(), redo = 0.0;
+    int redone = 0;
+    double limit = std::numeric_limits<double>::infinity();
+    int tries = 0;
+};
+
 class Control {
 public:
     virtual ~Control() = default;
+    virtual void resume(const ControlState& state) = 0;
     virtual Proposal propose(double t, double limit, Memory& memory) = 0;
     // `result` is null if a stage could not be evaluated.
     virtual Verdict judge(const Proposal& proposal, const StepResult* result) = 0;
@@ -43,6 +55,11 @@ public:
         : t_end_(t_end), h_(first_step), order_(order), constants_(constants) {}
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void resume(const ControlState& s) override {
+        h_ = s.h;
+        xi_old_ = s.xi_old;
+        just_rejected_ = s.just_rejected;
+    }
 
 private:
     double t_end_, h_;
@@ -59,6 +76,7 @@ public:
     }
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void resume(const ControlState& s) override { index_ = s.index; }
 
 private:
     double t0_, t_end_, step_;
@@ -84,6 +102,13 @@ public:
                          const ControlConstants& constants);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void resume(const ControlState& s) override {
+        inner_->resume(s);
+        slope_ = s.slope;
+        zero_ = s.zero;
+        redo_ = s.redo;
+        redone_ = s.redone;
+    }
 
 private:
     double placed_step(double distance, double h, double t) const;
@@ -105,6 +130,10 @@ public:
     SlopeOfSigma(std::unique_ptr<Control> inner, const Scheme& scheme);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void resume(const ControlState& s) override {
+        inner_->resume(s);
+        slope_ = s.slope;
+    }
 
 private:
     std::unique_ptr<Control> inner_;
@@ -118,6 +147,11 @@ public:
                 const ControlConstants& constants);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void resume(const ControlState& s) override {
+        inner_->resume(s);
+        limit_ = s.limit;
+        tries_ = s.tries;
+    }
     std::vector<double> suspects;
 
 private:

@@ -303,6 +303,26 @@ struct PyRun {
         return static_cast<int>(run->advance(steps, seconds));
     }
 
+    // One attempt from where the reference stands: (stop, verdict), verdict -1 if none was made.
+    nb::tuple attempt_from(double t, const Array& state, const nb::dict& memory,
+                           const nb::dict& control) {
+        ControlState c;
+        c.h = number(control, "h");
+        c.xi_old = number(control, "xi_old");
+        c.just_rejected = nb::cast<bool>(control["just_rejected"]);
+        c.index = nb::cast<long>(control["index"]);
+        c.slope = number(control, "slope");
+        c.zero = number(control, "zero");
+        c.redo = number(control, "redo");
+        c.redone = whole(control, "redone");
+        c.limit = number(control, "limit");
+        c.tries = whole(control, "tries");
+        run->resume(t, state.data(), memory_of(memory, s.nv), c);
+        Verdict verdict = static_cast<Verdict>(-1);
+        const Stop stop = run->attempt(verdict);
+        return nb::make_tuple(static_cast<int>(stop), static_cast<int>(verdict));
+    }
+
     // The records since the start, which are handed over.
     nb::dict arrays() {
         Run& r = *run;
@@ -437,6 +457,7 @@ NB_MODULE(_core, m) {
                  new (self) PyRun(nb::cast<PySystem&>(system), system, d);
              })
         .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
+        .def("attempt_from", &PyRun::attempt_from)
         .def("arrays", &PyRun::arrays)
         .def("last", &PyRun::last)
         .def("attempts", &PyRun::attempts)

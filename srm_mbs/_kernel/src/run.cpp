@@ -10,7 +10,7 @@ namespace srm {
 
 namespace {
 constexpr double inf = std::numeric_limits<double>::infinity();
-// Steps between two looks at the clock.
+// Attempts between two looks at the clock.
 constexpr long clock_every = 16;
 }  // namespace
 
@@ -67,52 +67,60 @@ void Run::record(const StepResult& r, double t_new, int placement) {
     end_rate = r.end_rate;
 }
 
+void Run::resume(double t, const double* from, const Memory& known, const ControlState& known_control) {
+    t_ = t;
+    std::copy(from, from + state.size(), state.begin());
+    memory = known;
+    control->resume(known_control);
+}
+
+Stop Run::attempt(Verdict& verdict) {
+    const double limit = std::min(max_step_, system.step_limit(state.data()));
+    const Proposal proposal = control->propose(t_, limit, memory);
+    const double h = h_ = proposal.h;
+    const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
+    if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
+    const long made = count();
+    if (made >= constants_.watched_steps && made % constants_.watched_steps == 0 &&
+        t_ - times[made - constants_.watched_steps] < constants_.standstill * (t_end_ - t0_))
+        return Stop::standstill;
+    const StepResult* result = nullptr;
+    try {
+        const double theta =
+            eps_.factor > 0.0 ? -std::expm1(-h / (eps_.factor * std::pow(h, eps_.power))) : 1.0;
+        result = &step.make(t_, h, state.data(), memory, theta);
+    } catch (const EvaluationError&) {
+        trouble = true;
+    }
+    verdict = control->judge(proposal, result);
+    const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
+    redone_ = verdict == Verdict::replaced;
+    if (verdict != Verdict::accepted || !result) {
+        attempts.push_back(
+            {t_, h, result ? result->error_ratio : inf, static_cast<int>(verdict)});
+        return !control->adaptive && verdict == Verdict::rejected ? Stop::evaluation : Stop::chunk;
+    }
+    trouble = false;
+    if (opens(*result)) return Stop::closures;
+    record(*result, proposal.t_new, placement);
+    std::copy(result->state.begin(), result->state.end(), state.begin());
+    step.accept(memory);
+    t_ = proposal.t_new;
+    return t_ < t_end_ ? Stop::chunk : Stop::finished;
+}
+
 Stop Run::advance(long steps, double seconds) {
     using clock = std::chrono::steady_clock;
     const auto started = clock::now();
     const long last = steps > 0 ? count() + steps : std::numeric_limits<long>::max();
-    while (t_ < t_end_) {
-        const double limit = std::min(max_step_, system.step_limit(state.data()));
-        const Proposal proposal = control->propose(t_, limit, memory);
-        const double h = h_ = proposal.h;
-        const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
-        if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
-        const long made = count();
-        if (made >= constants_.watched_steps && made % constants_.watched_steps == 0 &&
-            t_ - times[made - constants_.watched_steps] <
-                constants_.standstill * (t_end_ - t0_))
-            return Stop::standstill;
-        const StepResult* result = nullptr;
-        try {
-            const double theta =
-                eps_.factor > 0.0
-                    ? -std::expm1(-h / (eps_.factor * std::pow(h, eps_.power)))
-                    : 1.0;
-            result = &step.make(t_, h, state.data(), memory, theta);
-        } catch (const EvaluationError&) {
-            trouble = true;
-        }
-        const Verdict verdict = control->judge(proposal, result);
-        const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
-        redone_ = verdict == Verdict::replaced;
-        if (verdict != Verdict::accepted || !result) {
-            attempts.push_back({t_, h, result ? result->error_ratio : inf,
-                                static_cast<int>(verdict)});
-            if (!control->adaptive && verdict == Verdict::rejected) return Stop::evaluation;
-            continue;
-        }
-        trouble = false;
-        if (opens(*result)) return Stop::closures;
-        record(*result, proposal.t_new, placement);
-        std::copy(result->state.begin(), result->state.end(), state.begin());
-        step.accept(memory);
-        t_ = proposal.t_new;
-        if (count() >= last) return t_ < t_end_ ? Stop::chunk : Stop::finished;
-        if (count() % clock_every == 0 &&
+    Verdict verdict;
+    for (long attempted = 1;; ++attempted) {
+        const Stop stop = attempt(verdict);
+        if (stop != Stop::chunk || count() >= last) return stop;
+        if (attempted % clock_every == 0 &&
             std::chrono::duration<double>(clock::now() - started).count() > seconds)
-            return t_ < t_end_ ? Stop::chunk : Stop::finished;
+            return Stop::chunk;
     }
-    return Stop::finished;
 }
 
 }  // namespace srm

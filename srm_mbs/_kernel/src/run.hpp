@@ -48,6 +48,11 @@ public:
     // Makes up to `steps` accepted steps, or as many as take `seconds`.
     Stop advance(long steps, double seconds);
 
+    // Goes on from elsewhere, as the reference stands there; what is recorded stays.
+    void resume(double t, const double* state, const Memory& memory, const ControlState& control);
+    // Proposes, makes and judges one step; `verdict` is only set if there was one.
+    Stop attempt(Verdict& verdict);
+
     double t() const { return t_; }
     double last_h() const { return h_; }
     long count() const { return static_cast<long>(times.size()); }

@@ -1,0 +1,191 @@
+"""Both backends side by side: every attempt of the reference is repeated by the kernel.
+
+The kernel starts each attempt from where the reference stands, so that rounding cannot add up:
+what is compared is one proposal, one step and one verdict at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import srm_mbs as srm
+from srm_mbs import kernel, options, simulation
+from srm_mbs.errors import EvaluationError
+from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm
+from srm_mbs.stepping.guard import BranchGuard
+from srm_mbs.stepping.placement import SingularityPlacement
+from srm_mbs.stepping.singular_times import SlopeOfSigma, placed
+from srm_mbs.stepping.starting import start
+from srm_mbs.stepping.stepsize import FixedStep, PIControl, Verdict, initial_step
+from srm_mbs.systems.multibody import make_system
+
+
+def control_state(control: Any) -> dict[str, Any]:
+    """What a control of the reference remembers, in the words of control.hpp."""
+    state: dict[str, Any] = {
+        "h": 0.0,
+        "xi_old": 1.0,
+        "just_rejected": False,
+        "index": 1,
+        "slope": 0.0,
+        "zero": np.nan,
+        "redo": 0.0,
+        "redone": 0,
+        "limit": np.inf,
+        "tries": 0,
+    }
+    while True:
+        if isinstance(control, BranchGuard):
+            state |= {"limit": control._limit, "tries": control._tries}
+        elif isinstance(control, SingularityPlacement):
+            state |= {
+                "slope": control._slope,
+                "zero": np.nan if control._zero is None else control._zero,
+                "redo": 0.0 if control._redo is None else control._redo,
+                "redone": control._redone,
+            }
+        elif isinstance(control, SlopeOfSigma):
+            state |= {"slope": control._slope}
+        elif isinstance(control, PIControl):
+            return state | {
+                "h": control._h,
+                "xi_old": control._xi_old,
+                "just_rejected": control._just_rejected,
+            }
+        else:
+            assert isinstance(control, FixedStep)
+            return state | {"index": control._index}
+        control = control._inner
+
+
+@dataclass
+class Comparison:
+    """Largest differences over all attempts, each over the size that it should be small to.
+
+    Attributes
+    ----------
+    h, state, rates, sigma, correction, error
+        Step lengths, states (over units), stage rates, sigma, corrections, error ratios.
+    near
+        States of steps next to singular configurations, where rounding is magnified.
+    verdicts
+        (t, reference, kernel) where the two decided differently.
+    attempts, zones, replaced
+        How many attempts there were, how many used the zone, how many were redone.
+    """
+
+    h: float = 0.0
+    state: float = 0.0
+    near: float = 0.0
+    rates: float = 0.0
+    sigma: float = 0.0
+    correction: float = 0.0
+    error: float = 0.0
+    verdicts: list[tuple[float, Any, Any]] = field(default_factory=list)
+    attempts: int = 0
+    zones: int = 0
+    replaced: int = 0
+
+
+def compare(
+    mechanism: srm.Mechanism,
+    t_end: float,
+    *,
+    rtol: float,
+    tableau: str = "dop853",
+    step: float | None = None,
+    placement: str = "automatic",
+    eps: float | str | None = None,
+    max_step: float = np.inf,
+) -> Comparison:
+    """Run the reference and repeat each of its attempts on the kernel."""
+    method = srm.PSRM(tableau, eps=eps)
+    scheme = method.scheme
+    system = make_system(mechanism)
+    twin = kernel.compiled(system)
+    norm = ErrorNorm(
+        simulation._absolute_tolerance(mechanism, None, rtol),
+        rtol,
+        NEGLIGIBLE if step is None else 0.0,
+    )
+    x = np.concatenate([mechanism.q0, mechanism.v0])
+    memory = start(system, method, 0.0, x, norm, t_end)
+    order = scheme.controller_order or 1
+    first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
+    control = options.step_size_control(scheme, 0.0, t_end, step, lambda: first)
+    control, _ = placed(
+        control, scheme, placement if system.has_constraints else None, np.zeros(0), t_end, step
+    )
+    if system.has_constraints and placement == "automatic":
+        control = BranchGuard(control, system)
+    run = kernel.CompiledRun(
+        twin,
+        method,
+        norm,
+        memory,
+        x,
+        t_end,
+        step=step,
+        first_step=first,
+        max_step=max_step,
+        placed=placement,
+    )
+    out = Comparison()
+    one = np.concatenate([norm.one, norm.one])[: 2 * system.nv]
+    t = 0.0
+    while t < t_end and out.attempts < 4000:
+        limit = min(max_step, system.step_limit(x))
+        # Before the reference proposes: its proposal writes the slope into the memory.
+        _, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
+        proposal = control.propose(t, limit, memory)
+        try:
+            result = method.step(system, t, proposal.h, x, memory, norm)
+        except EvaluationError:
+            result = None
+        verdict = control.judge(proposal, result)
+        out.attempts += 1
+        out.h = max(out.h, abs(run.h - proposal.h) / proposal.h)
+        if verdict is not twin_verdict:
+            out.verdicts.append((t, verdict, twin_verdict))
+        if result is not None:
+            twin_result = run.last()
+            size = np.maximum(one, memory.magnitude)
+            rates = np.abs(result.rates).max(axis=0)
+            change = system.difference(result.state, twin_result.state)
+            # Next to a singular configuration the algebra magnifies rounding by 1 / sigma^2.
+            lowest = min(1.0, float(result.sigmas.min()))
+            scale = np.maximum(size, proposal.h * rates) / lowest**2
+            moved = float(np.max(np.abs(change) / scale))
+            if result.quiet or not system.has_constraints:
+                out.state = max(out.state, moved)
+            else:
+                out.near = max(out.near, moved)
+            out.rates = max(
+                out.rates,
+                float(np.max(np.abs(twin_result.rates - result.rates).max(0) / (rates + one)))
+                * lowest**2,
+            )
+            if np.isfinite(result.sigmas).all():
+                change = np.abs(twin_result.sigmas - result.sigmas)
+                out.sigma = max(out.sigma, float(change.max()) * lowest)
+            if result.correction.size:
+                change = np.abs(twin_result.correction - result.correction)
+                out.correction = max(out.correction, float(np.max(change / scale)))
+            # An error estimate is a difference of rates: its rounding is theirs.
+            rounding = norm(proposal.h * rates, norm.weights(memory.magnitude))
+            change = abs(twin_result.error_ratio - result.error_ratio)
+            bound = (rounding + result.error_ratio) / lowest**2
+            out.error = max(out.error, float(change / bound))
+            out.zones += result.zone is not None
+            assert (result.zone is None) == (twin_result.zone is None)
+            assert result.rank == twin_result.rank
+            assert result.held == twin_result.held
+            assert result.quiet == twin_result.quiet
+        out.replaced += verdict is Verdict.REPLACED
+        if verdict is Verdict.ACCEPTED and result is not None:
+            method.accept(memory, result)
+            t, x = proposal.t_new, result.state
+    return out

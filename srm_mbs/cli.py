@@ -316,9 +316,9 @@ def info(model: Model) -> None:
         typer.echo()
         _table(force_rows(mechanism), ("force", "type", "acts on", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
-    if srm_mbs.backend() == "python":
-        from srm_mbs.kernel import missing
+    from srm_mbs.kernel import missing
 
+    if missing:
         notes = (*notes, f"the compiled kernel is missing: {missing}")
     if notes:
         typer.echo()

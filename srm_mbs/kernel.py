@@ -7,6 +7,7 @@ and leaves what is rare to Python: events, progress, and the sentences that say 
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -39,9 +40,11 @@ _VERDICTS = (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.REPLACED)
 def backend() -> str:
     """What ``backend="auto"`` takes where it can: ``"kernel"`` or ``"python"``.
 
-    ``srm-mbs info`` says why the kernel is missing where it is.
+    ``"python"`` where there is no kernel (``srm-mbs info`` says why), or where the environment
+    variable SRM_MBS_BACKEND is ``python``.
     """
-    return "python" if core is None else "kernel"
+    unwanted = os.environ.get("SRM_MBS_BACKEND") == "python"
+    return "python" if core is None or unwanted else "kernel"
 
 
 def obstacle(method: Method, placement: str, singular_times: FloatArray) -> str:

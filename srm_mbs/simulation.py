@@ -355,7 +355,7 @@ def _uses_kernel(backend: str, method: Method, placement: str, singular_times: F
     InputError
         If ``backend`` asks for it and it cannot.
     """
-    if backend == "python":
+    if backend == "python" or (backend == "auto" and kernel.backend() == "python"):
         return False
     reason = kernel.obstacle(method, placement, singular_times)
     if backend == "kernel" and reason:

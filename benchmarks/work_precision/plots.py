@@ -6,6 +6,7 @@ python -m benchmarks.work_precision.plots DIR/results.json --out DIR
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,15 +47,18 @@ def _best_variant(variants: dict[str, list[Point]]) -> str:
     return min(variants, key=rank)
 
 
-def _work_precision(axes: Axes, results: records.Results, problem: str) -> None:
+def _work_precision(
+    axes: Axes, results: records.Results, problem: str, variants: bool = True
+) -> None:
+    """Draw ``problem``; without ``variants`` the peers' names alone are in the legend."""
     for peer, title in results.peers.items():
-        variants = sweeps(results, problem, peer)
-        if not variants:
+        found = sweeps(results, problem, peer)
+        if not found:
             continue
         colour, marker, line, width = STYLES.get(peer, OTHER)
-        names = list(variants) if peer == "ours" else [_best_variant(variants)]
+        names = list(found) if peer == records.OURS else [_best_variant(found)]
         for k, name in enumerate(names):
-            points = [p for p in variants[name] if p.error is not None and p.error > 0.0]
+            points = [p for p in found[name] if p.error is not None and p.error > 0.0]
             if not points:
                 continue
             points.sort(key=lambda point: -point.tightness)
@@ -63,11 +67,11 @@ def _work_precision(axes: Axes, results: records.Results, problem: str) -> None:
                 [point.error for point in points],
                 color=colour,
                 marker=marker,
-                linestyle=(line, "--", ":")[k] if peer == "ours" else line,
+                linestyle=(line, "--", ":")[k] if peer == records.OURS else line,
                 linewidth=width,
                 markersize=4.5,
                 markerfacecolor=colour if k == 0 else "white",
-                label=f"{title}, {name}" if name else title,
+                label=f"{title}, {name}" if name and (variants or peer == records.OURS) else title,
             )
     axes.set(xscale="log", yscale="log", xlabel="CPU time (ms)", ylabel="largest error (m, rad)")
     low, high = axes.get_ylim()
@@ -100,6 +104,23 @@ def work_precision(results: records.Results, problem: str) -> Figure:
     _work_precision(axes, results, problem)
     figure.suptitle(results.problems[problem]["title"], fontsize=9)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+    return figure
+
+
+def overview(results: records.Results, problems: Sequence[str]) -> Figure:
+    """:func:`work_precision` of several problems in one figure, two in a row."""
+    rows = (len(problems) + 1) // 2
+    figure = _figure(9.5, 3.4 * rows + 1.2)
+    panels = figure.subplots(rows, 2, squeeze=False).flat
+    labels = {}
+    for problem, axes in zip(problems, panels):
+        _work_precision(axes, results, problem, variants=False)
+        axes.set_title(results.problems[problem]["title"].split(",")[0], fontsize=9)
+        for handle, label in zip(*axes.get_legend_handles_labels()):
+            labels.setdefault(label, handle)
+    for axes in list(panels):
+        axes.remove()
+    figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=3, fontsize=8)
     return figure
 
 

@@ -9,6 +9,10 @@ from pathlib import Path
 from typing import Any
 
 SCHEMA = 1
+OURS, FLOOR = "ours", "reduced"
+"""Names of the two peers that are not counted among the other simulators."""
+DIGITS = 5
+"""Significant digits of the numbers in the file."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,10 @@ class Results:
 
     def save(self, path: Path) -> None:
         """Write to ``path``; complete at any moment."""
-        text = json.dumps(_finite(asdict(self)), indent=1, allow_nan=False)
+        data = _plain(asdict(self))
+        # A row per line: files stay small, and differences between two can be read.
+        entries = [f"{json.dumps(key)}: {_rows(value)}" for key, value in data.items()]
+        text = "{\n" + ",\n".join(entries) + "\n}"
         scratch = path.with_suffix(".part")
         scratch.write_text(text + "\n", encoding="utf-8")
         scratch.replace(path)
@@ -98,12 +105,19 @@ def load(path: Path) -> Results:
     return Results(**data)
 
 
-def _finite(value: Any) -> Any:
-    """``value`` with floats that JSON has not, replaced by None."""
+def _rows(value: Any) -> str:
+    if isinstance(value, list) and value:
+        lines = ",\n ".join(json.dumps(row, allow_nan=False) for row in value)
+        return f"[\n {lines}\n]"
+    return json.dumps(value, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """``value`` with floats of DIGITS digits; those that JSON has not are None."""
     if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
     return value

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.work_precision.counting import LEVELS, Point, cheapest
-from benchmarks.work_precision.peers import FLOOR, OURS
-from benchmarks.work_precision.records import Results
+from benchmarks.work_precision.records import FLOOR, OURS, Results
 
 DEFAULT_VARIANT = "dop853, auto"
 """What somebody gets who sets nothing but the tolerance."""

@@ -19,7 +19,6 @@ from benchmarks.work_precision.peers.reduced_ode import ReducedODE
 from benchmarks.work_precision.peers.scipy_dae_radau import ScipyDaeRadau
 from benchmarks.work_precision.peers.sundials_ida import SundialsIDA
 
-OURS, FLOOR = Ours.name, ReducedODE.name
 PEERS: Mapping[str, Peer] = MappingProxyType(
     {
         peer.name: peer

@@ -29,6 +29,8 @@ from benchmarks.work_precision.problems.base import SAMPLES, Problem
 from benchmarks.work_precision.trees import Tree
 
 SPECTRAL_RADIUS = 0.9
+DENSE_BODIES = 8
+"""Bodies up to which the dense linear solver, Exudyn's default, is the faster one."""
 SUBSTEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -224,6 +226,8 @@ class ExudynAlpha(Peer):
             integration.newton.absoluteTolerance = 1e-12
             options.solutionSettings.writeSolutionToFile = False
             options.solutionSettings.sensorsWritePeriod = problem.t_end / SAMPLES
+            if len(plane.massive) > DENSE_BODIES:
+                options.linearSolverType = exudyn.LinearSolverType.EigenSparse
             options.displayStatistics = False
             options.displayComputationTime = False
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -14,17 +15,20 @@ from tests import reduced
 SPEED = 1.0  # m/s, the first crank tip in +x at the start
 
 
-def cranks(q: Array, v: Array) -> Array:
-    """Angles and rates (n, 2 (N + 1)) of all cranks: on a wrong branch they differ."""
-    return np.hstack([q[:, ::2], v[:, ::2]])
-
-
 def n_four_bar(n: int, speed: float = SPEED) -> Problem:
     """The bundled n_four_bar_<n>, with any start speed (m/s)."""
 
+    @cache
     def mechanism() -> srm.Mechanism:
         loaded = srm.load(f"n_four_bar_{n}")
         return loaded if speed == SPEED else loaded.with_state(loaded.q0, loaded.v0 * speed)
+
+    def cranks(q: Array, v: Array) -> Array:
+        """Angles and rates (n, 2 (N + 1)) of all cranks: on a wrong branch they differ."""
+        model = mechanism().model
+        joints = [model.joints[model.getJointId(f"crank_{i}")] for i in range(n + 1)]
+        columns = [joint.idx_q for joint in joints]  # of hinges only: idx_v as well
+        return np.hstack([q[:, columns], v[:, columns]])
 
     return Problem(
         f"n_four_bar_{n}",

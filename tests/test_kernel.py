@@ -274,7 +274,11 @@ def test_the_interpreter_is_free_while_the_kernel_runs() -> None:
     assert during > 20
 
 
-def test_the_backend_is_named_and_can_be_chosen() -> None:
+def test_the_backend_is_named_and_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SRM_MBS_BACKEND", "python")
+    assert srm.backend() == "python"
+    assert srm.simulate(srm.load("four_bar"), 0.1).settings.backend == "python"
+    monkeypatch.delenv("SRM_MBS_BACKEND")
     assert srm.backend() == "kernel"
     assert srm.simulate(srm.load("four_bar"), 0.1).settings.backend == "kernel"
     assert srm.simulate(srm.load("four_bar"), 0.1, backend="python").settings.backend == "python"

@@ -396,6 +396,9 @@ def benchmark(context: typer.Context) -> None:
     """
     harness = Path("benchmarks", "work_precision", "__main__.py")
     if not harness.is_file():
+        if "--help" in context.args:
+            typer.echo(context.get_help())
+            raise typer.Exit
         raise InputError(
             "the benchmark is not installed with the package, and there is none in this folder",
             file=str(harness),

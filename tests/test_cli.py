@@ -109,7 +109,16 @@ def test_every_command_has_help_on_its_arguments_and_options(name: str, words: s
 
 def test_help_lists_the_commands_and_the_exit_status() -> None:
     output = run("--help")
-    for word in ("simulate", "info", "models", "play", "plot", "--verbose", "--version"):
+    for word in (
+        "simulate",
+        "info",
+        "models",
+        "play",
+        "plot",
+        "benchmark",
+        "--verbose",
+        "--version",
+    ):
         assert word in output
     assert "2 for bad input" in output
 

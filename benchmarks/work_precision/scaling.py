@@ -1,9 +1,13 @@
 """Cost per evaluation and per step against size, beside ``pin.constraintDynamics``.
 
-N-four-bars for loops, open chains for coordinates.  ``evaluation``: one evaluation with its rate in
-Python; ``run``: a whole run with the default backend over its evaluations.  The parts of an
-evaluation are Pinocchio's calls, and LAPACK's on matrices of the same size; the rest of it is
-Python, and what a run takes more than its evaluations is stepping.
+N-four-bars for loops, open chains for coordinates.  ``run``: whole runs with the default backend,
+over their evaluations or steps.  Where the time goes:
+
+* Pinocchio: its calls in an evaluation, made from Python (0.25 us of each is the call itself);
+* algebra: the rest of an evaluation; in the Python backend LAPACK on matrices of the same size
+  apart from Python;
+* stepping: what one more evaluation costs in a run beyond itself;
+* Python around the kernel: what a run costs however short it is.
 """
 
 from __future__ import annotations
@@ -23,6 +27,8 @@ from benchmarks.work_precision.peers.pinocchio_dynamics import PinocchioDynamics
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.records import Results
+from srm_mbs._kernel import core
+from srm_mbs.kernel import compiled
 from srm_mbs.systems.multibody import make_system
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160)
@@ -83,34 +89,67 @@ def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
     }
 
 
-def run_cost(mechanism: srm.Mechanism, backend: str, repeats: int) -> tuple[float, float]:
-    """CPU microseconds per evaluation and per step of whole runs of about ``STEPS`` steps."""
-    probe = srm.simulate(mechanism, 0.5, rtol=RTOL, backend=backend)
+def kernel_evaluation(mechanism: srm.Mechanism, repeats: int) -> float | None:
+    """Microseconds of an evaluation in the kernel's own loop; None where there is no kernel."""
+    if core is None:
+        return None
+    twin = compiled(make_system(mechanism))
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    number = 20
+    cost = per_call(lambda: twin.repeat(0.0, state, number), repeats)
+    return cost / number
+
+
+def _run_cost(
+    mechanism: srm.Mechanism, backend: str, t_end: float, repeats: int
+) -> tuple[float, int, int]:
+    """Least CPU microseconds of a run, its evaluations and its steps."""
+
+    def run() -> srm.Solution:
+        return srm.simulate(mechanism, t_end, rtol=RTOL, backend=backend)
+
+    stats = run().stats
+    cpu, _ = timing.repeated(run, repeats)
+    return 1e6 * cpu.least, stats.evaluations, max(stats.steps, 1)
+
+
+def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float | None]:
+    probe = srm.simulate(mechanism, 0.5, rtol=RTOL)
     t_end = 0.5 * STEPS / max(probe.stats.steps, 1)
-    solution = srm.simulate(mechanism, t_end, rtol=RTOL, backend=backend)
-    cpu, _ = timing.repeated(
-        lambda: srm.simulate(mechanism, t_end, rtol=RTOL, backend=backend), repeats
-    )
-    stats = solution.stats
-    return 1e6 * cpu.least / stats.evaluations, 1e6 * cpu.least / max(stats.steps, 1)
-
-
-def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
     found = parts(mechanism, repeats)
-    python, _ = run_cost(mechanism, "python", repeats)
-    auto, step = run_cost(mechanism, "auto", repeats)
-    evaluation = min(found["evaluation"], python)
-    return {
+    pinocchio, lapack_part, evaluation = (
+        found[key] for key in ("pinocchio", "lapack", "evaluation")
+    )
+    cost, evaluations, steps = _run_cost(mechanism, "auto", t_end, repeats)
+    auto = cost / evaluations
+    row: dict[str, float | None] = {
         "run, per evaluation (us)": auto,
-        "run, per step (us)": step,
-        "Python run, per evaluation (us)": python,
-        "Pinocchio (us)": found["pinocchio"],
-        "LAPACK (us)": found["lapack"],
-        "of a run: Pinocchio": found["pinocchio"] / auto,
-        "of a Python run: Pinocchio": found["pinocchio"] / python,
-        "LAPACK": found["lapack"] / python,
-        "Python in evaluations": (evaluation - found["pinocchio"] - found["lapack"]) / python,
-        "stepping": (python - evaluation) / python,
+        "run, per step (us)": cost / steps,
+    }
+    in_kernel = kernel_evaluation(mechanism, repeats)
+    if in_kernel is None:
+        python = auto
+    else:
+        twice, more, _ = _run_cost(mechanism, "auto", 2.0 * t_end, repeats)
+        marginal = (twice - cost) / (more - evaluations)
+        python = _run_cost(mechanism, "python", t_end, repeats)
+        python = python[0] / python[1]
+        row |= {
+            "evaluation in the kernel (us)": in_kernel,
+            "of a run: Pinocchio": min(pinocchio, in_kernel) / auto,
+            "algebra": max(in_kernel - pinocchio, 0.0) / auto,
+            "stepping": (marginal - in_kernel) / auto,
+            "Python around the kernel": (auto - marginal) / auto,
+        }
+    within = min(evaluation, python)
+    return row | {
+        "Python backend, per evaluation (us)": python,
+        "Pinocchio (us)": pinocchio,
+        "LAPACK (us)": lapack_part,
+        "of a Python run: Pinocchio": pinocchio / python,
+        "LAPACK": lapack_part / python,
+        "Python in evaluations": (within - pinocchio - lapack_part) / python,
+        "stepping in Python": (python - within) / python,
     }
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.work_precision import machine, plots, records, tables, timing
-from benchmarks.work_precision.harness import measure_problem
+from benchmarks.work_precision.harness import LIMIT, measure_problem
 from benchmarks.work_precision.peers import PEERS
 from benchmarks.work_precision.problems import PROBLEMS
 from benchmarks.work_precision.reliability import measure_reliability
@@ -24,8 +24,8 @@ def parser() -> argparse.ArgumentParser:
     out = argparse.ArgumentParser(
         prog="python -m benchmarks.work_precision",
         description="Run time against error, beside other simulators, on one thread.",
-        epilog="Peers that are not installed are skipped: pip install mujoco exudyn "
-        "scikit-sundae scipy-dae.",
+        epilog="Everything takes about two hours. Peers that are not installed are skipped: "
+        "pip install mujoco exudyn scikit-sundae scipy-dae.",
     )
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
     out.add_argument("--problems", nargs="+", choices=PROBLEMS, default=list(PROBLEMS))
@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
         "--repeats", type=int, default=timing.REPEATS, help="timed calls per setting, 5 or more"
     )
     out.add_argument(
-        "--limit", type=float, default=10.0, metavar="S", help="CPU time that ends a sweep"
+        "--limit", type=float, default=LIMIT, metavar="S", help="CPU time that ends a sweep"
     )
     out.add_argument("--thin", action="store_true", help="every third setting: a quick look")
     return out

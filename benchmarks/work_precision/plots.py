@@ -99,11 +99,13 @@ def _figure(width: float, height: float) -> Figure:
 
 def work_precision(results: records.Results, problem: str) -> Figure:
     """Error over CPU time of every peer on ``problem``: for each peer its best variant."""
-    figure = _figure(8.0, 4.6)
+    figure = _figure(7.2, 6.2)
     axes = figure.subplots()
     _work_precision(axes, results, problem)
     figure.suptitle(results.problems[problem]["title"], fontsize=9)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=7)
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=7
+    )
     return figure
 
 

@@ -26,7 +26,7 @@ FAMILIES: tuple[tuple[str, Callable[[float], Problem], float, float], ...] = (
 )
 RIGHT = 0.1
 """Largest error (rad, rad/s) of a run that is on the right branch: a wrong one is off by more."""
-LIMIT = 10.0
+LIMIT = 5.0
 """CPU seconds after which a run counts as failed."""
 
 

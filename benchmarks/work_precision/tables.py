@@ -196,7 +196,8 @@ def text(results: Results) -> str:
     parts = [
         "# Work and precision\n",
         f"{machine}. {versions}. CPU time of one thread, least of {results.settings['repeats']}; "
-        "a setting counts for a level only if it and every tighter one reach it.\n",
+        "a setting counts for a level only if it and every tighter one reach it. Sweeps end at "
+        f"{results.settings.get('limit', '-')} s of CPU time a run.\n",
     ]
     if results.measurements:
         parts += ["## Ours beside the best peer\n", *_ratios(results)]

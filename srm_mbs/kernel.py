@@ -398,6 +398,21 @@ def _trouble(
     return loop.NOT_FINITE if reason == NOT_EVALUATED else ""
 
 
+def dense_output(
+    system: ClosedSystem | OpenSystem, scheme: ButcherTableau, steps: StepData, made_by: str
+) -> DenseOutput:
+    """Dense output of a run, on the kernel where that made the run and is at hand.
+
+    Parameters
+    ----------
+    made_by
+        Backend of the run.
+    """
+    if made_by == "kernel" and core is not None:
+        return CompiledDenseOutput(compiled(system), system, scheme, steps)
+    return DenseOutput(system, scheme, steps)
+
+
 class CompiledDenseOutput(DenseOutput):
     """Dense output on the kernel, of the runs that it made.
 

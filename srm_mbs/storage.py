@@ -17,6 +17,7 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
+from srm_mbs.kernel import dense_output
 from srm_mbs.loading import rebuild
 from srm_mbs.mechanism import (
     Anchor,
@@ -250,11 +251,13 @@ def load_solution(path: str | Path) -> Solution:
         _check_shapes(mechanism, meta["settings"]["tableau"], steps)
         tuples = {key: tuple(meta["settings"][key]) for key in ("atol", "singular_times")}
         settings = Settings(**meta["settings"] | tuples)
+        system, scheme = make_system(mechanism), get_tableau(settings.tableau)
         return Solution(
             mechanism,
-            make_system(mechanism),
-            get_tableau(settings.tableau),
+            system,
+            scheme,
             steps,
+            dense=dense_output(system, scheme, steps, settings.backend),
             t_eval=arrays.get("t_eval"),
             attempts=arrays["attempts"],
             events=_events(meta["events"], arrays),

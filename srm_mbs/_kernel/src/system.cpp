@@ -18,6 +18,7 @@ namespace srm {
 
 using pinocchio::Motion;
 using pinocchio::SE3;
+using pinocchio_model::Argument;
 using pinocchio_model::placement;
 
 namespace {
@@ -156,12 +157,12 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
             add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
-        pinocchio::aba(w.model, w.data, w.q, w.v, w.tau);
+        pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
         std::copy(w.data.ddq.data(), w.data.ddq.data() + nv, rate_.begin());
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
-    pinocchio::crba(w.model, w.data, w.q, pinocchio::Convention::WORLD);
+    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
     pinocchio::nonLinearEffects(w.model, w.data, w.q, w.v);
     for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
     if (!data_.forces.empty())
@@ -308,7 +309,7 @@ double System::closure_gap(const double* state) {
     if (!closed_) return 0.0;
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
-    pinocchio::crba(w.model, w.data, w.q, pinocchio::Convention::WORLD);
+    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
     update_loops(false);
     return gap();
 }

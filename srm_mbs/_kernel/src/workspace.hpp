@@ -5,6 +5,10 @@
 
 namespace pinocchio_model {
 
+// What Pinocchio's library has crba and aba for: with vectors, the compiler would make them anew,
+// for every kind of joint, in ten times the time and memory.
+using Argument = Eigen::Ref<const Eigen::VectorXd>;
+
 struct Workspace {
     explicit Workspace(const pinocchio::Model& model)
         : model(model), data(model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv) {}

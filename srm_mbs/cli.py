@@ -316,7 +316,7 @@ def info(model: Model) -> None:
         typer.echo()
         _table(force_rows(mechanism), ("force", "type", "acts on", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
-    from srm_mbs.kernel import missing
+    from srm_mbs._kernel import missing
 
     if missing:
         notes = (*notes, f"the compiled kernel is missing: {missing}")

@@ -179,6 +179,9 @@ class CompiledRun:
         max_step: float,
         placed: str,
     ) -> None:
+        self.twin, self.method, self.norm = twin, method, norm
+        self.start, self.t_end = state.copy(), t_end
+        self.adaptive = step is None
         scheme = method.scheme
         gaps = np.array(scheme.gaps)
         eps = method.regularisation
@@ -294,44 +297,24 @@ class CompiledRecord(RunRecord):
 
 def integrate(
     system: ClosedSystem | OpenSystem,
-    twin: Any,
-    method: PSRM,
-    norm: ErrorNorm,
-    memory: Memory,
-    state: FloatArray,
-    t_end: float,
+    run: CompiledRun,
     *,
-    step: float | None,
-    first_step: float,
-    max_step: float,
-    placed: str,
     tick: Tick | None = None,
     events: EventWatch | None = None,
 ) -> CompiledRecord:
-    """As :func:`srm_mbs.stepping.loop.integrate`, from t = 0, on the kernel.
+    """As :func:`srm_mbs.stepping.loop.integrate`, on the kernel.
 
     Parameters
     ----------
-    system, twin
-        The mechanism, and what :func:`compiled` made of it.
-    step, first_step, max_step, placed
-        See :class:`CompiledRun`.
+    system
+        The mechanism that ``run`` is of.
+    tick, events
+        With either, the kernel returns after every step.
     """
-    record = CompiledRecord(0.0, state.copy())
+    state = run.start
+    record = CompiledRecord(0.0, state)
+    record.run = run
     started = time.perf_counter()
-    run = record.run = CompiledRun(
-        twin,
-        method,
-        norm,
-        memory,
-        state,
-        t_end,
-        step=step,
-        first_step=first_step,
-        max_step=max_step,
-        placed=placed,
-    )
-    adaptive = step is None
     one_by_one = tick is not None or events is not None
     start = state
     try:
@@ -342,8 +325,8 @@ def integrate(
             made = run.count
             reason = run.advance(1 if one_by_one else 0)
             if reason not in (CHUNK_FULL, FINISHED):
-                trouble = _trouble(reason, system, method, run, norm)
-                loop.fail(record, run.t, run.h, run.memory().sigma, trouble, adaptive)
+                trouble = _trouble(reason, system, run)
+                loop.fail(record, run.t, run.h, run.memory().sigma, trouble, run.adaptive)
                 break
             if not one_by_one or run.count == made:
                 continue
@@ -351,48 +334,37 @@ def integrate(
             stop = None if events is None else events.after_step(start, result, t)
             start = result.state
             if stop is not None:
-                record.status, record.stop, record.message = "event", stop.time, stop.message
+                record.ended(stop)
                 break
             if tick is not None:
                 loop.tell(tick, t, result.h, result.state)
         else:
-            record.status = "finished"
-            record.message = f"The run reached t = {t_end:.6g} s."
-    except KeyboardInterrupt:
-        record.status = "interrupted"
-        record.message = f"Interrupted at t = {run.t:.6g} s; everything up to there is kept."
-    except (ControllerError, EventError) as error:
-        record.status = "failed"
-        record.message = f"Stopped at t = {run.t:.6g} s: {error}. Everything up to there is kept."
+            record.finished(run.t_end)
+    except (KeyboardInterrupt, ControllerError, EventError) as error:
+        record.broken_off(run.t, error)
     record.attempts = [
         loop.Attempt(t, h, ratio, _VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
     ]
     record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
-    system.count(twin.evaluations, twin.factorisations)
+    system.count(run.twin.evaluations, run.twin.factorisations)
     record.wall_time = time.perf_counter() - started
     loop.log.info("%s", record.message)
     return record
 
 
-def _trouble(
-    reason: int,
-    system: ClosedSystem | OpenSystem,
-    method: PSRM,
-    run: CompiledRun,
-    norm: ErrorNorm,
-) -> str:
+def _trouble(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> str:
     """Why the kernel stopped, in the words of the reference, which repeats what failed."""
     attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
     if reason == STANDSTILL:
         return loop.standstill(run.t - run.time_before(loop.WATCHED_STEPS))
     if reason == CLOSURES:
-        return loop.Closures(system, norm).trouble(run.last())
+        return loop.Closures(system, run.norm).trouble(run.last())
     if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
         return loop.BELOW_ROUND_OFF
     if run.trouble:
         t, h = next((t, h) for t, h, ratio, _ in reversed(attempts) if np.isinf(ratio))
         try:
-            method.step(system, t, h, run.state, run.memory(), norm)
+            run.method.step(system, t, h, run.state, run.memory(), run.norm)
         except EvaluationError as error:
             return str(error)
     return loop.NOT_FINITE if reason == NOT_EVALUATED else ""

@@ -292,8 +292,7 @@ def simulate(
             if on_kernel and isinstance(method, PSRM):
                 check_embedded(method.scheme, step)
                 twin = kernel.compiled(system)
-                record = kernel.integrate(
-                    system,
+                run = kernel.CompiledRun(
                     twin,
                     method,
                     norm,
@@ -304,9 +303,8 @@ def simulate(
                     first_step=chosen_first_step() if step is None else 0.0,
                     max_step=longest,
                     placed=placement,
-                    tick=tick,
-                    events=watch,
                 )
+                record = kernel.integrate(system, run, tick=tick, events=watch)
             else:
                 control, wrappers = _control(
                     system, method, step, chosen_first_step, t_end, placement, avoided

@@ -14,7 +14,7 @@ from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.dense import StepData, step_data
-from srm_mbs.stepping.events import EventWatch
+from srm_mbs.stepping.events import EventWatch, Stop
 from srm_mbs.stepping.stepsize import StepSizeControl, Verdict
 from srm_mbs.systems.base import System
 
@@ -83,6 +83,23 @@ class RunRecord:
     message: str = ""
     stop: float | None = None
     wall_time: float = 0.0
+
+    def finished(self, t_end: float) -> None:
+        """Mark it as complete."""
+        self.status = "finished"
+        self.message = f"The run reached t = {t_end:.6g} s."
+
+    def ended(self, stop: Stop) -> None:
+        """Mark it as ended by a terminal event."""
+        self.status, self.stop, self.message = "event", stop.time, stop.message
+
+    def broken_off(self, t: float, error: BaseException) -> None:
+        """Mark it as interrupted, or failed because a function of the user did, at ``t``."""
+        kept = "verything up to there is kept."
+        if isinstance(error, KeyboardInterrupt):
+            self.status, self.message = "interrupted", f"Interrupted at t = {t:.6g} s; e{kept}"
+        else:
+            self.status, self.message = "failed", f"Stopped at t = {t:.6g} s: {error}. E{kept}"
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
@@ -181,19 +198,14 @@ def integrate(
             record.steps.append(result)
             stop = None if events is None else events.after_step(start, result, t)
             if stop is not None:
-                record.status, record.stop, record.message = "event", stop.time, stop.message
+                record.ended(stop)
                 break
             if tick is not None:
                 tell(tick, t, h, x)
         else:
-            record.status = "finished"
-            record.message = f"The run reached t = {t_end:.6g} s."
-    except KeyboardInterrupt:
-        record.status = "interrupted"
-        record.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
-    except (ControllerError, EventError) as error:
-        record.status = "failed"
-        record.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
+            record.finished(t_end)
+    except (KeyboardInterrupt, ControllerError, EventError) as error:
+        record.broken_off(t, error)
     # An interrupt between the two appends would leave one list longer.
     del record.times[min(len(record.times), len(record.steps)) :]
     del record.steps[len(record.times) :]

@@ -7,7 +7,7 @@ frozen: the package treats it as constant and never attaches anything to it, and
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -402,7 +402,22 @@ class Mechanism:
         changed = replace(self, q0=q0, v0=v0)
         if "structure" in self.__dict__:
             changed.__dict__["structure"] = self.structure.at(changed)
+        changed.__dict__["_derived"] = self._derived
         return changed
+
+    @cached_property
+    def _derived(self) -> dict[str, Any]:
+        return {}
+
+    def derived(self, name: str, make: Callable[[], Any]) -> Any:
+        """What follows from the model alone, made once and kept under ``name``.
+
+        It is shared with every :meth:`with_state`, so it must not depend on the initial state, and
+        nothing may change it.
+        """
+        if name not in self._derived:
+            self._derived[name] = make()
+        return self._derived[name]
 
     @cached_property
     def structure(self) -> Structure:

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import blas
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.errors import ControllerError, EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.base import Terms, Zone
@@ -23,6 +23,7 @@ from srm_mbs.systems.charts import (
     LARGEST_ROTATION,
     ROTATION_PER_STEP,
     SERIES,
+    GroupJoint,
     dexp_inverse,
     group_joints,
     planar_translation,
@@ -60,13 +61,15 @@ class _Mechanics:
         self._friction = self.model.friction.copy() if np.any(self.model.friction) else None
         self._friction_speed = mechanism.friction_speed
         self._forces = ForceKinematics(self.model, mechanism.forces) if mechanism.forces else None
-        self._groups = group_joints(self.model)
+        self._groups: tuple[GroupJoint, ...] = mechanism.derived(
+            "groups", lambda: group_joints(self.model)
+        )
         self._planar = tuple(joint for joint in self._groups if joint.group == "se2")
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
-        self._position_of = self._vector_coordinates()
+        self._position_of: IndexArray = mechanism.derived("position_of", self._vector_coordinates)
 
-    def _vector_coordinates(self) -> FloatArray:
+    def _vector_coordinates(self) -> IndexArray:
         """Index into q of each velocity component, -1 where q is not a vector space there."""
         index = np.full(self.nv, -1)
         for joint in list(self.model.joints)[1:]:

@@ -14,7 +14,16 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from benchmarks.work_precision import command, plots, readme, records, tables, threads, timing
+from benchmarks.work_precision import (
+    command,
+    plots,
+    readme,
+    records,
+    reliability,
+    tables,
+    threads,
+    timing,
+)
 from benchmarks.work_precision.counting import Point, cheapest
 from benchmarks.work_precision.harness import attempt, errors_of, measure_problem
 from benchmarks.work_precision.peers import PEERS
@@ -22,7 +31,7 @@ from benchmarks.work_precision.peers.base import Peer, Setting
 from benchmarks.work_precision.problems import PROBLEMS, andrews
 from benchmarks.work_precision.records import Measurement, Results
 from benchmarks.work_precision.references import by_extrapolation, by_gauss, by_scipy
-from benchmarks.work_precision.reliability import summary
+from benchmarks.work_precision.reliability import measure_reliability, summary
 from benchmarks.work_precision.scaling import measure_scaling
 from benchmarks.work_precision.skip import measure_unneeded
 from benchmarks.work_precision.trees import Equations
@@ -378,3 +387,16 @@ def test_cost_against_size_has_ours_beside_pinocchio() -> None:
             parts = names[names.index("of a run: Pinocchio") :][:4]
             assert sum(row[part] for part in parts) == pytest.approx(1.0)
     assert all(row["aba (us)"] < row["run, per step (us)"] for row in chains)
+
+
+def test_reliability_counts_right_branches_and_names_peers_that_are_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reliability, "FAMILIES", reliability.FAMILIES[1:2])
+    out = Results({}, {}, {})
+    measure_reliability([PEERS["ours"], Absent()], out, thin=True, say=quiet)
+    (row,) = out.reliability
+    assert (row["problem"], row["peer"], row["right"]) == ("n_four_bar_1", "ours", 3)
+    assert [run["speed"] for run in row["runs"]] == pytest.approx([0.5, 2.4, 4.3])
+    assert 0.0 < row["median"] <= row["worst"] < 1e-6
+    assert [entry.peer for entry in out.skipped] == ["absent"]

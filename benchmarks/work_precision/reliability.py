@@ -15,7 +15,7 @@ from benchmarks.work_precision.peers.base import Budget, NotApplicableError, Pee
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.problems.slider_cranks import whirl
-from benchmarks.work_precision.records import Results
+from benchmarks.work_precision.records import Results, Skipped
 from benchmarks.work_precision.references import Reference, reduced_reference
 
 SPEEDS = 20
@@ -66,14 +66,20 @@ def measure_reliability(
 ) -> None:
     """Append a row per family and installed peer."""
     Budget.seconds = LIMIT
+    installed: list[Peer] = []
+    for peer in peers:
+        missing = peer.missing()
+        if missing is None:
+            installed.append(peer)
+        else:
+            say(f"reliability, {peer.name}: skipped, {missing} is not installed")
+            results.skipped.append(Skipped(peer.name, f"{missing} is not installed"))
     for name, family, low, high in FAMILIES:
         problems = [
             _with_reference(family(float(speed)))
             for speed in np.linspace(low, high, 3 if thin else SPEEDS)
         ]
-        for peer in peers:
-            if peer.missing() is not None:
-                continue
+        for peer in installed:
             runs = []
             try:
                 for problem in problems:

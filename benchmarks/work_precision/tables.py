@@ -143,6 +143,24 @@ def _everyone(results: Results) -> str:
     )
 
 
+def _problems(results: Results) -> str:
+    return markdown(
+        ("problem", "", "degrees of freedom", "nv", "loops", "reference", "accurate to"),
+        (
+            (
+                name,
+                facts["title"],
+                str(facts["degrees_of_freedom"]),
+                str(facts["nv"]),
+                str(facts["loops"]),
+                facts["reference"],
+                f"{facts['reference_accuracy']:.1e}",
+            )
+            for name, facts in results.problems.items()
+        ),
+    )
+
+
 def _reliability(results: Results) -> str:
     return markdown(
         ("problem", "peer", "setting", "right branch", "median error", "worst error"),
@@ -203,6 +221,7 @@ def text(results: Results) -> str:
         parts += ["## Ours beside the best peer\n", *_ratios(results)]
         levels = " / ".join(f"{level:.0e}" for level in LEVELS)
         parts += [f"## Everyone: CPU ms at error {levels}\n", _everyone(results), ""]
+        parts += ["## Problems and their references\n", _problems(results), ""]
         parts += ["## Build and first call, not in the times above (ms)\n"]
         rows = (
             (row.problem, results.peers[row.peer], milliseconds(row.build),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import threading
 import time
+import weakref
 from typing import Any
 
 import numpy as np
@@ -272,6 +274,22 @@ def test_the_interpreter_is_free_while_the_kernel_runs() -> None:
     assert solution.success
     # Held for the whole run, the lock would be passed on a handful of times at most.
     assert during > 20
+
+
+def test_a_run_whose_controller_leads_back_to_it_is_collected() -> None:
+    class Plant:
+        solution: srm.Solution | None = None
+
+        def __call__(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            return np.zeros_like(v)
+
+    plant = Plant()
+    plant.solution = srm.simulate(srm.load("four_bar"), 0.2, backend="kernel", controller=plant)
+    plant.solution(0.1)
+    alive = weakref.ref(plant)
+    del plant
+    gc.collect()
+    assert alive() is None
 
 
 def test_the_backend_is_named_and_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

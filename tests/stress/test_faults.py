@@ -232,7 +232,8 @@ def test_a_chain_almost_stretched_to_its_reach_rattles(slack: float) -> None:
     assert gap(solution) <= 1e-9
     assert np.abs(solution.q).max() < 10.0 * size
     kinetic = solution.energy[0] - min(solution.energy[0] - 9.81 * size, solution.energy.min())
-    assert np.ptp(solution.energy) < 1e-5 * kinetic
+    # sigma is about sqrt(slack): rounding enters as eps over its square.
+    assert np.ptp(solution.energy) < max(1e-8, 10.0 * np.finfo(float).eps / slack) * kinetic
 
 
 @pytest.mark.parametrize("damping", [2.0, 8.0])

@@ -435,7 +435,37 @@ struct PyDense {
 
 }  // namespace
 
+// The collector follows what the objects keep alive: a controller may lead back to a solution.
+template <typename T, nb::object T::*... kept>
+int traverse(PyObject* self, visitproc visit, void* arg) {
+    Py_VISIT(Py_TYPE(self));
+    if (!nb::inst_ready(self)) return 0;
+    T* object = nb::inst_ptr<T>(self);
+    for (PyObject* held : {(object->*kept).ptr()...}) Py_VISIT(held);
+    return 0;
+}
+
+template <typename T, nb::object T::*... kept>
+int clear(PyObject* self) {
+    if (!nb::inst_ready(self)) return 0;
+    T* object = nb::inst_ptr<T>(self);
+    ((object->*kept).reset(), ...);
+    return 0;
+}
+
+template <typename T, nb::object T::*... kept>
+PyType_Slot* collected() {
+    static PyType_Slot slots[] = {
+        {Py_tp_traverse, reinterpret_cast<void*>(traverse<T, kept...>)},
+        {Py_tp_clear, reinterpret_cast<void*>(clear<T, kept...>)},
+        {0, nullptr},
+    };
+    return slots;
+}
+
 NB_MODULE(_core, m) {
+    // Results that live until the interpreter ends are no leak.
+    nb::set_leak_warnings(false);
     m.doc() = "Compiled twin of the default paths of srm_mbs; see srm_mbs.kernel.";
     nb::register_exception_translator([](const std::exception_ptr& p, void*) {
         try {
@@ -444,14 +474,15 @@ NB_MODULE(_core, m) {
             PyErr_SetString(PyExc_ArithmeticError, "the stage cannot be evaluated");
         }
     });
-    nb::class_<PySystem>(m, "System")
+    nb::class_<PySystem>(
+        m, "System", nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller>()))
         .def(nb::init<nb::object, const nb::dict&, nb::object>(), nb::arg("model"),
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
         .def("repeat", &PySystem::repeat)
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
         .def_prop_ro("factorisations", [](const PySystem& s) { return s.system->factorisations(); });
-    nb::class_<PyRun>(m, "Run")
+    nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
         .def("__init__",
              [](PyRun* self, nb::object system, const nb::dict& d) {
                  new (self) PyRun(nb::cast<PySystem&>(system), system, d);
@@ -473,7 +504,8 @@ NB_MODULE(_core, m) {
         .def_prop_ro("state", [](PyRun& r) {
             return owned(r.run->state, {r.run->state.size()});
         });
-    nb::class_<PyDense>(m, "DenseOutput")
+    nb::class_<PyDense>(
+        m, "DenseOutput", nb::type_slots(collected<PyDense, &PyDense::system, &PyDense::steps>()))
         .def("__init__",
              [](PyDense* self, nb::object system, const nb::dict& d) {
                  new (self) PyDense(nb::cast<PySystem&>(system), system, d);

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import srm_mbs as srm
 from benchmarks.work_precision import machine, plots, records, tables, timing
 from benchmarks.work_precision.harness import LIMIT, measure_problem
 from benchmarks.work_precision.peers import PEERS
@@ -51,7 +52,12 @@ def main(arguments: Sequence[str]) -> int:
     results = records.Results(
         machine.describe(),
         machine.versions(),
-        {"repeats": chosen.repeats, "limit": chosen.limit, "thin": chosen.thin},
+        {
+            "repeats": chosen.repeats,
+            "limit": chosen.limit,
+            "thin": chosen.thin,
+            "backend": srm.backend(),
+        },
     )
     peers = [PEERS[name] for name in chosen.peers]
 

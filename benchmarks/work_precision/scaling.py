@@ -27,7 +27,6 @@ from benchmarks.work_precision.peers.pinocchio_dynamics import PinocchioDynamics
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.records import Results
-from srm_mbs._kernel import core
 from srm_mbs.kernel import compiled
 from srm_mbs.systems.multibody import make_system
 
@@ -90,8 +89,8 @@ def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
 
 
 def kernel_evaluation(mechanism: srm.Mechanism, repeats: int) -> float | None:
-    """Microseconds of an evaluation in the kernel's own loop; None where there is no kernel."""
-    if core is None:
+    """Microseconds of an evaluation in the kernel's own loop; None where runs do not use it."""
+    if srm.backend() != "kernel":
         return None
     twin = compiled(make_system(mechanism))
     state = np.concatenate([mechanism.q0, mechanism.v0])

@@ -211,11 +211,12 @@ def text(results: Results) -> str:
     """All tables as Markdown."""
     machine = ", ".join(f"{key} {value}" for key, value in results.machine.items())
     versions = ", ".join(f"{key} {value}" for key, value in results.versions.items() if value)
+    settings = results.settings
     parts = [
         "# Work and precision\n",
-        f"{machine}. {versions}. CPU time of one thread, least of {results.settings['repeats']}; "
-        "a setting counts for a level only if it and every tighter one reach it. Sweeps end at "
-        f"{results.settings.get('limit', '-')} s of CPU time a run.\n",
+        f"{machine}. {versions}, backend {settings.get('backend', 'unknown')}. CPU time of one "
+        f"thread, least of {settings.get('repeats', '-')}; a setting counts for a level only if it "
+        f"and every tighter one reach it. Sweeps end at {settings.get('limit', '-')} s a run.\n",
     ]
     if results.measurements:
         parts += ["## Ours beside the best peer\n", *_ratios(results)]

@@ -17,7 +17,6 @@ from benchmarks.work_precision.peers.base import (
     Setting,
 )
 from benchmarks.work_precision.problems.base import Problem
-from srm_mbs.simulation import BACKENDS
 
 TOLERANCES = tuple(10.0**-k for k in range(4, 13))
 """1e-4 is the loosest that ``simulate`` takes."""
@@ -33,7 +32,7 @@ class Ours(Peer):
     def variants(self) -> list[str]:
         """``tableau, backend``; the Python backend apart where there is another."""
         out = ["dop853, auto", "dopr54, auto"]
-        return [*out, "dop853, python"] if "kernel" in BACKENDS else out
+        return [*out, "dop853, python"] if srm.backend() == "kernel" else out
 
     def settings(self, problem: Problem) -> Sequence[Setting]:
         return [Setting("rtol", tol, name) for name in self.variants() for tol in TOLERANCES]

@@ -103,6 +103,50 @@ def compiled(system: ClosedSystem | OpenSystem) -> Any:
     return core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
 
 
+class _TwinTerms:
+    """Terms of a regular stage, evaluated by the kernel."""
+
+    weak = False
+    held = False
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        self.sigma: float = found["sigma"]
+        self.rank: int = found["rank"]
+        self._found = found
+
+    def rate(self) -> FloatArray:
+        return self._found["rate"]  # type: ignore[no-any-return]
+
+    def multiplier(self) -> FloatArray:
+        return self._found["multiplier"]  # type: ignore[no-any-return]
+
+
+class Evaluator:
+    """A system whose stages outside the zone are evaluated by the kernel.
+
+    Parameters
+    ----------
+    system, twin
+        The mechanism, and what :func:`compiled` made of it.
+    """
+
+    def __init__(self, system: ClosedSystem | OpenSystem, twin: Any) -> None:
+        self._system = system
+        self._twin = twin
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._system, name)
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
+        """Terms of a stage; see :class:`~srm_mbs.systems.base.System`."""
+        if zone is None:
+            try:
+                return _TwinTerms(self._twin.terms(t, state))
+            except ArithmeticError:
+                pass  # the reference says why
+        return self._system.evaluate(t, state, zone)
+
+
 def _history(history: MultiplierHistory | None) -> dict[str, Any] | None:
     if history is None:
         return None

@@ -140,6 +140,8 @@ def checked_placement(placement: Any) -> str:
 
 def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> FloatArray:
     """The given times within the run, in order."""
+    if isinstance(singular_times, tuple) and not singular_times:
+        return np.zeros(0)
     remedy = "Give times (s) between the start and the end of the run"
     times = numbers(singular_times, "singular_times", remedy)
     if times.ndim != 1:

@@ -45,6 +45,7 @@ from srm_mbs.stepping.stepsize import (
     Verdict,
     initial_step,
 )
+from srm_mbs.systems.base import System
 from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, make_system
 from srm_mbs.systems.units import row_units
 
@@ -279,19 +280,21 @@ def simulate(
     twin: Any = None
     record: RunRecord
     try:
-        memory = start(system, method, 0.0, state, norm, t_end)
+        if on_kernel:
+            twin = kernel.compiled(system)
+        evaluator: System = system if twin is None else kernel.Evaluator(system, twin)
+        memory = start(system, method, 0.0, state, norm, t_end, evaluator)
 
         def chosen_first_step() -> float:
             if first_step is not None:
                 return first_step
             order = method.scheme.controller_order or 1
-            return initial_step(system, state, memory, norm, t_end, order)
+            return initial_step(evaluator, state, memory, norm, t_end, order)
 
         longest = np.inf if max_step is None else max_step
         with progress_of(progress, system, t_end) as tick:
             if on_kernel and isinstance(method, PSRM):
                 check_embedded(method.scheme, step)
-                twin = kernel.compiled(system)
                 run = kernel.CompiledRun(
                     twin,
                     method,
@@ -427,20 +430,30 @@ def _bifurcations(solution: Solution) -> str:
     return "".join(f" {bifurcation}." for bifurcation in found[:TOLD]) + more
 
 
-def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
-    """A sentence naming the one-degree joints that left their limits, which do not act."""
-    model = mechanism.model
-    _, states = dense.nodes()
-    left = []
+def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]:
+    """Name, index in q and limits of the one-degree joints that have limits."""
+    model, found = mechanism.model, []
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
-        if joint.nq != 1:
-            continue
-        low = model.lowerPositionLimit[joint.idx_q]
-        high = model.upperPositionLimit[joint.idx_q]
-        q = states[:, joint.idx_q]
+        if joint.nq == 1:
+            low = float(model.lowerPositionLimit[joint.idx_q])
+            high = float(model.upperPositionLimit[joint.idx_q])
+            if low < high and (np.isfinite(low) or np.isfinite(high)):
+                found.append((name, joint.idx_q, low, high))
+    return found
+
+
+def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
+    """A sentence naming the one-degree joints that left their limits, which do not act."""
+    joints = mechanism.derived("limited_joints", lambda: _limited_joints(mechanism))
+    if not joints:
+        return ""
+    _, states = dense.nodes()
+    left = []
+    for name, index, low, high in joints:
+        q = states[:, index]
         # A run that a terminal event ends at a limit has not left it.
         slack = ROUND_OFF * max(1.0, float(np.abs(q).max()))
-        if low < high and max(low - q.min(), q.max() - high) > slack:
+        if max(low - q.min(), q.max() - high) > slack:
             left.append(name)
     return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""

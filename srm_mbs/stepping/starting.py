@@ -17,6 +17,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import ErrorNorm, Memory, Method
 from srm_mbs.stepping.leaving import Point, free_acceleration, known_multipliers
+from srm_mbs.systems.base import System
 from srm_mbs.systems.branch_limit import BranchLimit, branch_next_to
 from srm_mbs.systems.branches import branch_tangents
 from srm_mbs.systems.closure_geometry import ClosureGeometry
@@ -119,6 +120,7 @@ def start(
     state: FloatArray,
     norm: ErrorNorm,
     t_end: float,
+    evaluator: System | None = None,
 ) -> Memory:
     """The memory of ``method`` at the initial state, also on a singular configuration.
 
@@ -126,6 +128,8 @@ def start(
     ----------
     t_end
         End of the run (s): nothing is evaluated beyond it.
+    evaluator
+        Evaluates the first stage; ``system`` by default.
 
     Raises
     ------
@@ -135,7 +139,7 @@ def start(
     EvaluationError
         If the start, or what lies ahead of it, cannot be evaluated.
     """
-    memory = method.start(system, t, state, norm)
+    memory = method.start(system if evaluator is None else evaluator, t, state, norm)
     if not isinstance(system, ClosedSystem) or not memory.sigma < LOOK:
         return memory
     mechanism = system.mechanism

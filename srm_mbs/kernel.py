@@ -406,11 +406,13 @@ def _trouble(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -
     if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
         return loop.BELOW_ROUND_OFF
     if run.trouble:
-        t, h = next((t, h) for t, h, ratio, _ in reversed(attempts) if np.isinf(ratio))
-        try:
-            run.method.step(system, t, h, run.state, run.memory(), run.norm)
-        except EvaluationError as error:
-            return str(error)
+        failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
+        # The last one first; at the edge of what can be evaluated rounding decides.
+        for h in reversed(failed):
+            try:
+                run.method.step(system, run.t, h, run.state, run.memory(), run.norm)
+            except EvaluationError as error:
+                return str(error)
     return loop.NOT_FINITE if reason == NOT_EVALUATED else ""
 
 

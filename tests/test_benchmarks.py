@@ -242,6 +242,23 @@ def test_every_peer_simulates_the_spatial_robot(peer: str, error: float) -> None
     assert difference.max() < error
 
 
+@pytest.mark.parametrize("name", ["slider_crank_regular", "n_four_bar_2", "squeezing_mechanism"])
+@pytest.mark.parametrize("peer", ["exudyn", "mujoco", "pinocchio_rk4_baumgarte"])
+def test_peers_with_fixed_steps_simulate_planar_loops(peer: str, name: str) -> None:
+    chosen = PEERS[peer]
+    if chosen.missing():
+        pytest.skip(f"{chosen.missing()} is not installed")
+    whole = PROBLEMS[name]()
+    problem = replace(whole, t_end=whole.t_end / 10.0)  # every tenth sample is one of the whole
+    setting = next(each for each in chosen.settings(problem) if each.substeps == 20)
+    outcome = attempt(problem, chosen.prepare(problem), setting)
+    assert not isinstance(outcome, str), outcome
+    q, v = outcome[0].states()
+    difference = np.abs(problem.observe(q, v)[9::10] - problem.reference.observed[:10])
+    difference[:, problem.rates :] /= problem.rate_unit
+    assert difference.max() < 1e-3
+
+
 def test_references_agree_with_independent_integrators() -> None:
     field = lambda t, y: np.array([y[1], -np.sin(y[0])])  # noqa: E731
     times = np.linspace(0.0, 5.0, 6)[1:]

@@ -34,7 +34,8 @@ class Setting:
     """One way to run a peer.
 
     ``kind``: ``"rtol"`` or ``"step"`` (s).  ``variant``: what else differs, such as Baumgarte
-    rates; every variant is a sweep of its own.
+    rates; every variant is a sweep of its own.  ``gain``: that rate alpha (1/s), 0 without.
+    ``substeps``: steps from one sample to the next, where they are fixed.
     """
 
     kind: str

@@ -118,9 +118,7 @@ class ExudynAlpha(Peer):
                 items.NodeRigidBody2D(referenceCoordinates=position, initialVelocities=velocity)
             )
             bodies[j] = system.AddObject(
-                items.ObjectRigidBody2D(
-                    physicsMass=mass, physicsInertia=plane.inertia(j), nodeNumber=node
-                )
+                items.ObjectRigidBody2D(mass=mass, inertia=plane.inertia(j), nodeNumber=node)
             )
             centre = system.AddMarker(items.MarkerBodyMass(bodyNumber=bodies[j]))
             system.AddLoad(
@@ -224,12 +222,12 @@ class ExudynAlpha(Peer):
             integration.newton.useModifiedNewton = True
             integration.newton.relativeTolerance = 1e-10
             integration.newton.absoluteTolerance = 1e-12
-            options.solutionSettings.writeSolutionToFile = False
-            options.solutionSettings.sensorsWritePeriod = problem.t_end / SAMPLES
+            options.solution.file.write = False
+            options.solution.sensors.writePeriod = problem.t_end / SAMPLES
             if len(plane.massive) > DENSE_BODIES:
-                options.linearSolverType = exudyn.LinearSolverType.EigenSparse
-            options.displayStatistics = False
-            options.displayComputationTime = False
+                options.linearSolver.solverType = exudyn.LinearSolverType.EigenSparse
+            options.show.statistics = False
+            options.show.computationTime = False
 
             def run() -> Outcome:
                 try:

@@ -44,7 +44,6 @@ class Ours(Peer):
         mechanism = problem.mechanism
         _ = mechanism.structure  # the analysis of the closures, done once per mechanism
         times = problem.times
-        observe = problem.observe_ours or problem.observe
 
         def at(setting: Setting) -> Run:
             tableau, backend = setting.variant.split(", ")
@@ -70,7 +69,7 @@ class Ours(Peer):
                 return Outcome(
                     stats.evaluations,
                     stats.steps,
-                    observed=lambda: observe(q, v),
+                    observed=lambda: problem.observe(q, v),
                     own_drift=drift,
                     own_energy=energy,
                 )

@@ -38,8 +38,8 @@ class Problem:
         Key, a line of description, and the end of the run (s).
     make_mechanism, make_tree
         What we simulate, and what the peers simulate.
-    observe, observe_ours
-        What is compared, from the peers' coordinates and from ours.
+    observe
+        What is compared, from the peers' coordinates or from ours.
     rate_unit
         What a velocity is divided by before errors are compared (1/s); lengths and angles count
         in m and rad.
@@ -50,7 +50,7 @@ class Problem:
     singular
         Whether the motion passes through singular configurations.
     planar
-        Whether all moves in one plane, of which ``axes`` are the world axes.
+        The two world axes of the plane in which everything moves; None in space.
     gains
         Baumgarte rates alpha (1/s) that peers are tried with: kp = alpha^2, kd = 2 alpha.
     reference_of
@@ -64,7 +64,6 @@ class Problem:
     make_tree: Callable[[], Tree]
     observe: Observer
     rates: int
-    observe_ours: Observer | None = None
     rate_unit: float = 1.0
     reduced: ReducedModel | None = None
     expand: Callable[[Array], Array] = lambda observed: observed

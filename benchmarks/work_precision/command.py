@@ -29,9 +29,30 @@ def parser() -> argparse.ArgumentParser:
         "pip install mujoco exudyn scikit-sundae scipy-dae.",
     )
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
-    out.add_argument("--problems", nargs="+", choices=PROBLEMS, default=list(PROBLEMS))
-    out.add_argument("--peers", nargs="+", choices=PEERS, default=list(PEERS))
-    out.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
+    out.add_argument(
+        "--problems",
+        nargs="+",
+        choices=PROBLEMS,
+        default=list(PROBLEMS),
+        metavar="NAME",
+        help=f"all by default: {', '.join(PROBLEMS)}",
+    )
+    out.add_argument(
+        "--peers",
+        nargs="+",
+        choices=PEERS,
+        default=list(PEERS),
+        metavar="NAME",
+        help=f"all by default: {', '.join(PEERS)}",
+    )
+    out.add_argument(
+        "--sections",
+        nargs="+",
+        choices=SECTIONS,
+        default=list(SECTIONS),
+        metavar="NAME",
+        help=f"all by default: {', '.join(SECTIONS)}",
+    )
     out.add_argument(
         "--repeats", type=int, default=timing.REPEATS, help="timed calls per setting, 5 or more"
     )

@@ -131,6 +131,7 @@ class _Mechanics:
             "rows": 0,
             "structural_rank": 0,
             "sigma_ref": 1.0,
+            "algebra": "auto",
             "gap_scale": np.zeros(0),
             "unit": self._unit,
             "position_of": [int(i) for i in self._position_of],

@@ -190,6 +190,7 @@ struct PySystem {
         data.rows = whole(d, "rows");
         data.structural_rank = whole(d, "structural_rank");
         data.sigma_ref = number(d, "sigma_ref");
+        data.algebra = nb::cast<std::string>(d["algebra"]);
         data.gap_scale = vector_of(d["gap_scale"]);
         data.unit = vector_of(d["unit"]);
         data.position_of = nb::cast<std::vector<int>>(d["position_of"]);
@@ -480,6 +481,7 @@ NB_MODULE(_core, m) {
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
         .def("repeat", &PySystem::repeat)
+        .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
         .def_prop_ro("factorisations", [](const PySystem& s) { return s.system->factorisations(); });
     nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))

@@ -3,20 +3,23 @@
 //     M = L L^T,  W = L^{-1} G^T,  W Pi = Q R,
 //     E g = L^{-T} Q R^{-T} Pi^T g,   P v = L^{-T} Q Q^T L^T v,   yhat = E gamma.
 //
-// Q stays in its reflections: a stage multiplies by it once or twice, which costs less than
-// forming it.
+// "White" vectors are L^T v.  Two factors L of the same M differ by an orthogonal matrix: norms,
+// pivots and sigma of W are the same for all, white vectors are not.
 #pragma once
 
+#include <memory>
+#include <string>
 #include <vector>
 
 namespace srm {
 
 class Projection {
 public:
-    Projection(int nv, int rows, int structural_rank, double sigma_ref);
+    virtual ~Projection() = default;
 
-    // Columns of G^T (nv, rows), to be filled before factor(), which overwrites them.
-    double* columns() { return A_.data(); }
+    // Column `row` of G^T (nv,), of which the entries of the row's support are to be written
+    // before factor(), which overwrites them.
+    virtual double* column(int row) = 0;
 
     // Factorises the upper triangle of M (nv, nv) and G, and solves for the multiplier with the
     // forces f (nv,) and bias (rows,).  threshold < 0: none.
@@ -26,16 +29,17 @@ public:
     void hold(const double* normals, int count);
 
     // white = Q R^-T Pi^T g, for g (rows,) in their own order.
-    void normal(const double* g, double* white) const;
+    virtual void normal(const double* g, double* white) const = 0;
     // white = Q Q^T L^T w, held normals included.
     void white_project(const double* w, double* white) const;
     // Subtracts Q Q^T x from x, in place.
-    void remove_normal(double* white) const;
+    virtual void remove_normal(double* white) const = 0;
     // x = L^T x and x = L^-T x, in place.
-    void whiten_velocity(double* x) const;
-    void unwhiten(double* x) const;
+    virtual void whiten_velocity(double* x) const = 0;
+    virtual void unwhiten(double* x) const = 0;
     // M-orthonormal normals L^-T Q (nv, rank).
-    void normals(double* out) const;
+    virtual void normals(double* out) const = 0;
+    virtual bool sparse() const = 0;
 
     int nv, rows, structural_rank;
     double sigma_ref;
@@ -46,17 +50,33 @@ public:
     long factorisations = 0;
     std::vector<double> white_force, white_multiplier;
 
-private:
-    void cholesky(const double* M);
-    void pivoted_qr();
-    void whiten(double* x) const;
-    void times_q(double* x) const;
-    void times_q_transposed(double* x) const;
+protected:
+    Projection(int nv, int rows, int structural_rank, double sigma_ref);
 
-    std::vector<double> U_, A_, tau_, norms_, first_norms_, gamma_, held_;
+    // white_force, gamma_ and |R_kk| (pivots_) down to the structural rank.
+    virtual void factorise(const double* M, const double* f, const double* bias) = 0;
+    // x = Q Q^T x
+    virtual void keep_normal(double* white) const = 0;
+
+    std::vector<double> gamma_, pivots_;
+
+private:
+    std::vector<double> held_;
     mutable std::vector<double> work_;
-    std::vector<int> order_;
     int held_count_ = 0;
 };
+
+// LAPACK's xGEQP3 recomputes a column norm once its square has lost this much: sqrt(2^-53).
+constexpr double norm_lost = 1.0536712127723509e-8;
+
+// What is known of W before any number is.
+struct Pattern {
+    std::vector<int> parents;                 // (nv,), the next coordinate to the root, or -1
+    std::vector<std::vector<int>> supports;   // of the rows of G, ascending
+};
+
+// choice: "auto", "dense" or "sparse".
+std::unique_ptr<Projection> make_projection(int structural_rank, double sigma_ref,
+                                            const Pattern& pattern, const std::string& choice);
 
 }  // namespace srm

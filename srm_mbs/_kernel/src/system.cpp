@@ -43,8 +43,10 @@ System::System(const void* model, SystemData data, Controller controller)
     closed_ = data_.structural_rank > 0;
     flat_ = nq == nv;
     if (closed_)
-        projection_ = std::make_unique<Projection>(nv, data_.rows, data_.structural_rank,
-                                                   data_.sigma_ref);
+        projection_ = make_projection(data_.structural_rank, data_.sigma_ref, pattern(),
+                                      // A joint that mimics another adds entries off the tree.
+                                      work_->model.mimicking_joints.empty() ? data_.algebra
+                                                                            : "dense");
     g_.resize(data_.rows);
     bias_.resize(data_.rows);
     f_.resize(nv);
@@ -56,6 +58,16 @@ System::System(const void* model, SystemData data, Controller controller)
 }
 
 System::~System() = default;
+
+Pattern System::pattern() const {
+    Pattern out;
+    out.parents.assign(work_->data.parents_fromRow.begin(), work_->data.parents_fromRow.end());
+    for (const LoopRows& loop : data_.loops)
+        out.supports.insert(out.supports.end(),
+                            (loop.directions.size() / 3) + (loop.alignments.size() / 6),
+                            loop.columns);
+    return out;
+}
 
 double System::sigma() const {
     return closed_ ? projection_->sigma : std::numeric_limits<double>::infinity();
@@ -87,11 +99,8 @@ void System::update_loops(bool with_bias) {
             }
         }
         int row = loop.first_row;
-        const int nv = this->nv;
-        double* const columns = closed_ ? projection_->columns() : nullptr;
         const auto fill = [&](int row, const double* a) {
-            double* out = columns + row * nv;
-            std::fill(out, out + nv, 0.0);
+            double* const out = projection_->column(row);
             for (std::size_t k = 0; k < loop.columns.size(); ++k) {
                 const int j = loop.columns[k];
                 const double* column = J + 6 * j;

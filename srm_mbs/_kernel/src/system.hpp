@@ -8,6 +8,7 @@
 
 #include <functional>
 #include <memory>
+#include <string>
 #include <vector>
 
 #include "charts.hpp"
@@ -35,6 +36,7 @@ struct SystemData {
     std::vector<LoopRows> loops;
     int rows = 0, structural_rank = 0;
     double sigma_ref = 1.0;
+    std::string algebra = "auto";       // "auto", "dense" or "sparse"
     std::vector<double> gap_scale;      // (rows,)
     std::vector<double> unit;           // (nv,)
     std::vector<int> position_of;       // (nv,), -1 on groups
@@ -66,6 +68,7 @@ public:
 
     // Terms of the stage evaluated last.
     bool constrained() const { return closed_; }
+    bool sparse() const { return closed_ && projection_->sparse(); }
     double sigma() const;
     int rank() const;
     bool weak() const;
@@ -93,6 +96,7 @@ public:
     const double* closure_errors() const { return g_.data(); }
 
 private:
+    Pattern pattern() const;
     void update_loops(bool with_bias);
     void completed(const double* white, double* out) const;
 

@@ -2,7 +2,8 @@
 
     python -m benchmarks.singular_cost [--repeats 15] [--json FILE]
 
-Run from a checkout; BLAS runs on one thread.  Regular mechanisms are run as they are, and with
+Run from a checkout; BLAS runs on one thread.  The Python reference is measured: in the compiled
+kernel the measures cannot be left out.  Regular mechanisms are run as they are, and with
 placement, the guard of the branch, the zone with its history, stages on the branch, the watch
 over closure errors and the look for bifurcations all left out.  The two take the same
 steps, which is checked; the runs alternate; times are CPU times of the process.
@@ -15,7 +16,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,11 @@ import numpy as np
 import srm_mbs as srm
 from srm_mbs import simulation
 from srm_mbs.arrays import FloatArray
+from srm_mbs.methods import psrm
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.methods.split import later_stages
 from srm_mbs.options import step_size_control
+from srm_mbs.stepping.loop import Closures
 from srm_mbs.systems.base import System
 
 CASES = (
@@ -39,64 +43,69 @@ CASES = (
 RUNS = (("dop853", 1e-8), ("dopr54", 1e-8))
 
 
-@dataclass(frozen=True)
-class Plain:
+def plain_start(system: System, t: float, state: FloatArray) -> Memory:
+    """First stage; no multiplier history."""
+    terms = system.evaluate(t, state)
+    return Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+
+
+def plain_step(
+    system: System,
+    scheme: srm.ButcherTableau,
+    t: float,
+    h: float,
+    state: FloatArray,
+    memory: Memory,
+    norm: ErrorNorm,
+    theta: float,
+) -> StepResult:
     """The split PSRM with nothing for singular configurations (docs/notation.md, "The method")."""
+    s = scheme.n_stages
+    all_weights, fractions = later_stages(scheme)
+    rates = np.zeros((s + 1, system.tangent_size))
+    weighed = rates[:s]
+    sigmas = [memory.sigma]
+    rates[0] = memory.rate
+    for j, weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
+        delta = weights.dot(weighed)
+        x = system.retract(state, delta)
+        terms = system.evaluate(t + fraction * h, x)
+        sigmas.append(terms.sigma)
+        rate = terms.rate()
+        rates[j] = system.chart_rate(delta, rate)
+    magnitude = system.magnitudes(x)
+    correction = terms.correction()
+    if theta != 1.0:
+        correction = theta * correction
+    weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+    return StepResult(
+        t=t,
+        h=h,
+        state=system.retract(x, -correction),
+        rates=rates,
+        end_rate=rate - system.rate_change(correction),
+        correction=correction,
+        error_ratio=norm(h * (scheme.error @ rates), weights),
+        sigmas=np.array(sigmas),
+        rank=terms.rank,
+        zone=None,
+        history=None,
+        multiplier=None,
+        magnitude=magnitude,
+    )
 
-    tableau: str
 
-    @property
-    def scheme(self) -> srm.ButcherTableau:
-        return srm.TABLEAUS[self.tableau]
-
-    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
-        terms = system.evaluate(t, state)
-        return Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
-
-    def step(
-        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
-    ) -> StepResult:
-        scheme = self.scheme
-        s, A, c = scheme.n_stages, scheme.A, scheme.c
-        rates = np.empty((s + 1, system.tangent_size))
-        sigmas = np.full(s + 1, memory.sigma)
-        rates[0] = memory.rate
-        for j in range(1, s + 1):
-            end = j == s
-            delta = (h * (scheme.b if end else A[j, :j])) @ rates[:j]
-            x = system.retract(state, delta)
-            terms = system.evaluate(t + (1.0 if end else float(c[j])) * h, x)
-            sigmas[j] = terms.sigma
-            rate = terms.rate()
-            rates[j] = system.chart_rate(delta, rate)
-        magnitude = system.magnitudes(x)
-        correction = terms.correction()
-        weights = norm.weights(np.maximum(memory.magnitude, magnitude))
-        return StepResult(
-            t=t,
-            h=h,
-            state=system.retract(x, -correction),
-            rates=rates,
-            end_rate=rate - system.rate_change(correction),
-            correction=correction,
-            error_ratio=norm(h * (scheme.error @ rates), weights),
-            sigmas=sigmas,
-            rank=terms.rank,
-            zone=None,
-            history=None,
-            multiplier=None,
-            magnitude=magnitude,
-        )
-
-    def accept(self, memory: Memory, result: StepResult) -> None:
-        memory.rate = result.end_rate
-        memory.sigma = float(result.sigmas[-1])
-        memory.magnitude = result.magnitude
+def plain_accept(memory: Memory, result: StepResult) -> None:
+    """Rate, sigma and size at the end of the step."""
+    memory.steps += 1
+    memory.rate = result.end_rate
+    memory.sigma = float(result.sigmas[-1])
+    memory.magnitude = result.magnitude
 
 
 @contextmanager
 def nothing_for_singular_configurations() -> Iterator[None]:
-    """``simulate`` without placement, guard, look at the start, and look for bifurcations."""
+    """``simulate`` with no placement, guard, watch, look at the start and look for bifurcations."""
 
     def control(
         system: Any, method: Any, step: Any, first_step: Callable[[], float], t_end: float, *_: Any
@@ -107,9 +116,13 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         return method.start(system, t, state, norm)  # type: ignore[no-any-return]
 
     with (
+        patch.object(psrm, "split_start", plain_start),
+        patch.object(psrm, "split_step", plain_step),
+        patch.object(psrm, "split_accept", plain_accept),
         patch.object(simulation, "_control", control),
         patch.object(simulation, "start", start),
         patch.object(simulation, "_bifurcations", lambda _: ""),
+        patch.object(Closures, "trouble", lambda *_: ""),
     ):
         yield
 
@@ -135,15 +148,12 @@ class Row:
 
 def measure(name: str, t_end: float, tableau: str, tol: float, repeats: int) -> Row:
     mechanism = srm.load(name)
-    plain = Plain(tableau)
 
     def run(everything: bool) -> tuple[float, srm.Solution]:
+        without = nullcontext() if everything else nothing_for_singular_configurations()
         start = time.process_time()
-        if everything:
-            solution = srm.simulate(mechanism, t_end, tableau=tableau, rtol=tol)
-        else:
-            with nothing_for_singular_configurations():
-                solution = srm.simulate(mechanism, t_end, method=plain, rtol=tol)
+        with without:
+            solution = srm.simulate(mechanism, t_end, tableau=tableau, rtol=tol, backend="python")
         return time.process_time() - start, solution
 
     both = [run(everything)[1] for everything in (True, False)]

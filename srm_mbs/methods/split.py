@@ -16,6 +16,8 @@ many evaluations as the tableau has stages, and a few more next to singular conf
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
@@ -31,6 +33,12 @@ FAR = 8.0
 ALL_ROWS = np.iinfo(np.int64).max
 GAP_EVERY = 16
 """Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
+
+
+@lru_cache(maxsize=64)
+def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
+    """Weights (s, s) and abscissae (s,) of the stages after the first, and of the end."""
+    return np.vstack([scheme.A[1:], scheme.b]), [*scheme.c[1:].tolist(), 1.0]
 
 
 def split_start(system: System, t: float, state: FloatArray) -> Memory:
@@ -59,7 +67,8 @@ def split_step(
     EvaluationError
         If a stage cannot be evaluated.
     """
-    s, A, c = scheme.n_stages, scheme.A, scheme.c
+    s = scheme.n_stages
+    all_weights, fractions = later_stages(scheme)
     history = memory.history
     sigma_change = h * memory.sigma_slope
     branch: BranchStages | None = None
@@ -68,21 +77,21 @@ def split_step(
         weights = norm.weights(memory.magnitude)
         branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
         zone = branch.zone
-    rates = np.empty((s + 1, system.tangent_size))
-    sigmas = np.full(s + 1, memory.sigma)
+    # Zeros, because each stage weighs all s rates: those still to come with 0.
+    rates = np.zeros((s + 1, system.tangent_size))
+    weighed = rates[:s]
+    all_sigmas = [memory.sigma]
     rates[0] = memory.rate
     weak_stages: list[int] = []
     rank = ALL_ROWS
     moved: FloatArray | None = None
     held = False
-    for j in range(1, s + 1):
-        end = j == s
-        delta = (h * (scheme.b if end else A[j, :j])) @ rates[:j]
+    for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
+        delta = stage_weights.dot(weighed)
         x = system.retract(state, delta)
-        fraction = 1.0 if end else float(c[j])
         time = t + fraction * h
         terms = system.evaluate(time, x, zone)
-        sigmas[j] = terms.sigma
+        all_sigmas.append(terms.sigma)
         if branch is not None and branch.near and fraction > 0.0:
             terms, x, moved = branch(terms, time, fraction, x)
         rate = terms.rate()
@@ -91,6 +100,7 @@ def split_step(
             rank = min(rank, terms.rank)
             weak_stages.append(j)
             held = held or terms.held
+    sigmas = np.array(all_sigmas)
     magnitude = system.magnitudes(x)
     normals: FloatArray | None = None
     if history is not None:
@@ -109,10 +119,10 @@ def split_step(
     else:
         correction = np.zeros(0)
         new_state, end_rate, multiplier = x, rate.copy(), None
-    change = abs(terms.sigma - memory.sigma)
-    quiet = branch is None and terms.sigma > WATCHED + FAR * change
+    sigma = terms.sigma
+    quiet = branch is None and sigma > WATCHED + FAR * abs(sigma - memory.sigma)
     gap = 0.0
-    due = memory.steps < GAP_EVERY or memory.steps % GAP_EVERY == 0
+    due = memory.steps % GAP_EVERY == 0 or memory.steps < GAP_EVERY
     if due and history is not None and theta == 1.0:
         gap = terms.gap()
     error_ratio = 0.0
@@ -124,7 +134,7 @@ def split_step(
                 error = np.abs(error)
                 for j in weak_stages:
                     if j < s:
-                        uncertainty = history.uncertainty(t + c[j] * h)
+                        uncertainty = history.uncertainty(t + scheme.c[j] * h)
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
             weights = branch.widened(weights, scheme, sigmas)
         error_ratio = norm(error, weights)
@@ -137,7 +147,7 @@ def split_step(
         correction=correction,
         error_ratio=error_ratio,
         sigmas=sigmas,
-        rank=min(rank, terms.rank),
+        rank=min(rank, terms.rank) if weak_stages else terms.rank,
         zone=zone if weak_stages else None,
         history=history if weak_stages else None,
         multiplier=multiplier,

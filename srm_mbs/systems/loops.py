@@ -12,6 +12,12 @@ position row g = d . p and an alignment row g = n . m, m = R u, have
     G  = (m x n)^T X_ang (J_a - J_b),       Gdot v = n . (B_ang x m + w x (w x m)),
 
 with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.
+
+Three numbers are multiplied before NumPy starts, so each row is made of plain floats, in the axes
+of the joint that carries b (the world's for a closure to the ground).  With e = R_b d and x the
+origin of anchor a, both in world axes, d^T X_lin = (e, x x e): one product with J is left for all
+rows together.  B_lin + w x r is A_a(x) - A_b(x) - 2 omega_b x r, with the classical acceleration
+A(x) = a + alpha x x + omega x (v + omega x x) of the point of a body that is at x.
 """
 
 from __future__ import annotations
@@ -25,12 +31,55 @@ import pinocchio as pin
 from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.mechanism import LoopClosure
 
+Vector = Sequence[float]
+"""Three numbers."""
+Triple = tuple[float, float, float]
 
-def cross(a: Sequence[float] | FloatArray, b: Sequence[float] | FloatArray) -> FloatArray:
-    """a x b; ``numpy.cross`` costs ten times as much on three numbers."""
+
+def cross3(a: Vector, b: Vector) -> Triple:
+    """a x b."""
     ax, ay, az = a
     bx, by, bz = b
-    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def cross(a: Vector | FloatArray, b: Vector | FloatArray) -> FloatArray:
+    """a x b as an array; ``numpy.cross`` costs ten times as much on three numbers."""
+    return np.array(cross3(a, b))  # type: ignore[arg-type]
+
+
+def _plus_cross(c: Vector, a: Vector, b: Vector) -> Triple:
+    """c + a x b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
+    return cx + (ay * bz - az * by), cy + (az * bx - ax * bz), cz + (ax * by - ay * bx)
+
+
+def _minus(a: Vector, b: Vector) -> Triple:
+    ax, ay, az = a
+    bx, by, bz = b
+    return ax - bx, ay - by, az - bz
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    ax, ay, az = a
+    bx, by, bz = b
+    return ax * bx + ay * by + az * bz
+
+
+def _to_world(R: Sequence[Vector], a: Vector) -> Triple:
+    """R a."""
+    x, y, z = a
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+def _from_world(R: Sequence[Vector], a: Vector) -> Triple:
+    """R^T a."""
+    x, y, z = a
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
 
 
 def world_jacobian(data: pin.Data) -> FloatArray:
@@ -54,6 +103,23 @@ def support(model: pin.Model, joint: int) -> FloatArray:
     return mask
 
 
+class _Body:
+    """Where a joint of ``data`` is and how it moves, read anew by every call.
+
+    Placement in the world; velocity and bias acceleration (with -gravity) in the joint's axes.
+    """
+
+    def __init__(self, data: pin.Data, joint: int) -> None:
+        # Pinocchio's arrays are views on data: finding one costs more than reading it.
+        placement, velocity, bias = data.oMi[joint], data.v[joint], data.a_gf[joint]
+        self.rotation = placement.rotation.tolist
+        self.origin = placement.translation.tolist
+        self.velocity = velocity.linear.tolist
+        self.spin = velocity.angular.tolist
+        self.bias = bias.linear.tolist
+        self.spin_bias = bias.angular.tolist
+
+
 class _LoopRows:
     """The kept, scaled rows of one closure, resolved against a model."""
 
@@ -72,9 +138,16 @@ class _LoopRows:
             (u, n) for u, n in zip(pairs[:, 0], pairs[:, 1] * inverse[k:][keep[k:], None])
         ]
         self.support = support(model, self.joint_a) - support(model, self.joint_b)
-        self.position_slice = slice(start, start + len(self.directions))
-        self.alignment_start = start + len(self.directions)
+        self.first_row = start
         self.count = len(self.directions) + len(self.alignments)
+        # The same in the axes of the joints, as plain floats.
+        self._at_a: list[float] = self.in_a.translation.tolist()
+        self._at_b: list[float] = self.in_b.translation.tolist()
+        self._d: list[list[float]] = (self.directions @ self.in_b.rotation.T).tolist()
+        self._un = [
+            ((self.in_a.rotation @ u).tolist(), (self.in_b.rotation @ n).tolist())
+            for u, n in self.alignments
+        ]
 
     def constants(self) -> dict[str, Any]:
         return {
@@ -85,8 +158,69 @@ class _LoopRows:
             "directions": np.ascontiguousarray(self.directions, dtype=float).ravel(),
             "alignments": np.array([np.concatenate(pair) for pair in self.alignments]).ravel(),
             "support": self.support,
-            "first_row": self.position_slice.start,
+            "first_row": self.first_row,
         }
+
+    def bind(self, data: pin.Data) -> None:
+        """Read the bodies of ``data`` from now on."""
+        self._a, self._b = _Body(data, self.joint_a), _Body(data, self.joint_b)
+
+    def evaluate(self, with_bias: bool, out: list[float]) -> None:
+        """Append for each row (force, moment) of G = (force, moment) J, then g, then Gdot v."""
+        if self._d:
+            self._positions(with_bias, out)
+        if self._un:
+            self._alignments(with_bias, out)
+
+    def _positions(self, with_bias: bool, out: list[float]) -> None:
+        a, b, ground = self._a, self._b, self.joint_b == 0
+        Ra, at_a = a.rotation(), self._at_a
+        rx, ry, rz = _to_world(Ra, at_a)
+        ox, oy, oz = a.origin()
+        x = at_b = (rx + ox, ry + oy, rz + oz)
+        if not ground:
+            Rb = b.rotation()
+            at_b = _from_world(Rb, _minus(x, b.origin()))
+        if with_bias:
+            spin = a.spin()
+            speed = _plus_cross(a.velocity(), spin, at_a)
+            bias = _plus_cross(a.bias(), a.spin_bias(), at_a)
+            bias = _to_world(Ra, _plus_cross(bias, spin, speed))
+            if ground:
+                bias = _minus(bias, b.bias())  # the ground's is -gravity, as in every body's
+            else:
+                spin = b.spin()
+                sx, sy, sz = _from_world(Rb, _to_world(Ra, speed))
+                cx, cy, cz = _plus_cross(b.velocity(), spin, at_b)
+                # omega_b x (carried + 2 r), r = speed - carried
+                twice = (2.0 * sx - cx, 2.0 * sy - cy, 2.0 * sz - cz)
+                carried = _plus_cross(b.bias(), b.spin_bias(), at_b)
+                bias = _minus(_from_world(Rb, bias), _plus_cross(carried, spin, twice))
+        else:
+            bias = (0.0, 0.0, 0.0)
+        p = _minus(at_b, self._at_b)
+        for d in self._d:
+            e = d if ground else _to_world(Rb, d)
+            out += e
+            out += cross3(x, e)
+            out += _dot(d, p), _dot(d, bias)
+
+    def _alignments(self, with_bias: bool, out: list[float]) -> None:
+        a, b = self._a, self._b
+        Ra, Rb = a.rotation(), b.rotation()
+        if with_bias:
+            carried = b.spin()
+            spin = _from_world(Rb, _to_world(Ra, a.spin()))
+            w = _minus(spin, carried)
+            bias = _minus(_from_world(Rb, _to_world(Ra, a.spin_bias())), b.spin_bias())
+            bias = _minus(bias, cross3(carried, spin))
+        else:
+            w = bias = (0.0, 0.0, 0.0)
+        for u, n in self._un:
+            m = _from_world(Rb, _to_world(Ra, u))
+            out += 0.0, 0.0, 0.0
+            out += _to_world(Rb, cross3(m, n))
+            out += _dot(n, m), _dot(n, _plus_cross(cross3(bias, m), w, cross3(w, m)))
 
 
 class LoopKinematics:
@@ -126,9 +260,15 @@ class LoopKinematics:
             m += resolved.count
             if resolved.count:
                 self._loops.append(resolved)
-        self.g = np.zeros(m)
+        self._numbers = np.zeros(8 * m)
+        table = self._numbers.reshape(m, 8)
+        self._wrenches, self.g, self.bias = table[:, :6], table[:, 6], table[:, 7]
         self.G = np.zeros((m, model.nv))
-        self.bias = np.zeros(m)
+        self._support = np.zeros((m, model.nv))
+        for resolved in self._loops:
+            first = resolved.first_row
+            self._support[first : first + resolved.count] = resolved.support
+        self._data: pin.Data | None = None
 
     def constants(self) -> list[dict[str, Any]]:
         """What the compiled kernel needs of each closure."""
@@ -140,40 +280,17 @@ class LoopKinematics:
         ``data`` must hold crba in the WORLD convention (placements, world Jacobian) and, for the
         bias, nonLinearEffects (velocities, bias accelerations) at the current state.
         """
-        J = world_jacobian(data)
-        oMi, v, a = data.oMi, data.v, data.a_gf
+        if data is not self._data:
+            self._data, self._J = data, world_jacobian(data)
+            for loop in self._loops:
+                loop.bind(data)
+        numbers: list[float] = []
         for loop in self._loops:
-            ja, jb = loop.joint_a, loop.joint_b
-            Ta = oMi[ja] * loop.in_a if ja else loop.in_a
-            Tb = oMi[jb] * loop.in_b if jb else loop.in_b
-            H = pin.SE3(Tb.rotation, Ta.translation)
-            X = H.toActionMatrixInverse()
-            rows = loop.position_slice
-            if with_bias:
-                # a_gf carries -gravity on every body and on the ground: it cancels here.
-                if jb == 0:
-                    W = H.actInv(oMi[ja].act(v[ja]))
-                    B = H.actInv(oMi[ja].act(a[ja]) - a[0])
-                else:
-                    Va, Vb = oMi[ja].act(v[ja]), oMi[jb].act(v[jb])
-                    W = H.actInv(Va - Vb)
-                    B = H.actInv(oMi[ja].act(a[ja]) - oMi[jb].act(a[jb]) - Vb.cross(Va))
-            if len(loop.directions):
-                self.g[rows] = loop.directions @ Tb.actInv(Ta.translation)
-                self.G[rows] = ((loop.directions @ X[:3]) @ J) * loop.support
-                if with_bias:  # classicAcceleration: B_lin + w x r
-                    self.bias[rows] = loop.directions @ pin.classicAcceleration(W, B)
-            if loop.alignments:
-                R = Tb.rotation.T @ Ta.rotation
-                XJ = (X[3:] @ J) * loop.support
-                if with_bias:
-                    w, angular = W.angular.tolist(), B.angular.tolist()
-                for k, (u, n) in enumerate(loop.alignments, loop.alignment_start):
-                    m = R @ u
-                    self.g[k] = n @ m
-                    self.G[k] = cross(m, n) @ XJ
-                    if with_bias:
-                        self.bias[k] = n @ (cross(angular, m) + cross(w, cross(w, m)))
+            loop.evaluate(with_bias, numbers)
+        self._numbers[:] = numbers
+        G = self.G
+        np.dot(self._wrenches, self._J, G)
+        np.multiply(G, self._support, G)
 
 
 def closure_errors(

@@ -30,13 +30,14 @@ from srm_mbs.systems.charts import (
 )
 from srm_mbs.systems.forces import COINCIDENT, ForceKinematics
 from srm_mbs.systems.loops import LoopKinematics
-from srm_mbs.systems.projection import Projection
+from srm_mbs.systems.projection import Projection, unwhiten
 from srm_mbs.systems.units import row_units
 
 Controller = Callable[[float, FloatArray, FloatArray], Any]
 """(t, q, v) -> generalised forces tau (nv,), N and N m."""
 
 _WORLD = pin.Convention.WORLD
+_sum_of_sizes = blas.dasum
 _OVERFLOW = 1e100
 """Size of a state from which products of its rates may overflow."""
 
@@ -68,6 +69,7 @@ class _Mechanics:
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
         self._position_of: IndexArray = mechanism.derived("position_of", self._vector_coordinates)
+        self._caps = np.concatenate([self._unit, np.full(self.nv, np.inf)])
 
     def _vector_coordinates(self) -> IndexArray:
         """Index into q of each velocity component, -1 where q is not a vector space there."""
@@ -185,7 +187,7 @@ class _Mechanics:
 
     def rate_change(self, delta: FloatArray) -> FloatArray:
         """(dv, 0); see :class:`~srm_mbs.systems.base.System`."""
-        out = np.zeros_like(delta)
+        out: FloatArray = np.zeros(delta.shape)
         out[..., : self.nv] = delta[..., self.nv :]
         return out
 
@@ -198,6 +200,9 @@ class _Mechanics:
 
         Angles are capped at 1 rad so that the accuracy does not decay with winding.
         """
+        if self._flat:
+            sizes: FloatArray = np.minimum(np.abs(state), self._caps)
+            return sizes
         q, v = self.split(state)
         position = self._unit.copy()
         vector = self._position_of >= 0
@@ -300,18 +305,12 @@ class _ClosedTerms:
         self._gap_scale = gap_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
-
-    @property
-    def sigma(self) -> float:
-        return self._p.sigma
+        self.sigma = projection.sigma
+        self.weak = projection.weak
 
     @property
     def rank(self) -> int:
         return self._p.rank
-
-    @property
-    def weak(self) -> bool:
-        return self._p.weak
 
     def _completed(self, white: FloatArray) -> FloatArray:
         """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
@@ -334,9 +333,10 @@ class _ClosedTerms:
     def rate(self) -> FloatArray:
         p = self._p
         nv = self.v.size
+        white = p.white_multiplier if self.predicted is None else self._white_multiplier()
         out = np.empty(2 * nv)
         out[:nv] = self.v
-        out[nv:] = p.unwhiten(p.white_force - self._white_multiplier())
+        out[nv:] = unwhiten(p.U, p.white_force - white)
         return out
 
     def multiplier(self) -> FloatArray:
@@ -385,6 +385,7 @@ class ClosedSystem(_Mechanics):
         unit = row_units(mechanism.loops, structure.units.length)
         self._gap_scale = (structure.row_scale / unit)[structure.kept]
         self.projection = Projection(structure.rank, structure.sigma_ref)
+        self._M = self.data.M  # a view on what crba writes
         self._terms = _ClosedTerms(self.projection, self.loops, self._gap_scale)
 
     def constants(self) -> dict[str, Any]:
@@ -416,7 +417,7 @@ class ClosedSystem(_Mechanics):
         """
         self.evaluations += 1
         # First, because LAPACK may factorise what is not finite without reporting it.
-        if not blas.dasum(state) < _OVERFLOW:
+        if not _sum_of_sizes(state) < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
         model, data, nq = self.model, self.data, self.nq
         q, v = state[:nq], state[nq:]
@@ -430,9 +431,12 @@ class ClosedSystem(_Mechanics):
         loops = self.loops
         loops.update(data)
         projection = self.projection
-        projection.factor(data.M, loops.G, f, loops.bias, None if zone is None else zone.threshold)
+        threshold = None if zone is None else zone.threshold
+        projection.factor(self._M, loops.G, f, loops.bias, threshold)
         terms = self._terms
         terms.v = v
+        terms.sigma = projection.sigma
+        terms.weak = projection.weak
         terms.predicted = None
         if projection.weak and zone is not None:
             terms.predicted = zone.predict(t)

@@ -16,10 +16,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.errors import EvaluationError
+
+# With positional arguments, because a keyword costs as much as the algebra of a small stage:
+# dtrtrs(triangle, right, lower, trans, unitdiag, lda, overwrite), dgeqp3(W, lwork, overwrite),
+# dgemv(alpha, a, x, beta, y, offset and increment of x and y, trans).
+_dgemv = blas.dgemv
+_dpotrf, _dtrtrs = lapack.dpotrf, lapack.dtrtrs
+_dgeqp3, _dorgqr = lapack.dgeqp3, lapack.dorgqr
 
 PIVOT_ZERO = 1e-13
 """Pivots (of scaled rows) below this are zero."""
@@ -33,7 +40,7 @@ def cholesky(M: FloatArray) -> FloatArray:
     EvaluationError
         If M is not positive definite or not finite.
     """
-    U, info = lapack.dpotrf(M, lower=0)
+    U, info = _dpotrf(M)  # lower=0
     if info != 0:
         raise EvaluationError(
             "the mass matrix is not positive definite or not finite "
@@ -44,17 +51,17 @@ def cholesky(M: FloatArray) -> FloatArray:
 
 def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
     """L^-1 right = U^-T right."""
-    return lapack.dtrtrs(U, right, lower=0, trans=1)[0]  # type: ignore[no-any-return]
+    return _dtrtrs(U, right, 0, 1)[0]  # type: ignore[no-any-return]
 
 
 def unwhiten(U: FloatArray, right: FloatArray) -> FloatArray:
     """L^-T right = U^-1 right."""
-    return lapack.dtrtrs(U, right, lower=0, trans=0)[0]  # type: ignore[no-any-return]
+    return _dtrtrs(U, right)[0]  # type: ignore[no-any-return]
 
 
 def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
     """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (k,)."""
-    packed, permutation, tau, _, _ = lapack.dgeqp3(W)
+    packed, permutation, tau, _, _ = _dgeqp3(W)
     return packed, permutation - 1, tau, np.abs(packed.diagonal())
 
 
@@ -82,6 +89,22 @@ class Projection:
         self.rank = rank
         self.weak = False
         self.held: FloatArray | None = None
+        self._allocate(0, 0)
+
+    def _allocate(self, m: int, nv: int) -> None:
+        """Workspace of :meth:`factor` for m rows: (G, f) and gamma."""
+        self._right = np.empty((m + 1, nv))
+        self._rows, self._force = self._right[:m], self._right[m]
+        self._white = self._right.T
+        self._W = self._white[:, :m]
+        self._permuted = np.zeros(m + 1)
+        self._gamma = self._permuted[1:]
+
+    @property
+    def order(self) -> IndexArray:
+        """The rows in use (rank,), by falling pivot."""
+        order: IndexArray = self._permutation - 1
+        return order
 
     def factor(
         self,
@@ -97,30 +120,36 @@ class Projection:
         structural pivots.
         """
         self.factorisations += 1
-        m = G.shape[0]
+        m, nv = G.shape
+        if self._right.shape != (m + 1, nv):
+            self._allocate(m, nv)
         U = self.U = cholesky(M)
-        right = np.empty((f.size, m + 1), order="F")
-        right[:, :m] = G.T
-        right[:, m] = f
-        white = whiten(U, right)
-        self.white_force = white[:, m]
-        W = white[:, :m]
-        packed, permutation, tau, pivots = pivoted_qr(W)
+        self._rows[:] = G
+        self._force[:] = f
+        # Both overwrite their argument: from here on _force is L^-1 f, and _W first W, then its QR.
+        _dtrtrs(U, self._white, 0, 1, 0, nv, 1)
+        force = self.white_force = self._force
+        self._gamma[:] = _dgemv(1.0, self._W, force, 1.0, bias, 0, 1, 0, 1, 1)  # W^T force + bias
+        packed, permutation, tau, _, _ = _dgeqp3(self._W, 3 * m + 3, 1)
         structural = self.structural_rank
-        self.sigma = float(pivots[structural - 1]) / self.sigma_ref
+        pivot = abs(packed.item(structural - 1, structural - 1))
+        self.sigma = pivot / self.sigma_ref
         if not self.sigma >= 0.0:
             raise EvaluationError("the mass matrix or the closures are not finite")
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
         rank = structural
-        while rank > 0 and not pivots[rank - 1] >= floor:
+        while rank > 0 and not abs(packed.item(rank - 1, rank - 1)) >= floor:
             rank -= 1
         self.rank = rank
         self.weak = rank < structural
-        self.order = permutation[:rank]
-        self.R = packed[:rank, :rank]
-        self.Q = lapack.dorgqr(packed[:, :rank], tau[:rank])[0] if rank else packed[:, :0]
+        if rank < m:
+            packed, permutation, tau = packed[:, :rank], permutation[:rank], tau[:rank]
+        self._permutation = permutation
+        self.R = packed
+        self.Q: FloatArray = _dorgqr(packed, tau)[0] if rank else packed
         self.held = None
-        self.white_multiplier = self.normal((W.T @ self.white_force + bias)[self.order])
+        # LAPACK counts rows from 1, and so does _permuted.
+        self.white_multiplier = self.normal(self._permuted.take(permutation))
 
     def hold(self, normals: FloatArray) -> None:
         """Keep the motion tangential to the last of ``normals`` (nv, k) in place of the dropped
@@ -142,8 +171,8 @@ class Projection:
         """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
         if self.rank == 0:
             return np.zeros(self.U.shape[0])
-        z: FloatArray = lapack.dtrtrs(self.R, right, lower=0, trans=1)[0]
-        return self.Q @ z
+        out: FloatArray = self.Q.dot(_dtrtrs(self.R, right, 0, 1)[0])
+        return out
 
     def unwhiten(self, right: FloatArray) -> FloatArray:
         """L^-T right."""
@@ -151,8 +180,8 @@ class Projection:
 
     def white_project(self, w: FloatArray) -> FloatArray:
         """Q Q^T L^T w (nv,), held normals included."""
-        white = self.U @ w
-        out: FloatArray = self.Q @ (self.Q.T @ white)
+        white = self.U.dot(w)
+        out: FloatArray = self.Q.dot(white.dot(self.Q))
         return out if self.held is None else out + self.held @ (self.held.T @ white)
 
     def project(self, w: FloatArray) -> FloatArray:

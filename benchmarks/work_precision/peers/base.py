@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.work_precision.problems.base import SAMPLES, Problem
 
 Array = Any
-TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 SUBSTEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Fixed steps are the distance of two samples divided by these."""
 

@@ -112,7 +112,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
     ) -> Any:
         return step_size_control(method.scheme, 0.0, t_end, step, first_step), ()
 
-    def start(system: Any, method: Any, t: float, state: Any, norm: Any, t_end: float) -> Memory:
+    def start(system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any) -> Memory:
         return method.start(system, t, state, norm)  # type: ignore[no-any-return]
 
     with (

@@ -70,7 +70,7 @@ class BranchGuard:
 
     def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
         """The inner proposal, halved after a passage that has to be redone."""
-        return self._inner.propose(t, min(limit, self._limit), memory)
+        return self._inner.propose(t, limit if limit < self._limit else self._limit, memory)
 
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a step whose velocity turned; otherwise the inner control's verdict."""

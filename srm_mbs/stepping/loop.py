@@ -247,10 +247,10 @@ class Closures:
 
     def trouble(self, result: StepResult) -> str:
         """What is wrong with the closures at the end of a step; empty if nothing is."""
-        if not result.correction.size:
-            return ""
         # Far from everything singular, a step within the tolerance has a correction to match.
         if result.quiet and 0.0 < result.error_ratio <= 1.0 and result.gap <= self._seen:
+            return ""
+        if not result.correction.size:
             return ""
         large = not (np.abs(result.correction) < self._large).all() or not result.gap < LOST
         # With every structural row in use the correction closes all rows, or the rank is wrong.

@@ -120,11 +120,13 @@ class SingularityPlacement:
         """The inner proposal, shortened where a stage would come too close."""
         if self._redo is not None:
             limit = min(limit, self._redo)
-        if self.adaptive and self._slope > 0.0:
-            limit = min(limit, SIGMA_CHANGE / self._slope)
-        memory.sigma_slope = self._slope
+        slope = memory.sigma_slope = self._slope
+        if slope > 0.0 and self.adaptive:
+            longest = SIGMA_CHANGE / slope
+            if longest < limit:
+                limit = longest
         proposal = self._inner.propose(t, limit, memory)
-        if self._redo is None and self._zero is not None and self._zero > t:
+        if self._zero is not None and self._redo is None and self._zero > t:
             h = self._placed(self._zero - t, proposal.h, t)
             if h != proposal.h:
                 self.placed += 1
@@ -183,7 +185,8 @@ class SingularityPlacement:
         self._redo = None
         self._redone = 0
         if verdict is Verdict.ACCEPTED and result is not None:
-            self._slope = max(slope, 0.5 * self._slope)
+            slowest = 0.5 * self._slope
+            self._slope = slope if slope > slowest else slowest
             ahead = None if result.quiet else zero_ahead(*self._middle, result.sigmas)
             self._zero = None if ahead is None else result.t + h * ahead
         return verdict

@@ -2,11 +2,12 @@
 
     python -m benchmarks.singular_cost [--repeats 15] [--json FILE]
 
-Run from a checkout; BLAS runs on one thread.  The Python reference is measured: in the compiled
-kernel the measures cannot be left out.  Regular mechanisms are run as they are, and with
+Run from a checkout; BLAS runs on one thread.  Regular mechanisms are run as they are, and with
 placement, the guard of the branch, the zone with its history, stages on the branch, the watch
-over closure errors and the look for bifurcations all left out.  The two take the same
-steps, which is checked; the runs alternate; times are CPU times of the process.
+over closure errors and the look for bifurcations all left out: on the Python reference by a step
+without them, on the compiled kernel by constants that never let them begin (it still follows the
+slope of sigma).  The two take the same steps, which is checked; the runs alternate; times are CPU
+times of the process.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -25,7 +27,7 @@ from unittest.mock import patch
 import numpy as np
 
 import srm_mbs as srm
-from srm_mbs import simulation
+from srm_mbs import kernel, simulation
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods import psrm
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
@@ -41,6 +43,8 @@ CASES = (
     ("five_bar", 6.0),
 )
 RUNS = (("dop853", 1e-8), ("dopr54", 1e-8))
+KERNEL_REPEATS = 10
+"""Runs on the kernel per run in Python: they are that much shorter."""
 
 
 def plain_start(system: System, t: float, state: FloatArray) -> Memory:
@@ -127,6 +131,20 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         yield
 
 
+NEVER = {"watched": -1.0, "far": 0.0, "gap_every": -(2**31 - 1)}
+"""Constants of the kernel with which no step is looked at."""
+
+
+@contextmanager
+def nothing_on_the_kernel() -> Iterator[None]:
+    """The same for the kernel, together with ``placement="off"``."""
+    with (
+        patch.dict(kernel.CONSTANTS, NEVER),
+        patch.object(simulation, "_bifurcations", lambda _: ""),
+    ):
+        yield
+
+
 @dataclass(frozen=True)
 class Row:
     """CPU times (s) of one mechanism with everything and without, and their ratio.
@@ -135,6 +153,7 @@ class Row:
     followed each other.
     """
 
+    backend: str
     mechanism: str
     tableau: str
     evaluations: int
@@ -146,15 +165,23 @@ class Row:
     ratios: tuple[float, float, float]
 
 
-def measure(name: str, t_end: float, tableau: str, tol: float, repeats: int) -> Row:
+def measure(backend: str, name: str, t_end: float, tableau: str, tol: float, repeats: int) -> Row:
     mechanism = srm.load(name)
+    nothing = {"python": nothing_for_singular_configurations, "kernel": nothing_on_the_kernel}
+    off = {"python": "automatic", "kernel": "off"}
 
     def run(everything: bool) -> tuple[float, srm.Solution]:
-        without = nullcontext() if everything else nothing_for_singular_configurations()
-        start = time.process_time()
-        with without:
-            solution = srm.simulate(mechanism, t_end, tableau=tableau, rtol=tol, backend="python")
-        return time.process_time() - start, solution
+        with nullcontext() if everything else nothing[backend]():
+            start = time.process_time()
+            solution = srm.simulate(
+                mechanism,
+                t_end,
+                tableau=tableau,
+                rtol=tol,
+                backend=backend,
+                placement="automatic" if everything else off[backend],
+            )
+            return time.process_time() - start, solution
 
     both = [run(everything)[1] for everything in (True, False)]
     evaluations = [solution.stats.evaluations for solution in both]
@@ -167,6 +194,7 @@ def measure(name: str, t_end: float, tableau: str, tol: float, repeats: int) -> 
     ratios = [a / b for a, b in zip(times[True], times[False])]
     low, middle, high = statistics.quantiles(ratios, n=4)
     return Row(
+        backend,
         name,
         tableau,
         evaluations[0],
@@ -185,19 +213,22 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     rows = []
-    print("| mechanism | tableau | evaluations | least (ms) | without | ratio | quartiles |")
-    print("|---|---|---|---|---|---|---|")
-    for name, t_end in CASES:
-        for tableau, tol in RUNS:
-            row = measure(name, t_end, tableau, tol, arguments.repeats)
-            rows.append(row)
-            quartiles = " ".join(f"{ratio:.3f}" for ratio in row.ratios)
-            print(
-                f"| {row.mechanism} | {row.tableau} | {row.evaluations} "
-                f"| {1e3 * row.least_with:.1f} | {1e3 * row.least_without:.1f} "
-                f"| {row.ratio:.3f} | {quartiles} |",
-                flush=True,
-            )
+    print(
+        "| backend | mechanism | tableau | evaluations | least (ms) | without | ratio | quartiles |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    backends = ("kernel", "python") if kernel.core is not None else ("python",)
+    for backend, (name, t_end), (tableau, tol) in product(backends, CASES, RUNS):
+        repeats = arguments.repeats * (KERNEL_REPEATS if backend == "kernel" else 1)
+        row = measure(backend, name, t_end, tableau, tol, repeats)
+        rows.append(row)
+        quartiles = " ".join(f"{ratio:.3f}" for ratio in row.ratios)
+        print(
+            f"| {backend} | {row.mechanism} | {row.tableau} | {row.evaluations} "
+            f"| {1e3 * row.least_with:.2f} | {1e3 * row.least_without:.2f} "
+            f"| {row.ratio:.3f} | {quartiles} |",
+            flush=True,
+        )
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
 

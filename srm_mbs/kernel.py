@@ -60,7 +60,7 @@ def obstacle(method: Method, placement: str, singular_times: FloatArray) -> str:
     return ""
 
 
-_CONSTANTS = {
+CONSTANTS = {
     "watched": branch.WATCHED,
     "near": branch.NEAR,
     "far": split.FAR,
@@ -95,6 +95,7 @@ _CONSTANTS = {
     "lost": loop.LOST,
     "watched_steps": loop.WATCHED_STEPS,
 }
+"""Every number of the algorithm, from the module of the reference that has it."""
 
 
 def compiled(system: ClosedSystem | OpenSystem) -> Any:
@@ -241,7 +242,7 @@ class CompiledRun:
                     "gap_centres": gaps[:, 0].copy(),
                     "gap_half_widths": gaps[:, 1].copy(),
                 },
-                "constants": _CONSTANTS,
+                "constants": CONSTANTS,
                 "norm": {
                     "atol": np.ascontiguousarray(norm.atol),
                     "one": np.ascontiguousarray(norm.one),

@@ -25,6 +25,7 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
+from srm_mbs import kernel
 from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.multibody import make_system
 from tests import reduced
@@ -135,8 +136,9 @@ def measure(
     return rows
 
 
-def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float]:
-    """Least microseconds of one evaluation with its rate, and of the Pinocchio calls in it.
+def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float, float]:
+    """Least microseconds of one evaluation with its rate: on the kernel (NaN without one), in the
+    Python reference, and of the Pinocchio calls in the latter.
 
     The least, not the median: whatever else the machine does only adds.
     """
@@ -155,7 +157,12 @@ def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float]:
     def per_call(function: Callable[[], None], calls: int = 500) -> float:
         return 1e6 * min(timeit.repeat(function, number=calls, repeat=4 * repeats)) / calls
 
-    return per_call(whole), per_call(pinocchio_only)
+    inside = 2000
+    compiled = float("nan")
+    if kernel.core is not None:
+        twin = kernel.compiled(system)
+        compiled = per_call(lambda: twin.repeat(0.0, state, inside), 1) / inside
+    return compiled, per_call(whole), per_call(pinocchio_only)
 
 
 ORDER_PROBLEMS: tuple[tuple[str, str, float], ...] = (
@@ -241,11 +248,12 @@ def main() -> None:
     print("\nslider_crank: SciPy DOP853 on the index-1 equations leaves its branch at t =")
     print(", ".join(f"{t:.2f} s (tolerance {tol:g})" for tol, t in leaves.items() if t is not None))
     costs = {}
-    print("\n| mechanism | microseconds per evaluation | of which Pinocchio |")
-    print("|---|---|---|")
+    print("\n| mechanism | kernel (us per evaluation) | Python reference | Pinocchio from Python |")
+    print("|---|---|---|---|")
     for name in ("slider_crank", "four_bar", "n_four_bar_2", "spatial_four_bar", "pendulum_chain"):
         costs[name] = cost_per_evaluation(name, arguments.repeats)
-        print(f"| {name} | {costs[name][0]:.0f} | {costs[name][1]:.1f} |")
+        compiled, python, pinocchio = costs[name]
+        print(f"| {name} | {compiled:.2f} | {python:.0f} | {pinocchio:.1f} |")
     if arguments.json:
         record = {
             "machine": platform.machine(),

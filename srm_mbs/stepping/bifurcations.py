@@ -100,6 +100,38 @@ def _ranges(marked: list[int], steps: StepData) -> list[tuple[int, int]]:
     return out
 
 
+def _closest(watched: Watched, t: FloatArray) -> float:
+    """When, within the times t (SAMPLES,), sigma is smallest."""
+    sigma = watched.smallest(t)
+    k = int(np.argmin(sigma))
+    if 0 < k < SAMPLES - 1:
+        return watched.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])[0]
+    return float(t[k])
+
+
+def _turn(watched: Watched, t: FloatArray) -> float:
+    """When, within the times t (k,), the motion turns back."""
+    from scipy.optimize import brentq
+
+    unit = watched.geometry.unit
+
+    def rates(times: FloatArray) -> FloatArray:
+        return np.array([v for _, v in watched.states(times)]) / unit
+
+    ends = rates(t[[0, -1]])
+    direction = ends[0] - ends[1]
+
+    def along(time: float) -> float:
+        return float(rates(np.array([time]))[0] @ direction)
+
+    values = rates(t) @ direction
+    changes = np.flatnonzero(values[:-1] * values[1:] < 0.0)
+    if not len(changes):
+        return float(t[np.argmin(np.abs(values))])
+    k = int(changes[0])
+    return float(brentq(along, t[k], t[k + 1], xtol=1e-12 * (t[-1] - t[0]), rtol=1e-15))
+
+
 def find_bifurcations(
     system: OpenSystem | ClosedSystem,
     steps: StepData,
@@ -127,18 +159,16 @@ def find_bifurcations(
     watched = Watched(system, dense)
     for first, final in _ranges(marked, steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
-        sigma = watched.smallest(t)
-        k = int(np.argmin(sigma))
-        closest = float(t[k])
-        if 0 < k < SAMPLES - 1:
-            closest, _ = watched.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])
+        stayed = final > first or first in held
+        stopped = bool(stops and final == last)
+        # Where a motion turns back tells whether it had the momentum to pass: it may have passed
+        # and come back within the step.
+        closest = _closest(watched, t) if stayed or stopped else _turn(watched, t)
         q = watched.q(closest)
         singular = nearest_singular(watched.geometry, q, watched.rank, WITHIN)
         if singular is None:
             continue
         distance = float(np.linalg.norm(watched.geometry.difference(singular, q)))
-        stayed = final > first or first in held
-        stopped = bool(stops and final == last)
         if not (stayed or stopped or distance < UNDECIDED * rtol):
             continue
         begin, end = (float(t[0]), float(t[-1])) if stayed else (closest, closest)

@@ -37,6 +37,8 @@ PARTICIPATES = 1e-6
 BRANCH_ITERATIONS = 8
 SEARCH_ITERATIONS = 20
 SEARCH_DIFFERENCE = 1e-6
+NEARER = 1e-3
+"""Part by which a singular configuration of higher rank must be nearer to be another one."""
 WEAK_FACTORS = (10.0, 3.0, 1.0)
 """Singular values up to these multiples of the smallest may vanish together."""
 THIRD_ORDER = ((1, 45.0 / 60.0), (2, -9.0 / 60.0), (3, 1.0 / 60.0))
@@ -150,7 +152,8 @@ def nearest_singular(
         found = sharpened(geometry, q, rank, reach, closed=1e-14)
         if found is not None:
             away = float(np.linalg.norm(geometry.difference(q, found)))
-            if away < (1.0 - 1e-6) * distance:
+            # A search for a higher rank ends next to the same configuration, less accurately.
+            if away < (1.0 - NEARER) * distance:
                 best, distance = found, away
     return best
 

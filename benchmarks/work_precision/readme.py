@@ -75,6 +75,9 @@ def block(results: Results, figure: str) -> str:
     """What stands between the marks; ``figure`` is the path of the picture from the README."""
     versions = results.versions
     names = ("pin", "mujoco", "exudyn", "scikit-sundae", "scipy-dae", "scipy")
+    limit = results.settings.get("limit")
+    option = "" if limit is None else f" --limit {limit:g}"
+    until = "" if limit is None else f" with runs of up to {limit:g} s"
     listed = ", ".join(f"{name} {versions[name]}" for name in names if versions.get(name))
     return "\n".join(
         [
@@ -83,12 +86,12 @@ def block(results: Results, figure: str) -> str:
             "",
             table(results),
             "",
-            f"`srm-mbs benchmark --out DIR` measures this (least of "
+            f"`srm-mbs benchmark --out DIR --sections work{option}` measures this (least of "
             f"{results.settings['repeats']} runs, one thread, {results.machine['processor']}, "
             f"{listed}): integration and output at 100 times, the error is the largest over them. "
             "A setting counts for an error only if it and every tighter one reach it. Ours is the "
             "default, the others are the best of their variants (Baumgarte rates, softness); a "
-            "dash: not reached.",
+            f"dash: not reached{until}.",
             END,
         ]
     )

@@ -28,9 +28,10 @@ PROBLEMS = {
     "pendulum_chain": 10.0,
 }
 FLOOR = 3e-10
-"""Largest effect of rounding seen on these runs and their references; the motion of the chain is
-chaotic and magnifies it to CHAIN_FLOOR."""
-CHAIN_FLOOR = 3e-5
+"""Largest effect of rounding seen on these runs and their references."""
+FLOORS = {"spatial_dead_point": 1e-9, "pendulum_chain": 3e-5}
+"""Where it is larger: eleven passages solved for next to them (up to 9.3e-10 over twenty tolerances
+around 1e-9, on either backend), and a chaotic motion."""
 
 
 def errors(name: str, tableau: str, tolerances: list[float]) -> np.ndarray:
@@ -46,7 +47,7 @@ def errors(name: str, tableau: str, tolerances: list[float]) -> np.ndarray:
 
 def check(name: str, tableau: str, tolerances: list[float]) -> None:
     found = errors(name, tableau, tolerances)
-    floor = CHAIN_FLOOR if name == "pendulum_chain" else FLOOR
+    floor = FLOORS.get(name, FLOOR)
     what = f"{name}, {tableau}: " + " ".join(f"{error:.1e}" for error in found)
     for looser, tighter in pairwise(found):
         assert tighter <= max(2.0 * looser, floor), what

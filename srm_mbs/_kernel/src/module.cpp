@@ -426,10 +426,8 @@ struct PyDense {
     nb::object states(const Array& t) {
         const auto k = t.size();
         std::vector<double> out(k * static_cast<std::size_t>(nx));
-        {
-            nb::gil_scoped_release released;
-            dense->states(t.data(), static_cast<long>(k), out.data());
-        }
+        // With the interpreter's lock held: threads may read one solution, and share its workspace.
+        dense->states(t.data(), static_cast<long>(k), out.data());
         return owned(std::move(out), {k, static_cast<std::size_t>(nx)});
     }
 };

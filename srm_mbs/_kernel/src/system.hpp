@@ -90,10 +90,7 @@ public:
 
     int nq, nv;
     long evaluations = 0;
-    Projection& projection() { return *projection_; }
     long factorisations() const { return closed_ ? projection_->factorisations : 0; }
-    const SystemData& data() const { return data_; }
-    const double* closure_errors() const { return g_.data(); }
 
 private:
     Pattern pattern() const;

@@ -94,6 +94,7 @@ class SpringDamper(ForceElement):
     """
 
     type: ClassVar[str] = "spring_damper"
+    has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
     stiffness: float = _in("N/m", 0.0)
@@ -180,6 +181,7 @@ class TorsionSpring(ForceElement):
     """
 
     type: ClassVar[str] = "torsion_spring"
+    has_potential: ClassVar[bool] = True
     joint: str
     stiffness: float = _in("N m/rad, N/m", 0.0)
     damping: float = _in("N m s/rad, N s/m", 0.0)
@@ -283,6 +285,7 @@ class Bushing(ForceElement):
     """
 
     type: ClassVar[str] = "bushing"
+    has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
     stiffness: Sequence[float] = _in("N/m, N m/rad", (0.0,) * 6)

@@ -195,9 +195,12 @@ class ForceElement(ABC):
         Its type in a description.
     name
         Unique name; by default made from the type and what the element acts on.
+    has_potential
+        Whether its force at rest follows from a potential, which ``solution.energy`` contains.
     """
 
     type: ClassVar[str]
+    has_potential: ClassVar[bool] = False
     name: str
 
     @abstractmethod

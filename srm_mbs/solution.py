@@ -25,6 +25,8 @@ from srm_mbs.systems.reactions import reactions_at
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from srm_mbs.analysis.energy_balance import EnergyBalance
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -280,13 +282,31 @@ class Solution:
         return np.array([self._system.energy(np.concatenate(x)) for x in zip(self.q, self.v)])
 
     @cached_property
-    def _reactions(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    def energy_balance(self) -> EnergyBalance:
+        """Energies and the works of everything that acts; see
+        :class:`srm_mbs.analysis.energy_balance.EnergyBalance`.
+
+        Raises
+        ------
+        InputError
+            For a loaded run that had a controller.
+        """
+        from srm_mbs.analysis.energy_balance import energy_balance
+
+        self._need_controller("energy balance")
+        return energy_balance(self, self._system)
+
+    def _need_controller(self, what: str) -> None:
         if self.settings.controlled and not self._system.controlled:
             raise InputError(
-                "the reactions of a loaded run with a controller cannot be computed: "
+                f"the {what} of a loaded run with a controller cannot be computed: "
                 "controllers are not saved",
-                remedy="Read solution.reactions before saving, or simulate again",
+                remedy="Read it before saving, or simulate again",
             )
+
+    @cached_property
+    def _reactions(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        self._need_controller("reactions")
         return reactions_at(self._system, self.t, self.q, self.v)
 
     @property

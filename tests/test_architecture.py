@@ -27,6 +27,7 @@ LAYERS = (
     ("storage",),
     ("options", "progress"),
     ("dae", "simulation"),
+    ("analysis",),
     ("plots", "visuals", "scene", "playback", "summary", "export"),
     ("cli",),
 )

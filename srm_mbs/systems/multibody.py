@@ -115,11 +115,25 @@ class _Mechanics:
             )
         return np.ascontiguousarray(tau)
 
+    def damping_force(self, v: FloatArray) -> FloatArray:
+        """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
+        if self._damping is None:
+            return np.zeros(v.shape)
+        out: FloatArray = -self._damping * v
+        return out
+
+    def friction_force(self, v: FloatArray) -> FloatArray:
+        """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
+        if self._friction is None:
+            return np.zeros(v.shape)
+        out: FloatArray = -self._friction * np.tanh(v / self._friction_speed)
+        return out
+
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
         """Controller, joint damping and joint friction (nv,); None if there is none of them."""
-        force = None if self._damping is None else -self._damping * v
+        force = None if self._damping is None else self.damping_force(v)
         if self._friction is not None:
-            rubbing = -self._friction * np.tanh(v / self._friction_speed)
+            rubbing = self.friction_force(v)
             force = rubbing if force is None else force + rubbing
         if self._controller is None:
             return force

@@ -1,0 +1,1 @@
+"""Around the simulation: energy balance, equilibria, linearisation, inverse dynamics, mobility."""

@@ -1,0 +1,153 @@
+r"""Energy balance of a run: what kinetic and potential energy gained is the work of what acts.
+
+    K + V - (K + V)(t_0) = sum of the works W_i,   W_i' = tau_i . v,
+
+with the works of the controller, of joint damping and friction, and of each force element (of
+springs and bushings the damping only: their potential is part of V).  Closures that do not depend
+on time do no work.  Each power is integrated by Gauss quadrature on the dense output, step by step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.solution import Solution
+from srm_mbs.systems.forces import ForceKinematics
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+
+NODES = 8
+"""Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
+
+Powers = dict[str, FloatArray]
+"""Power (n,) W of each thing that does work, by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyBalance:
+    """Energies and works over a run.
+
+    Attributes
+    ----------
+    t : (n,) s
+        The times of the solution.
+    kinetic, potential : (n,) J
+        Of the bodies; of gravity, springs and bushings.
+    works : {name: (n,) J}
+        Work done on the mechanism since the start of the run, by what does it: ``controller``,
+        ``joint damping``, ``joint friction``, ``force NAME``.
+    start
+        Energy (J) at the start of the run.
+    """
+
+    t: FloatArray
+    kinetic: FloatArray
+    potential: FloatArray
+    works: Mapping[str, FloatArray]
+    start: float
+
+    @property
+    def residual(self) -> FloatArray:
+        """Energy gained minus all works (n,) J: the error of the run, and of this balance."""
+        done: FloatArray = sum(self.works.values(), start=np.zeros(len(self.t)))
+        return self.kinetic + self.potential - self.start - done
+
+    @property
+    def scale(self) -> float:
+        """The energy (J) that took part: the largest of kinetic energy, change of potential energy
+        and each work."""
+        sizes = [self.kinetic, self.potential - self.potential[:1], *self.works.values()]
+        return max((float(np.abs(values).max(initial=0.0)) for values in sizes), default=0.0)
+
+    @property
+    def relative(self) -> float:
+        """Largest residual over the scale; 0 where nothing moved."""
+        largest = float(np.abs(self.residual).max(initial=0.0))
+        return largest / self.scale if self.scale else 0.0
+
+
+_System = OpenSystem | ClosedSystem
+
+
+def _controller(run: Solution, system: _System) -> Powers:
+    if not system.controlled:
+        return {}
+    states = zip(run.t, run.q, run.v)
+    return {"controller": np.array([system.controlled_force(*x) @ x[2] for x in states])}
+
+
+def _joints(run: Solution, system: _System) -> Powers:
+    model = run.mechanism.model
+    powers = {}
+    if np.any(model.damping):
+        powers["joint damping"] = (system.damping_force(run.v) * run.v).sum(axis=1)
+    if np.any(model.friction):
+        powers["joint friction"] = (system.friction_force(run.v) * run.v).sum(axis=1)
+    return powers
+
+
+def _elements(run: Solution, system: _System) -> Powers:
+    """Of springs and bushings what is left when their force at rest is taken off."""
+    mechanism = run.mechanism
+    model, data = mechanism.model, mechanism.model.createData()
+    rest = np.zeros(model.nv)
+    elements = [ForceKinematics(model, [force]) for force in mechanism.forces]
+    names = [f"force {force.name}" for force in mechanism.forces]
+    powers = {name: np.zeros(len(run.t)) for name in names}
+    for i, (q, v) in enumerate(zip(run.q, run.v)):
+        pin.computeJointJacobians(model, data, q)
+        for velocity, sign in ((v, 1.0), (rest, -1.0)):
+            pin.forwardKinematics(model, data, q, velocity)
+            for name, force, element in zip(names, mechanism.forces, elements):
+                if sign > 0.0 or force.has_potential:
+                    powers[name][i] += sign * (element.generalised(data, q, velocity) @ v)
+    # An undamped spring does no other work.
+    return {
+        name: powers[name]
+        for name, force in zip(names, mechanism.forces)
+        if not force.has_potential or np.any(getattr(force, "damping", 1.0))
+    }
+
+
+TERMS: tuple[Callable[[Solution, _System], Powers], ...] = (_controller, _joints, _elements)
+"""Everything that does work beside the potentials; what is new is added here."""
+
+
+def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
+    """The balance of ``solution`` at its times; ``system`` is the one that made it.
+
+    Raises
+    ------
+    EvaluationError
+        If a force cannot be evaluated.
+    """
+    times = solution.steps.times
+    ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
+    if times[0] < ends[0]:
+        ends = np.concatenate([times[:1], ends])
+    points, weights = np.polynomial.legendre.leggauss(NODES)
+    lengths = np.diff(ends)
+    nodes = ends[:-1, None] + 0.5 * (points + 1.0) * lengths[:, None]
+    run = solution.at(nodes.ravel())
+    works = {}
+    place = np.searchsorted(ends, solution.t)
+    for term in TERMS:
+        for name, power in term(run, system).items():
+            pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
+            works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
+    model = solution.mechanism.model
+    data = model.createData()
+    kinetic = np.array(
+        [pin.computeKineticEnergy(model, data, *x) for x in zip(solution.q, solution.v)]
+    )
+    return EnergyBalance(
+        solution.t,
+        kinetic,
+        solution.energy - kinetic,
+        works,
+        float(system.energy(solution.steps.states[0])),
+    )

@@ -1,0 +1,162 @@
+"""What energy a run gained is the work of everything that acted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import srm_mbs as srm
+from srm_mbs.analysis import energy_balance
+from tests.mechanisms import rod
+from tests.reduced import G
+
+
+def changed(name: str, damping=None, friction=None, forces=()) -> srm.Mechanism:
+    """A bundled mechanism with joint damping, joint friction or force elements."""
+    bundled = srm.load(name)
+    model = bundled.model.copy()
+    if damping is not None:
+        model.damping = np.array(damping)
+    if friction is not None:
+        model.friction = np.array(friction)
+    return srm.Mechanism(
+        model,
+        bundled.loops,
+        q0=bundled.q0,
+        v0=bundled.v0,
+        forces=forces or bundled.forces,
+        friction_speed=0.05,
+    )
+
+
+def push(t: float, q: np.ndarray, v: np.ndarray) -> list[float]:
+    return [5.0 * np.sin(3.0 * t) - 0.2 * v[0], 0.3, *np.zeros(len(v) - 2)]
+
+
+COUPLER = srm.Anchor("coupler", xyz=(0.7, 0.1, 0.2))
+GROUND = srm.Anchor("world", xyz=(0.4, -1.0, 0.8))
+ELEMENTS: dict[str, srm.ForceElement] = {
+    "spring_damper": srm.SpringDamper(
+        COUPLER, GROUND, stiffness=20.0, damping=1.5, rest_length=0.5, name="it"
+    ),
+    "torsion_spring": srm.TorsionSpring("crank", 3.0, 0.2, 0.4, name="it"),
+    "torque": srm.JointTorque("crank", 0.7, name="it"),
+    "wrench": srm.Wrench(COUPLER, (0.3, 0.0, 1.0), (0.1, 0.4, 0.2), "link", name="it"),
+    "bushing": srm.Bushing(
+        COUPLER, GROUND, (5.0, 6.0, 7.0, 0.1, 0.2, 0.3), (0.3, 0.2, 0.1, 0.02, 0.03, 0.04), "it"
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "t_end"),
+    [
+        ("squeezing_mechanism", 0.03),
+        ("four_bar", 2.0),
+        ("slider_crank", 3.0),
+        ("spatial_four_bar", 2.0),
+        ("n_four_bar_2", 3.0),
+    ],
+)
+def test_it_closes_on_the_bundled_mechanisms(name: str, t_end: float) -> None:
+    balance = srm.simulate(srm.load(name), t_end, rtol=1e-10).energy_balance
+    assert balance.scale > 0.1
+    assert balance.relative < 1e-10
+
+
+@pytest.mark.parametrize("name", ["slider_crank_regular", "slider_crank"])
+def test_it_closes_with_damping_friction_and_a_controller(name: str) -> None:
+    mechanism = changed(name, damping=[0.3, 0.2], friction=[0.5, 0.1])
+    balance = srm.simulate(mechanism, 2.0, rtol=1e-10, controller=push).energy_balance
+    assert set(balance.works) == {"controller", "joint damping", "joint friction"}
+    assert all(np.abs(work).max() > 0.05 for work in balance.works.values())
+    assert balance.relative < 1e-10
+
+
+@pytest.mark.parametrize("kind", srm.FORCE_TYPES)
+def test_it_closes_with_every_force_element(kind: str) -> None:
+    mechanism = changed("spatial_four_bar", forces=(ELEMENTS[kind],))
+    balance = srm.simulate(mechanism, 1.5, rtol=1e-10).energy_balance
+    assert np.abs(balance.works["force it"]).max() > 1e-3
+    assert balance.relative < 1e-10
+
+
+@pytest.mark.parametrize("left_out", energy_balance.TERMS, ids=lambda term: term.__name__)
+def test_a_missing_term_opens_it(left_out, monkeypatch: pytest.MonkeyPatch) -> None:
+    spring = srm.SpringDamper(
+        srm.Anchor("rod", xyz=(1.0, 0.0, 0.0)), GROUND, stiffness=3.0, damping=0.5, rest_length=0.2
+    )
+    mechanism = changed("slider_crank_regular", [0.3, 0.2], [0.5, 0.1], (spring,))
+    solution = srm.simulate(mechanism, 1.0, rtol=1e-10, controller=push)
+    kept = tuple(term for term in energy_balance.TERMS if term is not left_out)
+    monkeypatch.setattr(energy_balance, "TERMS", kept)
+    assert solution.energy_balance.relative > 1e-3
+
+
+def test_works_are_those_of_the_pendulum_equation() -> None:
+    """theta'' I = -m g l/2 cos theta - d w - F tanh(w/v_s) + u(t), works as further states."""
+    model = pin.Model()
+    model.name = "pendulum"
+    joint = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "hinge")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    model.damping = np.array([0.1])
+    model.friction = np.array([0.2])
+    mechanism = srm.Mechanism(model, q0=[0.3], v0=[2.0], friction_speed=0.1)
+
+    def torque(t: float) -> float:
+        return float(np.sin(2.0 * t))
+
+    def field(t: float, y: np.ndarray) -> list[float]:
+        theta, w = y[:2]
+        damping, friction = -0.1 * w, -0.2 * np.tanh(w / 0.1)
+        # RY turns x towards -z
+        pull = 0.5 * G * np.cos(theta)
+        return [
+            w,
+            3.0 * (pull + damping + friction + torque(t)),
+            damping * w,
+            friction * w,
+            torque(t) * w,
+        ]
+
+    times = np.linspace(0.3, 2.0, 7)
+    exact = solve_ivp(
+        field, (0.0, 2.0), [0.3, 2.0, 0, 0, 0], "DOP853", times, rtol=1e-12, atol=1e-13
+    ).y
+    solution = srm.simulate(
+        mechanism, 2.0, rtol=1e-11, controller=lambda t, q, v: [torque(t)], t_eval=times
+    )
+    balance = solution.energy_balance
+    for k, name in enumerate(("joint damping", "joint friction", "controller")):
+        np.testing.assert_allclose(balance.works[name], exact[2 + k], rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(balance.kinetic, exact[1] ** 2 / 6.0, rtol=1e-9)
+    assert np.abs(balance.residual).max() < 1e-10
+
+
+def test_it_can_be_read_at_any_times_and_ends_at_a_terminal_event() -> None:
+    mechanism = changed("slider_crank_regular", damping=[0.3, 0.2])
+
+    def slow(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        return float(v[0] - 3.9)
+
+    slow.terminal = True
+    solution = srm.simulate(mechanism, 5.0, rtol=1e-10, events=[slow])
+    assert solution.status == "event"
+    whole = solution.energy_balance
+    assert whole.relative < 1e-10
+    some = solution.at(solution.t[[2, 0, 1]]).energy_balance
+    np.testing.assert_allclose(
+        some.works["joint damping"], whole.works["joint damping"][[2, 0, 1]], rtol=1e-13
+    )
+
+
+def test_a_loaded_run_with_a_controller_says_why_it_has_none(tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load("slider_crank_regular"), 0.1, controller=push)
+    solution.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    with pytest.raises(srm.InputError, match="energy balance of a loaded run with a controller"):
+        loaded.energy_balance  # noqa: B018

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -367,17 +368,10 @@ class Mechanism:
         _check_order(model)
         set_(self, "loops", tuple(self.loops))
         set_(self, "name", self.name or model.name)
-        q0 = pin.neutral(model) if self.q0 is None else self.q0
-        v0 = np.zeros(model.nv) if self.v0 is None else self.v0
-        q0 = _frozen_array(q0, (model.nq,), "q0")
-        if not pin.isNormalized(model, q0, 1e-9):
-            raise InputError(
-                "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
-                element="q0",
-                remedy="Use pinocchio.normalize(model, q0)",
-            )
-        set_(self, "q0", q0)
-        set_(self, "v0", _frozen_array(v0, (model.nv,), "v0"))
+        self._take_start(
+            pin.neutral(model) if self.q0 is None else self.q0,
+            np.zeros(model.nv) if self.v0 is None else self.v0,
+        )
         _check_names("loop", [loop.name for loop in self.loops])
         for loop in self.loops:
             resolve_apart(model, loop.a, loop.b, f"loop {loop.name!r}")
@@ -402,11 +396,26 @@ class Mechanism:
 
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
-        changed = replace(self, q0=q0, v0=v0)
+        changed = copy(self)
+        for kept in ("initial_errors", "_of_start", "structure"):
+            changed.__dict__.pop(kept, None)
+        changed._take_start(q0, v0)
         if "structure" in self.__dict__:
             changed.__dict__["structure"] = self.structure.at(changed)
         changed.__dict__["_derived"] = self._derived
         return changed
+
+    def _take_start(self, q0: Any, v0: Any) -> None:
+        model = self.model
+        q0 = _frozen_array(q0, (model.nq,), "q0")
+        if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
+            raise InputError(
+                "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
+                element="q0",
+                remedy="Use pinocchio.normalize(model, q0)",
+            )
+        object.__setattr__(self, "q0", q0)
+        object.__setattr__(self, "v0", _frozen_array(v0, (model.nv,), "v0"))
 
     @cached_property
     def _derived(self) -> dict[str, Any]:
@@ -422,6 +431,16 @@ class Mechanism:
             self._derived[name] = make()
         return self._derived[name]
 
+    def at_start(self, name: str, make: Callable[[], Any]) -> Any:
+        """As :meth:`derived`, for what depends on the initial state as well."""
+        if name not in self._of_start:
+            self._of_start[name] = make()
+        return self._of_start[name]
+
+    @cached_property
+    def _of_start(self) -> dict[str, Any]:
+        return {}
+
     @cached_property
     def structure(self) -> Structure:
         """Rank, redundancy and scales of the closures, found once by the walk of docs/notation.md.
@@ -435,9 +454,9 @@ class Mechanism:
     @cached_property
     def initial_errors(self) -> tuple[FloatArray, FloatArray]:
         """Closure errors g and G v (rows,) at the initial state, in m and rad, and per second."""
-        from srm_mbs.systems.loops import closure_errors
+        from srm_mbs.systems.loops import all_rows, closure_errors
 
-        g, c = closure_errors(self.model, self.loops, self.q0[None], self.v0[None])
+        g, c = closure_errors(self.model, self.loops, self.q0[None], self.v0[None], all_rows(self))
         return g[0], c[0]
 
     @property

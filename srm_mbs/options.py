@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -79,6 +79,12 @@ def checked_rtol(value: Any) -> float:
     return rtol
 
 
+@lru_cache(maxsize=64)
+def _named(name: str, tableau: str | ButcherTableau | None) -> Method:
+    kind = METHODS[name]
+    return kind() if tableau is None else kind(tableau)
+
+
 def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
     """A method object from a name or an object."""
     if isinstance(method, str):
@@ -88,8 +94,7 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
                 element="method",
                 remedy=f"This version has {', '.join(repr(name) for name in METHODS)}",
             )
-        kind = METHODS[method.lower()]
-        return kind() if tableau is None else kind(tableau)
+        return _named(method.lower(), tableau)
     if tableau is not None:
         raise InputError(
             "tableau is given beside a method object",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs import kernel
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.errors import (
     ControllerError,
     EvaluationError,
@@ -112,8 +112,8 @@ def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, F
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def _check_consistent(mechanism: Mechanism) -> None:
-    """Refuse a start that violates the closures or their rates."""
+def _check_consistent(mechanism: Mechanism) -> bool:
+    """Refuse a start that violates the closures or their rates; True for any other."""
     v0 = mechanism.v0
     g, c = mechanism.initial_errors
     units = mechanism.structure.units
@@ -129,6 +129,7 @@ def _check_consistent(mechanism: Mechanism) -> None:
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
             )
+    return True
 
 
 def _control(
@@ -273,7 +274,7 @@ def simulate(
     )
     system = make_system(mechanism, controller)
     if mechanism.loops:
-        _check_consistent(mechanism)
+        mechanism.at_start("consistent", lambda: _check_consistent(mechanism))
 
     watch = _event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()
@@ -383,11 +384,13 @@ def _collect(
     """Arrays and statistics from a run record."""
     scheme = method.scheme
     data = record.data(scheme, system.tangent_size)
-    dense = DenseOutput(system, scheme, data)
     placed = sum(wrapper.placed for wrapper in wrappers)
     replaced = sum(wrapper.replaced for wrapper in wrappers)
     suspects = suspected(wrappers)
-    if isinstance(record, kernel.CompiledRecord):
+    dense: DenseOutput
+    if not isinstance(record, kernel.CompiledRecord):
+        dense = DenseOutput(system, scheme, data)
+    else:
         dense = kernel.CompiledDenseOutput(twin, system, scheme, data)
         placed, replaced, suspects = record.placed, record.replaced, record.suspects
     rejected = [a for a in record.attempts if a.verdict is Verdict.REJECTED]
@@ -430,30 +433,35 @@ def _bifurcations(solution: Solution) -> str:
     return "".join(f" {bifurcation}." for bifurcation in found[:TOLD]) + more
 
 
-def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]:
-    """Name, index in q and limits of the one-degree joints that have limits."""
-    model, found = mechanism.model, []
+def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatArray]:
+    """Names, indices in q (k,) and limits (2, k) of the one-degree joints that have limits."""
+    model = mechanism.model
+    names, indices, limits = [], [], []
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         if joint.nq == 1:
             low = float(model.lowerPositionLimit[joint.idx_q])
             high = float(model.upperPositionLimit[joint.idx_q])
             if low < high and (np.isfinite(low) or np.isfinite(high)):
-                found.append((name, joint.idx_q, low, high))
-    return found
+                names.append(name)
+                indices.append(joint.idx_q)
+                limits.append((low, high))
+    return names, np.array(indices, dtype=int), np.array(limits).reshape(-1, 2).T
 
 
 def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
     """A sentence naming the one-degree joints that left their limits, which do not act."""
-    joints = mechanism.derived("limited_joints", lambda: _limited_joints(mechanism))
-    if not joints:
+    names, indices, (low, high) = mechanism.derived(
+        "limited_joints", lambda: _limited_joints(mechanism)
+    )
+    if not names:
         return ""
-    _, states = dense.nodes()
-    left = []
-    for name, index, low, high in joints:
-        q = states[:, index]
-        # A run that a terminal event ends at a limit has not left it.
-        slack = ROUND_OFF * max(1.0, float(np.abs(q).max()))
-        if max(low - q.min(), q.max() - high) > slack:
-            left.append(name)
+    q = dense.nodes()[1][:, indices]
+    least, largest = q.min(axis=0), q.max(axis=0)
+    beyond = np.maximum(low - least, largest - high)
+    if not beyond.max() > 0.0:
+        return ""
+    # A run that a terminal event ends at a limit has not left it.
+    slack = ROUND_OFF * np.maximum(1.0, np.maximum(-least, largest))
+    left = [names[k] for k in np.flatnonzero(beyond > slack)]
     return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""

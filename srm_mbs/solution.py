@@ -18,7 +18,7 @@ from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
-from srm_mbs.systems.loops import closure_errors
+from srm_mbs.systems.loops import all_rows, closure_errors
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 from srm_mbs.systems.reactions import reactions_at
 
@@ -270,7 +270,9 @@ class Solution:
     @cached_property
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g|| (m, rad) and ||G v|| (m/s, rad/s), all rows, unscaled."""
-        g, c = closure_errors(self.mechanism.model, self.mechanism.loops, self.q, self.v)
+        mechanism = self.mechanism
+        rows = all_rows(mechanism)
+        g, c = closure_errors(mechanism.model, mechanism.loops, self.q, self.v, rows)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
 
     @cached_property

@@ -334,3 +334,47 @@ def test_two_runs_are_identical(four_bar: srm.Mechanism) -> None:
     a, b = (srm.simulate(four_bar, 1.0) for _ in range(2))
     assert np.array_equal(a.q, b.q)
     assert np.array_equal(a.t, b.t)
+
+
+def test_a_second_run_looks_nothing_up_in_the_model_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mechanism = srm.load("squeezing_mechanism")
+    first = srm.simulate(mechanism, 1e-3)
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("an anchor is looked up again")
+
+    monkeypatch.setattr(srm.Anchor, "resolve", refuse)
+    for backend in ("auto", "python"):
+        again = srm.simulate(mechanism, 1e-3, backend=backend)
+        moved = srm.simulate(
+            mechanism, 1e-3, q0=mechanism.q0.copy(), v0=mechanism.v0.copy(), backend=backend
+        )
+        assert np.abs(again.q[-1] - first.q[-1]).max() < 1e-10
+        assert np.array_equal(again.q, moved.q)
+
+
+def test_runs_of_one_mechanism_do_not_share_what_they_work_on(four_bar: srm.Mechanism) -> None:
+    """Dense output and energies of a run stay what they were after another one."""
+    t = np.linspace(0.0, 0.5, 7)
+    first = srm.simulate(four_bar, 0.5, backend="python")
+    known = srm.simulate(four_bar, 0.5, backend="python").at(t)
+    other = srm.assemble(four_bar, {"crank": 2.0}, {"crank": -1.0})
+    second = srm.simulate(four_bar, 0.5, q0=other.q, v0=other.v, backend="python")
+    assert np.abs(second.q[-1] - first.q[-1]).max() > 0.1
+    assert np.array_equal(first.at(t).q, known.q)
+    assert np.array_equal(first.at(t).energy, known.energy)
+    assert first.drift.max() < 1e-9
+
+
+def test_a_start_that_does_not_fit_is_refused_whatever_ran_before(
+    four_bar: srm.Mechanism,
+) -> None:
+    srm.simulate(four_bar, 0.1)
+    with pytest.raises(srm.InputError, match="violates the closures"):
+        srm.simulate(four_bar, 0.1, q0=four_bar.q0 + np.array([1e-3, 0.0, 0.0]))
+    srm.simulate(four_bar, 0.1)
+    floating = floating_ring()
+    with pytest.raises(srm.InputError, match="unit length"):
+        floating.with_state(2.0 * floating.q0, floating.v0)

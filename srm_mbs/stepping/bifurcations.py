@@ -148,6 +148,8 @@ def find_bifurcations(
     """
     if not isinstance(system, ClosedSystem) or not steps.count:
         return ()
+    if not steps.held.any() and not steps.sigmas.min() < LOOKED_AT:
+        return ()
     held = set(np.flatnonzero(steps.held).tolist())
     turning = _turns_back(system.nq, steps, system.mechanism.structure.units.coordinate)
     last = steps.count - 1

@@ -256,6 +256,15 @@ _EVALUATORS = {
 }
 
 
+def resolved_forces(mechanism: Mechanism) -> ForceKinematics | None:
+    """The force elements of ``mechanism``, resolved once; None if it has none."""
+    forces: ForceKinematics | None = mechanism.derived(
+        "forces",
+        lambda: ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None,
+    )
+    return forces
+
+
 class ForceKinematics:
     """All force elements of a mechanism.
 

@@ -23,13 +23,14 @@ A(x) = a + alpha x x + omega x (v + omega x x) of the point of a body that is at
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
-from srm_mbs.mechanism import LoopClosure
+from srm_mbs.mechanism import LoopClosure, Mechanism
 
 Vector = Sequence[float]
 """Three numbers."""
@@ -260,15 +261,26 @@ class LoopKinematics:
             m += resolved.count
             if resolved.count:
                 self._loops.append(resolved)
-        self._numbers = np.zeros(8 * m)
-        table = self._numbers.reshape(m, 8)
-        self._wrenches, self.g, self.bias = table[:, :6], table[:, 6], table[:, 7]
-        self.G = np.zeros((m, model.nv))
         self._support = np.zeros((m, model.nv))
         for resolved in self._loops:
             first = resolved.first_row
             self._support[first : first + resolved.count] = resolved.support
+        self._allocate()
+
+    def _allocate(self) -> None:
+        m = len(self._support)
+        self._numbers = np.zeros(8 * m)
+        table = self._numbers.reshape(m, 8)
+        self._wrenches, self.g, self.bias = table[:, :6], table[:, 6], table[:, 7]
+        self.G = np.zeros(self._support.shape)
         self._data: pin.Data | None = None
+
+    def anew(self) -> LoopKinematics:
+        """The same rows with memory of their own: anchors are not looked up again."""
+        other = copy(self)
+        other._loops = [copy(loop) for loop in self._loops]
+        other._allocate()
+        return other
 
     def constants(self) -> list[dict[str, Any]]:
         """What the compiled kernel needs of each closure."""
@@ -293,11 +305,26 @@ class LoopKinematics:
         np.multiply(G, self._support, G)
 
 
+def all_rows(mechanism: Mechanism) -> LoopKinematics:
+    """All rows of a mechanism's closures, unscaled, with memory of their own."""
+    resolved: LoopKinematics = mechanism.derived(
+        "all_rows", lambda: LoopKinematics(mechanism.model, mechanism.loops)
+    )
+    return resolved.anew()
+
+
 def closure_errors(
-    model: pin.Model, loops: Sequence[LoopClosure], q: FloatArray, v: FloatArray
+    model: pin.Model,
+    loops: Sequence[LoopClosure],
+    q: FloatArray,
+    v: FloatArray,
+    rows: LoopKinematics | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv)."""
-    rows = LoopKinematics(model, loops)
+    """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv).
+
+    ``rows``: from :func:`all_rows`, where a mechanism is at hand.
+    """
+    rows = LoopKinematics(model, loops) if rows is None else rows
     data = model.createData()
     g = np.empty((len(q), len(rows.g)))
     c = np.empty_like(g)

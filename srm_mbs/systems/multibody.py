@@ -9,6 +9,7 @@ tau from controller, joint damping and friction, and force elements.  Only this 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from srm_mbs.systems.charts import (
     group_joints,
     planar_translation,
 )
-from srm_mbs.systems.forces import COINCIDENT, ForceKinematics
+from srm_mbs.systems.forces import COINCIDENT, resolved_forces
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import Projection, unwhiten
 from srm_mbs.systems.units import row_units
@@ -38,6 +39,7 @@ Controller = Callable[[float, FloatArray, FloatArray], Any]
 
 _WORLD = pin.Convention.WORLD
 _sum_of_sizes = blas.dasum
+_NO_ROWS = np.zeros(0)
 _OVERFLOW = 1e100
 """Size of a state from which products of its rates may overflow."""
 
@@ -50,26 +52,41 @@ class _Mechanics:
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
         self.mechanism = mechanism
-        self.model = mechanism.model
-        self.data = self.model.createData()
-        self.nq, self.nv = self.model.nq, self.model.nv
+        self.model = model = mechanism.model
+        self.nq, self.nv = model.nq, model.nv
         self.tangent_size = 2 * self.nv
         self.multiplier_part = slice(self.nv, 2 * self.nv)
         self.multiplier_size = self.nv
         self.evaluations = 0
         self._controller = controller
-        self._damping = self.model.damping.copy() if np.any(self.model.damping) else None
-        self._friction = self.model.friction.copy() if np.any(self.model.friction) else None
+        damping, friction = model.damping, model.friction
+        self._damping = damping.copy() if damping.any() else None
+        self._friction = friction.copy() if friction.any() else None
         self._friction_speed = mechanism.friction_speed
-        self._forces = ForceKinematics(self.model, mechanism.forces) if mechanism.forces else None
+        self._forces = resolved_forces(mechanism)
         self._groups: tuple[GroupJoint, ...] = mechanism.derived(
             "groups", lambda: group_joints(self.model)
         )
-        self._planar = tuple(joint for joint in self._groups if joint.group == "se2")
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
         self._position_of: IndexArray = mechanism.derived("position_of", self._vector_coordinates)
-        self._caps = np.concatenate([self._unit, np.full(self.nv, np.inf)])
+
+    # Made when the reference first evaluates: the compiled kernel has its own.
+    @cached_property
+    def data(self) -> pin.Data:
+        """Pinocchio's workspace."""
+        return self.model.createData()
+
+    @cached_property
+    def _caps(self) -> FloatArray:
+        caps: FloatArray = self.mechanism.at_start(
+            "caps", lambda: np.concatenate([self._unit, np.full(self.nv, np.inf)])
+        )
+        return caps
+
+    @cached_property
+    def _planar(self) -> tuple[GroupJoint, ...]:
+        return tuple(joint for joint in self._groups if joint.group == "se2")
 
     def _vector_coordinates(self) -> IndexArray:
         """Index into q of each velocity component, -1 where q is not a vector space there."""
@@ -142,17 +159,23 @@ class _Mechanics:
 
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel (:mod:`srm_mbs.kernel`)."""
+        fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
+        return fixed | {
+            "unit": self._unit,
+            "gap_scale": _NO_ROWS,
+            "damping": self._damping,
+            "friction": self._friction,
+        }
+
+    def _constants(self) -> dict[str, Any]:
+        """Those that do not depend on the start."""
         return {
             "loops": [],
             "rows": 0,
             "structural_rank": 0,
             "sigma_ref": 1.0,
             "algebra": "auto",
-            "gap_scale": np.zeros(0),
-            "unit": self._unit,
             "position_of": [int(i) for i in self._position_of],
-            "damping": self._damping,
-            "friction": self._friction,
             "friction_speed": float(self._friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
@@ -392,25 +415,45 @@ class ClosedSystem(_Mechanics):
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
-        structure = mechanism.structure
-        self.loops = LoopKinematics(
-            self.model, mechanism.loops, structure.row_scale, structure.kept
-        )
-        unit = row_units(mechanism.loops, structure.units.length)
-        self._gap_scale = (structure.row_scale / unit)[structure.kept]
-        self.projection = Projection(structure.rank, structure.sigma_ref)
-        self._M = self.data.M  # a view on what crba writes
-        self._terms = _ClosedTerms(self.projection, self.loops, self._gap_scale)
+        self.structure = mechanism.structure
+        self._gap_scale: FloatArray = mechanism.at_start("gap_scale", self._gap_scales)
+        self.projection = Projection(self.structure.rank, self.structure.sigma_ref)
+
+    def _resolved_loops(self) -> LoopKinematics:
+        structure = self.structure
+        return LoopKinematics(self.model, self.mechanism.loops, structure.row_scale, structure.kept)
+
+    def _gap_scales(self) -> FloatArray:
+        structure = self.structure
+        unit = row_units(self.mechanism.loops, structure.units.length)
+        scale: FloatArray = (structure.row_scale / unit)[structure.kept]
+        return scale
+
+    @cached_property
+    def loops(self) -> LoopKinematics:
+        """The rows of the closures that are in use, with memory of their own."""
+        resolved: LoopKinematics = self.mechanism.derived("loops", self._resolved_loops)
+        return resolved.anew()
+
+    @cached_property
+    def _mass_matrix(self) -> FloatArray:
+        M: FloatArray = self.data.M  # a view on what crba writes
+        return M
+
+    @cached_property
+    def _terms(self) -> _ClosedTerms:
+        return _ClosedTerms(self.projection, self.loops, self._gap_scale)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
-        structure = self.mechanism.structure
-        return super().constants() | {
+        return super().constants() | {"gap_scale": self._gap_scale}
+
+    def _constants(self) -> dict[str, Any]:
+        return super()._constants() | {
             "loops": self.loops.constants(),
             "rows": len(self.loops.g),
-            "structural_rank": structure.rank,
-            "sigma_ref": structure.sigma_ref,
-            "gap_scale": self._gap_scale,
+            "structural_rank": self.structure.rank,
+            "sigma_ref": self.structure.sigma_ref,
         }
 
     def count(self, evaluations: int, factorisations: int) -> None:
@@ -446,7 +489,7 @@ class ClosedSystem(_Mechanics):
         loops.update(data)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
-        projection.factor(self._M, loops.G, f, loops.bias, threshold)
+        projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
         terms = self._terms
         terms.v = v
         terms.sigma = projection.sigma

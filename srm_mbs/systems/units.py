@@ -15,7 +15,7 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import LoopClosure, Mechanism
-from srm_mbs.systems.forces import ForceKinematics
+from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.loops import world_jacobian
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
 
@@ -67,10 +67,8 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
         points.append(data.oMi[joint].translation.copy())
         if model.inertias[joint].mass > 0.0:
             points.append(data.oMi[joint].act(model.inertias[joint].lever))
-    for loop in mechanism.loops:
-        for anchor in (loop.a, loop.b):
-            joint, placement = anchor.resolve(model)
-            points.append(data.oMi[joint].act(placement.translation))
+    for joint, point in mechanism.derived("anchors", lambda: _anchors(mechanism)):
+        points.append(data.oMi[joint].act(point))
     corners = np.array(points) if points else np.zeros((1, 3))
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     length = diagonal if diagonal > 0.0 else 1.0
@@ -87,15 +85,28 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
     return Units(length, coordinate, rate)
 
 
+def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
+    """Joint, and origin (3,) in its axes, of every anchor of a closure."""
+    found = []
+    for loop in mechanism.loops:
+        for anchor in (loop.a, loop.b):
+            joint, placement = anchor.resolve(mechanism.model)
+            found.append((joint, placement.translation.copy()))
+    return found
+
+
 def _acceleration_by_forces(mechanism: Mechanism, q: FloatArray) -> FloatArray:
     """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
     model = mechanism.model
+    forces = resolved_forces(mechanism)
     data = model.createData()
     rest = np.zeros(model.nv)
+    if forces is None:
+        return rest
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, rest)
     try:
-        tau = ForceKinematics(model, mechanism.forces).generalised(data, q, rest)
+        tau = forces.generalised(data, q, rest)
         U = cholesky(data.M)
     except EvaluationError:  # a run from here says why
         return rest

@@ -32,6 +32,10 @@ _COMPONENTS = {
     "JointModelFreeFlyer": (_LENGTHS + _QUATERNION, _LINEAR + _ANGULAR),
     "JointModelSpherical": (_QUATERNION, _ANGULAR),
     "JointModelTranslation": (_LENGTHS, _LINEAR),
+    "JointModelUniversal": (
+        ("angle 1 (rad)", "angle 2 (rad)"),
+        ("rate 1 (rad/s)", "rate 2 (rad/s)"),
+    ),
     "JointModelPlanar": ((*_LENGTHS[:2], "cos", "sin"), (*_LINEAR[:2], _ANGULAR[2])),
 }
 """Columns of joints of several degrees of freedom: positions, velocities."""

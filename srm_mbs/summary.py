@@ -22,6 +22,8 @@ JOINT_TYPES = {
     "FreeFlyer": "floating",
     "Planar": "planar",
     "Spherical": "ball",
+    "Universal": "universal",
+    "HelicalUnaligned": "screw",
 }
 """Pinocchio's joint types as URDF calls them."""
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}

@@ -144,12 +144,12 @@ DESCRIPTION_FAULTS = {
     "unknown key in simulation": ("t_end", "tend", ("simulation.tend", "t_end, rtol, atol")),
     "unknown table": ("[simulation]", "[simulations]", ("simulations", "unknown key")),
     "a drive": ("[simulation]", '[[drive]]\njoint = "hinge"\n[simulation]', ("drive", "Remove")),
-    "an SDF": ("urdf =", 'sdf = "a.sdf"\nurdf =', ("sdf", "give a URDF", "Remove")),
-    "an MJCF": ("urdf =", 'mjcf = "a.xml"\nurdf =', ("mjcf", "give a URDF", "Remove")),
+    "an SDF": ("urdf =", 'sdf = "a.sdf"\nurdf =', ("sdf", "both given", "one of")),
+    "an MJCF": ("urdf =", 'mjcf = "a.xml"\nurdf =', ("mjcf", "both given", "one of")),
     "no format": ("format = 1\n", "", ("format", "missing", "format = 1")),
     "a later format": ("format = 1", "format = 2", ("format", "not 2", "format = 1")),
     "a text for format": ("format = 1", 'format = "1"', ("format", "format = 1")),
-    "no urdf": ('urdf = "two_bars.urdf"\n', "", ("urdf", "missing", "Add it")),
+    "no urdf": ('urdf = "two_bars.urdf"\n', "", ("urdf", "missing", "one of")),
     "an absent urdf": ("two_bars.urdf", "other.urdf", ("'other.urdf'", "no such file", "relative")),
     "a folder as urdf": ('"two_bars.urdf"', '"."', ("urdf", "irectory", "relative")),
     "an empty urdf": ('"two_bars.urdf"', '""', ("urdf", "irectory", "relative")),
@@ -348,21 +348,39 @@ def test_a_binary_urdf_is_named_with_the_description(tmp_path: Path) -> None:
     refusal(write(tmp_path, urdf=bytes(range(256))), "two_bars.urdf", "not UTF-8")
 
 
-@pytest.mark.parametrize("name", ["robot.sdf", "robot.xml", "robot.yaml", "robot.urdf.xacro"])
-def test_files_of_other_formats_are_refused_by_their_type(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("name", "text", "needle"),
+    [
+        ("robot.dae", '<?xml version="1.0"?><!-- a --><COLLADA/>', "<COLLADA>"),
+        ("robot.txt", "links and joints", "'.txt'"),
+        ("robot", "", "''"),
+    ],
+)
+def test_files_of_other_formats_are_refused_by_their_content(
+    name: str, text: str, needle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / name).write_text("<robot/>")
-    refusal(tmp_path / name, Path(name).suffix, ".toml description or a .urdf")
+    (tmp_path / name).write_text(text)
+    refusal(tmp_path / name, needle, "Formats: ", "URDF")
     monkeypatch.chdir(tmp_path)
-    refusal(name, Path(name).suffix, ".toml description or a .urdf")
+    refusal(f"./{name}", needle, "Formats: ", "URDF", file=name)
+
+
+@pytest.mark.parametrize("name", ["robot.xml", "robot.urdf.xacro", "robot.yaml", "robot.toml"])
+def test_a_urdf_is_known_by_its_content(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(URDF)
+    assert srm.load(tmp_path / name).joint_names == ("hinge", "knee")
+
+
+def test_a_description_is_known_by_its_content(tmp_path: Path) -> None:
+    path = write(tmp_path).rename(tmp_path / "bars.txt")
+    assert [loop.name for loop in srm.load(path).loops] == ["pin"]
 
 
 @pytest.mark.parametrize("name", ["slider-crank", "", "n_four_bar_0", "n_four_bar_x", "Four_bar"])
 def test_an_unknown_bundled_name_lists_the_known_ones(name: str) -> None:
     with pytest.raises(srm.InputError) as caught:
         srm.load(name)
-    for needle in (repr(name), "slider_crank", "four_bar", ".toml or .urdf path"):
+    for needle in (repr(name), "slider_crank", "four_bar", "the path of a file"):
         assert needle in str(caught.value)
 
 
@@ -538,7 +556,7 @@ URDF_FAULTS = {
     "no effort": (' effort="1"', "", ("'hinge'", "<limit> has no 'effort'")),
     "no joint type": (' type="revolute"', "", ("'hinge'", "None", "revolute, continuous")),
     "unknown joint type": ('"revolute"', '"hinge"', ("'hinge'", "joint type", "revolute, cont")),
-    "ball joint": (END, joint_c("spherical"), ("'c'", "'spherical'", "revolute, continuous")),
+    "ball joint": (END, joint_c("ball"), ("'c'", "'ball'", "revolute, continuous")),
     "planar along x": (
         END,
         joint_c("planar"),

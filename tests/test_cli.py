@@ -374,11 +374,11 @@ def test_wrong_usage_has_status_2(args: tuple[str, ...]) -> None:
 
 
 def test_file_of_another_type_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "robot.sdf"
-    path.write_text("<sdf/>")
+    path = tmp_path / "robot.dae"
+    path.write_text("<COLLADA/>")
     line = error_line(run("simulate", path, status=2))
     assert line.startswith(f"error: {path}: ")
-    assert "'.sdf'" in line
+    assert "<COLLADA>" in line
 
 
 def test_error_in_a_description_names_file_and_key(describe: Any) -> None:

@@ -17,6 +17,7 @@ from pydantic_core import PydanticCustomError
 from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
+from srm_mbs.loading.translation import MODEL_KEYS
 from srm_mbs.mechanism import FRICTION_SPEED, Anchor, ForceElement, LoopClosure
 
 LARGEST = 1e30
@@ -45,8 +46,6 @@ Base = Literal["fixed", "floating", "planar"]
 
 LATER = {
     "drive": "drives are not read by this version",
-    "sdf": "SDF files are not read by this version; give a URDF",
-    "mjcf": "MJCF files are not read by this version; give a URDF",
 }
 
 
@@ -178,7 +177,10 @@ class Description(_Strict):
 
     format: Literal[1]
     name: StrictStr = ""
-    urdf: StrictStr
+    urdf: StrictStr | None = None
+    sdf: StrictStr | None = None
+    mjcf: StrictStr | None = None
+    cut: list[StrictStr] = []
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]
     lock: list[StrictStr] = []
@@ -187,6 +189,11 @@ class Description(_Strict):
     force: list[AnyForceEntry] = []
     initial: InitialEntry = InitialEntry()
     simulation: SimulationEntry = SimulationEntry()
+
+    @property
+    def model_file(self) -> tuple[str, str]:
+        """Key and path of the file that holds the links and joints."""
+        return next((key, name) for key in MODEL_KEYS if (name := getattr(self, key)) is not None)
 
     def closures(self) -> tuple[LoopClosure, ...]:
         """The loop closures.
@@ -350,6 +357,14 @@ def parse_description(text: str, file: str) -> Description:
         if key == "format":
             remedy = "Write: format = 1"
         raise InputError(problem, file=file, element=key, remedy=remedy) from error
+    given = [key for key in MODEL_KEYS if getattr(description, key) is not None]
+    if len(given) != 1:
+        raise InputError(
+            f"{' and '.join(given)} are both given" if given else "this key is missing",
+            file=file,
+            element=given[0] if given else "urdf",
+            remedy=f"Give one of {', '.join(MODEL_KEYS)}",
+        )
     for i, entry in enumerate(description.loop):
         if entry.type not in CLOSURE_TYPES:
             raise InputError(

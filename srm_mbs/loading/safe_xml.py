@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from xml.etree.ElementTree import Element, ParseError
 
 from defusedxml import DefusedXmlException
 from defusedxml import ElementTree as SafeTree
 
 from srm_mbs.errors import InputError
+
+_PROLOG = re.compile(
+    r"(?:\s+|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*(?:\[[^\]]*\])?[^>]*>)*<([^\s/><!?]+)", re.DOTALL
+)
+
+
+def root_tag(text: str) -> str | None:
+    """Name of the root element, prefix included; None if ``text`` does not look like XML."""
+    match = _PROLOG.match(text.lstrip("\ufeff"))
+    return match[1] if match else None
 
 
 def parse_urdf(text: str, file: str) -> Element:

@@ -19,6 +19,7 @@ from scipy.linalg.lapack import dpotrf
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
+from srm_mbs.loading.joint_types import take_extended, with_joints
 from srm_mbs.loading.safe_xml import parse_urdf
 from srm_mbs.loading.urdf_check import UrdfChecker
 
@@ -157,6 +158,7 @@ def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> U
     checker = UrdfChecker(file)
     root = parse_urdf(text, file)
     checker.check(root, base, locked)
+    extended = take_extended(root)
     text = tostring(root, encoding="unicode")
     root_joint = ROOT_JOINTS[base]
     try:
@@ -168,7 +170,7 @@ def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> U
         raise InputError(f"Pinocchio cannot read it: {error}", file=file) from error
     for note in checker.notes:
         log.info("%s: %s", file, note)
-    return UrdfModel(model, tuple(checker.notes))
+    return UrdfModel(with_joints(model, extended), tuple(checker.notes))
 
 
 def lock_joints(model: pin.Model, names: list[str], q: Any) -> pin.Model:

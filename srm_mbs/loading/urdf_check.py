@@ -8,160 +8,25 @@ holds nothing but what was checked, with the numbers written afresh.
 
 from __future__ import annotations
 
-import math
-import re
-import sys
 import warnings
 from collections.abc import Sequence
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from srm_mbs.errors import InputError, SrmWarning
-from srm_mbs.loading.description import LARGEST
-from srm_mbs.loading.urdf_schema import (
-    ATTRIBUTES,
-    DRAWN_ONLY,
-    IGNORED,
-    INFORMATIVE,
-    LOOP_ELEMENTS,
-    READ,
-)
+from srm_mbs.errors import SrmWarning
+from srm_mbs.loading.urdf_joints import UNIVERSE, JointChecker
+from srm_mbs.loading.urdf_schema import ATTRIBUTES
 from srm_mbs.mechanism import WORLD
 
-JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-WITH_AXIS = ("revolute", "continuous", "prismatic", "planar")
-NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 DEEPEST = 1000
 """Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""
-UNIVERSE = "universe"
-"""Pinocchio's name for the ground."""
-ROOT_JOINT = "root_joint"
-"""Pinocchio's name for the joint of a floating or planar base."""
 POINT_LIKE = 1e-18
 """m^2: a radius of gyration below a nanometre is the rounding of zero."""
 
 
-class UrdfChecker:
+class UrdfChecker(JointChecker):
     """Walks a URDF once; raises :class:`InputError` at the first fault."""
-
-    def __init__(self, file: str) -> None:
-        self.file = file
-        self.notes: list[str] = []
-        self._ignored: dict[str, int] = {}
-
-    def fault(self, element: str, problem: str, remedy: str | None = None) -> InputError:
-        return InputError(problem, file=self.file, element=element, remedy=remedy)
-
-    def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
-        """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
-        text = node.get(key)
-        parts = (text or "").split()
-        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
-        # Limits do not act, and exporters write the largest double there.
-        largest = sys.float_info.max if node.tag == "limit" else LARGEST
-        if len(values) != count or not all(abs(value) <= largest for value in values):
-            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
-            raise self.fault(
-                where,
-                f"<{node.tag}> has no {key!r}"
-                if text is None
-                else f"<{node.tag} {key}={text!r}> is not {wanted}",
-                f"Write {wanted}",
-            )
-        node.set(key, " ".join(map(repr, values)))
-        return values
-
-    def attributes(self, node: Element, where: str) -> None:
-        known = ATTRIBUTES.get(node.tag)
-        ignored = INFORMATIVE.get(node.tag, ())
-        for key in list(node.attrib):
-            if key in ignored:
-                self._ignore(f"<{node.tag} {key}> attribute")
-                del node.attrib[key]
-            elif known is not None and key not in known:
-                raise self.fault(
-                    where,
-                    f"<{node.tag}> has an unknown attribute {key!r}",
-                    f"Known: {', '.join(known)}",
-                )
-
-    def _ignore(self, what: str) -> None:
-        self._ignored[what] = self._ignored.get(what, 0) + 1
-
-    def children(self, node: Element, where: str) -> None:
-        """Refuse unknown elements of ``node``; count and remove those that are ignored."""
-        read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
-        for child in list(node):
-            tag = child.tag
-            local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
-            if tag in read:
-                self.attributes(child, where)
-            elif tag in ignored:
-                self.no_loop_inside(child, where)
-                self.no_inertia_inside(child, where)
-                if tag not in DRAWN_ONLY:
-                    self._ignore(f"<{tag}> element")
-                node.remove(child)
-            elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
-                raise self.fault(
-                    f"{where}, <xacro:{local}>" if where else f"<xacro:{local}>",
-                    "this is a xacro macro, not URDF",
-                    "Run xacro on the file first",
-                )
-            elif local in LOOP_ELEMENTS or tag != local:
-                raise self.fault(
-                    f"{where}, <{local}>" if where else f"<{local}>",
-                    f"the element <{local}> (a loop, coupling or force of another tool) is not "
-                    "read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
-                )
-            else:
-                raise self.fault(
-                    where or f"<{tag}>",
-                    f"unknown element <{tag}> in <{node.tag}>",
-                    f"Known: {', '.join((*read, *ignored))}",
-                )
-        for tag in set(read) - {"link", "joint"}:
-            if len(node.findall(tag)) > 1:
-                raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
-
-    def no_loop_inside(self, node: Element, where: str) -> None:
-        """Refuse loops and couplings inside an element that is ignored as a whole."""
-        for inner in node.iter():
-            if inner.tag in (*LOOP_ELEMENTS, "mimic"):
-                raise self.fault(
-                    ", ".join(part for part in (where, f"<{node.tag}>, <{inner.tag}>") if part),
-                    f"the element <{inner.tag}> (a loop or coupling) inside <{node.tag}> is not "
-                    "read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
-                )
-
-    def no_inertia_inside(self, node: Element, where: str) -> None:
-        """Refuse inertia inside an element that is only drawn: the link would lose it."""
-        if node.tag not in DRAWN_ONLY:
-            return
-        for inner in node.iter():
-            if inner.tag in ("inertial", "mass", "inertia"):
-                raise self.fault(
-                    where or f"<{node.tag}>",
-                    f"<{inner.tag}> inside <{node.tag}> would not act",
-                    "Put <mass> and <inertia> into the <inertial> of the link",
-                )
-
-    def named(self, root: Element, tag: str) -> dict[str, Element]:
-        found: dict[str, Element] = {}
-        for node in root.findall(tag):
-            self.attributes(node, f"<{tag}>")
-            name = node.get("name")
-            if not name:
-                raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')
-            if name in found:
-                raise self.fault(
-                    f"{tag} {name!r}", f"two {tag}s have this name", "Rename one of them"
-                )
-            found[name] = node
-        return found
 
     def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
         """The whole file; leaves in ``root`` what Pinocchio is to read."""
@@ -184,7 +49,7 @@ class UrdfChecker:
         self.tree(links, joints, base)
         for name, joint in joints.items():
             self.joint(name, joint, base, name in locked)
-        for what, count in self._ignored.items():
+        for what, count in self.ignored.items():
             self.notes.append(f"{count} {what}(s) do not act and are ignored")
 
     def root(self, root: Element) -> None:
@@ -253,14 +118,6 @@ class UrdfChecker:
             )
             self.notes.append(note)
             warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
-
-    def origin(self, node: Element, where: str) -> None:
-        origin = node.find("origin")
-        if origin is None:
-            return
-        for key in ("xyz", "rpy"):
-            if origin.get(key) is not None:
-                self.numbers(origin, key, 3, where)
 
     def tree(self, links: dict[str, Element], joints: dict[str, Element], base: str) -> None:
         parent_joint: dict[str, str] = {}
@@ -333,96 +190,3 @@ class UrdfChecker:
                     if roots[0] == reserved
                     else "Rename the link",
                 )
-
-    def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
-        where = f"joint {name!r}"
-        if name == UNIVERSE or (name == ROOT_JOINT and base != "fixed"):
-            raise self.fault(
-                where,
-                f"the name {name!r} is reserved"
-                + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
-                "Rename the joint",
-            )
-        self.children(joint, where)
-        kind = joint.get("type")
-        if kind not in JOINT_TYPES:
-            raise self.fault(
-                where, f"unknown joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
-            )
-        self.origin(joint, where)
-        mimic = joint.find("mimic")
-        if mimic is not None and not locked and kind != "fixed":
-            raise self.fault(
-                where,
-                "<mimic> (a coupling of two joints) is not read by this version",
-                "Remove it, or name the joint in lock in a TOML description",
-            )
-        if mimic is not None:
-            joint.remove(mimic)
-        self.axis(joint, kind, where)
-        self.limit(joint, kind, where)
-        self.dynamics(joint, kind, where, locked)
-
-    def axis(self, joint: Element, kind: str, where: str) -> None:
-        axis = joint.find("axis")
-        if axis is not None and kind not in WITH_AXIS:
-            joint.remove(axis)
-            axis = None
-        direction = [1.0, 0.0, 0.0] if axis is None else self.numbers(axis, "xyz", 3, where)
-        if not any(direction):
-            raise self.fault(where, "its axis is zero", "Give a direction")
-        if axis is not None:
-            # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
-            length = math.hypot(*direction)
-            direction = [component / length for component in direction]
-            axis.set("xyz", " ".join(map(repr, direction)))
-        if kind == "planar" and (direction[:2] != [0.0, 0.0] or direction[2] < 0.0):
-            given = " (the default of URDF)" if axis is None else ""
-            raise self.fault(
-                where,
-                f"the normal of a planar joint is read along z only, not {direction}{given}",
-                'Write <axis xyz="0 0 1"/> and turn the joint by <origin rpy=...>',
-            )
-
-    def limit(self, joint: Element, kind: str, where: str) -> None:
-        limit = joint.find("limit")
-        if limit is None:
-            if kind in ("revolute", "prismatic"):
-                raise self.fault(
-                    where,
-                    f"a {kind} joint needs <limit lower upper effort velocity>",
-                    'Add it, or use type="continuous" for an unlimited angle'
-                    if kind == "revolute"
-                    else "Add it",
-                )
-            return
-        for key in limit.attrib:
-            self.numbers(limit, key, 1, where)
-        if kind not in ("revolute", "continuous", "prismatic"):
-            joint.remove(limit)
-            return
-        for key in ("effort", "velocity"):
-            if limit.get(key) is None and kind == "continuous":
-                limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
-            (value,) = self.numbers(limit, key, 1, where)
-            if value < 0.0:
-                raise self.fault(
-                    where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
-                )
-
-    def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
-        dynamics = joint.find("dynamics")
-        if dynamics is None:
-            return
-        for key in dynamics.attrib:
-            (value,) = self.numbers(dynamics, key, 1, where)
-            if value < 0.0:
-                raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
-            if value != 0.0 and kind in ("floating", "planar") and not locked:
-                raise self.fault(
-                    where,
-                    f"the {key} ({value:g}) of a {kind} joint is not simulated by this version",
-                    "Set it to 0; that of one-degree joints acts",
-                )
-        if not dynamics.attrib:
-            joint.remove(dynamics)

@@ -23,7 +23,17 @@ READ = {
     "robot": ("link", "joint"),
     "link": ("inertial",),
     "inertial": ("origin", "mass", "inertia"),
-    "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
+    "joint": (
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "axis2",
+        "thread_pitch",
+        "limit",
+        "dynamics",
+        "mimic",
+    ),
 }
 ATTRIBUTES = {
     "link": ("name", "type"),
@@ -34,10 +44,13 @@ ATTRIBUTES = {
     "parent": ("link",),
     "child": ("link",),
     "axis": ("xyz",),
+    "axis2": ("xyz",),
+    "thread_pitch": ("value",),
     "limit": ("lower", "upper", "effort", "velocity"),
     "dynamics": ("damping", "friction"),
 }
 INFORMATIVE = {
+    "joint": ("independent",),
     "limit": ("command_effort", "current", "gear_velocity"),
     "dynamics": ("D", "K", "mu_coulomb", "mu_viscous"),
 }

@@ -1,0 +1,240 @@
+"""From a description and its URDF to an assembled mechanism."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.assembly import assemble
+from srm_mbs.coordinates import set_position, set_rate
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.loading.description import (
+    Description,
+    TorqueEntry,
+    TorsionSpringEntry,
+    parse_description,
+)
+from srm_mbs.loading.urdf import build_urdf, check_inertia, lock_joints, undetermined_joint
+from srm_mbs.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.systems.forces import friction_time
+
+log = logging.getLogger(__name__)
+
+
+def _check_joint_names(description: Description, model: pin.Model, file: str) -> None:
+    """Refuse names in [initial] and lock that are no moving joints."""
+    known = tuple(model.names)[1:]
+    places: list[tuple[str, Sequence[str]]] = [
+        ("lock", description.lock),
+        ("initial.q", list(description.initial.q)),
+        ("initial.v", list(description.initial.v)),
+        ("initial.guess", list(description.initial.guess)),
+        *(
+            (f"force[{i}].joint", [force.joint])
+            for i, force in enumerate(description.force)
+            if isinstance(force, TorqueEntry | TorsionSpringEntry)
+        ),
+    ]
+    for where, names in places:
+        for name in names:
+            if name not in known:
+                raise InputError(
+                    f"there is no moving joint {name!r}",
+                    file=file,
+                    element=where,
+                    remedy=f"Known: {', '.join(known)}",
+                )
+    for i, force in enumerate(description.force):
+        if isinstance(force, TorqueEntry | TorsionSpringEntry) and force.joint in description.lock:
+            raise InputError(
+                f"joint {force.joint!r} is locked",
+                file=file,
+                element=f"force[{i}].joint",
+                remedy="Remove the force, or the joint from lock",
+            )
+    for i, name in enumerate(description.lock):
+        if name in description.lock[:i]:
+            raise InputError(
+                f"joint {name!r} stands there twice", file=file, element="lock", remedy="Keep one"
+            )
+    for name in description.initial.q:
+        if name in description.initial.guess:
+            raise InputError(
+                f"joint {name!r} is held in initial.q and guessed in initial.guess",
+                file=file,
+                element="initial.guess",
+                remedy="Keep one of the two",
+            )
+
+
+@contextmanager
+def _element(where: str) -> Iterator[None]:
+    """Name the key of the description in errors that do not name one."""
+    try:
+        yield
+    except InputError as error:
+        error.element = error.element or where
+        raise
+
+
+def _check_frames(description: Description, model: pin.Model) -> None:
+    """Refuse an anchor's frame name that means two different frames, say a joint's and a link's."""
+    for where, anchor in description.anchors():
+        if anchor.frame is None:
+            continue
+        first, *others = [f for f in model.frames if f.name == anchor.frame] or [None]
+        for other in others:
+            if other.parentJoint != first.parentJoint or not other.placement.isApprox(
+                first.placement, 1e-12
+            ):
+                raise InputError(
+                    f"the name {anchor.frame!r} belongs to a joint and to another joint's link",
+                    element=f"{where}.frame",
+                    remedy="Rename one of them in the URDF, or write link = instead of frame =",
+                )
+
+
+def _without_locked(
+    description: Description, model: pin.Model, file: str
+) -> tuple[pin.Model, dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The model without the locked joints, and q, v and guess of those that remain."""
+    initial = description.initial
+    q, v, guess = dict(initial.q), dict(initial.v), dict(initial.guess)
+    if not description.lock:
+        return model, q, v, guess
+    whole = Mechanism(model)
+    frozen = np.array(whole.q0)
+    for name in description.lock:
+        for where, values in (("initial.q", q), ("initial.guess", guess)):
+            if name in values:
+                with _element(where):
+                    set_position(whole, frozen, name, values.pop(name))
+        rate = np.zeros(model.nv)
+        with _element("initial.v"):
+            set_rate(whole, rate, name, v.pop(name, np.zeros(whole.joint(name).nv)))
+        if rate.any():
+            raise InputError(
+                f"joint {name!r} is locked but has an initial rate",
+                file=file,
+                element="initial.v",
+                remedy="Remove the rate, or the joint from lock",
+            )
+    return lock_joints(model, list(description.lock), frozen), q, v, guess
+
+
+def _friction_note(mechanism: Mechanism) -> tuple[str, ...]:
+    try:
+        time = friction_time(mechanism)
+    except EvaluationError:  # in gimbal lock, which is reported elsewhere
+        return ()
+    if time == np.inf:
+        return ()
+    return (
+        "joint friction F acts as F tanh(v/v_s) with v_s = "
+        f"{mechanism.friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
+        f"{6.0 * time:.0e} s, in proportion to v_s: set it with friction_speed",
+    )
+
+
+def unassembled(
+    description: Description, source: Source, notes: Sequence[str] = ()
+) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
+    """The mechanism with the guess as its q0, and the held positions and rates by joint.
+
+    Parameters
+    ----------
+    description, source
+        The parsed description, and the texts it was parsed from.
+    notes
+        Sentences of the translator that wrote them.
+
+    Raises
+    ------
+    InputError
+        Naming file, element and remedy.
+    """
+    file = source.path
+    built = build_urdf(source.urdf, source.urdf_path, source.base, description.lock)
+    built.model.gravity.linear = np.array(source.gravity)
+    _check_joint_names(description, built.model, file)
+    model, q, v, guess = _without_locked(description, built.model, file)
+    check_inertia(model, source.urdf_path)
+    _check_frames(description, model)
+    defaults = description.simulation
+    mechanism = Mechanism(
+        model,
+        description.closures(),
+        forces=description.force_elements(),
+        friction_speed=description.friction_speed,
+        name=description.name or model.name,
+        source=source,
+        defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
+        notes=(*notes, *built.notes),
+    )
+    start = np.array(mechanism.q0)
+    for where, values in (("initial.guess", guess), ("initial.q", q)):
+        for name, value in values.items():
+            with _element(where):
+                set_position(mechanism, start, name, value)
+    for name, value in v.items():
+        with _element("initial.v"):
+            set_rate(mechanism, np.zeros(model.nv), name, value)
+    mechanism = replace(mechanism, q0=start)
+    return replace(mechanism, notes=mechanism.notes + _friction_note(mechanism)), q, v
+
+
+def rebuild(source: Source) -> Mechanism:
+    """The mechanism of a saved run; its q0 is the guess of the description, not assembled."""
+    return unassembled(parse_description(source.description, source.path), source)[0]
+
+
+def _in_gimbal_lock(source: Source, why: str) -> InputError:
+    return InputError(
+        f"where the loops are closed the accelerations are not determined: {why}",
+        file=source.path,
+        element="initial",
+        remedy="Axes of massless links may be in line there (gimbal lock): give another guess, or "
+        "these links inertia",
+    )
+
+
+def assembled(description: Description, source: Source, notes: Sequence[str] = ()) -> Mechanism:
+    """The mechanism with its loops closed; parameters as in :func:`unassembled`.
+
+    Raises
+    ------
+    InputError, AssemblyError
+        As :func:`srm_mbs.load`.
+    """
+    mechanism, q, v = unassembled(description, source, notes)
+    try:
+        state = assemble(mechanism, q, v)
+        # A fresh mechanism: its structure is analysed from the assembled state.
+        mechanism = replace(mechanism, q0=state.q, v0=state.v)
+        _ = mechanism.structure
+    except AssemblyError as error:
+        if description.lock:
+            error.remedy = f"{error.remedy}. Locked, so that they cannot help: " + ", ".join(
+                map(repr, description.lock)
+            )
+        raise
+    except EvaluationError as error:
+        raise _in_gimbal_lock(source, str(error)) from error
+    joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
+    if joint is not None:
+        raise _in_gimbal_lock(
+            source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"
+        )
+    log.info(
+        "%s: %d degrees of freedom, rank %d",
+        mechanism.name,
+        mechanism.degrees_of_freedom,
+        mechanism.structure.rank,
+    )
+    return mechanism

@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from srm_mbs.analysis.energy_balance import EnergyBalance
+    from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
+    from srm_mbs.analysis.linearisation import Linearisation, linearise
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
     from srm_mbs.dae import DaeSolution, solve_dae
     from srm_mbs.errors import (
+        AnalysisError,
         AssemblyError,
         InputError,
         SimulationError,
@@ -36,12 +40,14 @@ if TYPE_CHECKING:
     from srm_mbs.methods.psrm import PSRM
     from srm_mbs.methods.srm import SRM
     from srm_mbs.methods.tableaus import TABLEAUS
+    from srm_mbs.motion import JointMotion
     from srm_mbs.semi_explicit import SemiExplicitDAE
     from srm_mbs.simulation import simulate
     from srm_mbs.solution import Solution
     from srm_mbs.storage import load_solution
 
 _HOME = {
+    "AnalysisError": "errors",
     "Anchor": "mechanism",
     "Assembly": "assembly",
     "AssemblyError": "errors",
@@ -49,10 +55,14 @@ _HOME = {
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
     "DaeSolution": "dae",
+    "EnergyBalance": "analysis.energy_balance",
+    "Equilibrium": "analysis.equilibrium",
     "FORCE_TYPES": "forces",
     "ForceElement": "mechanism",
     "InputError": "errors",
+    "JointMotion": "motion",
     "JointTorque": "forces",
+    "Linearisation": "analysis.linearisation",
     "LoopClosure": "mechanism",
     "Mechanism": "mechanism",
     "PSRM": "methods.psrm",
@@ -69,6 +79,8 @@ _HOME = {
     "assemble": "assembly",
     "backend": "kernel",
     "bundled_models": "loading",
+    "equilibrium": "analysis.equilibrium",
+    "linearise": "analysis.linearisation",
     "load": "loading",
     "load_solution": "storage",
     "n_four_bar": "loading",
@@ -82,15 +94,20 @@ __all__ = [
     "PSRM",
     "SRM",
     "TABLEAUS",
+    "AnalysisError",
     "Anchor",
     "Assembly",
     "AssemblyError",
     "Bushing",
     "ButcherTableau",
     "DaeSolution",
+    "EnergyBalance",
+    "Equilibrium",
     "ForceElement",
     "InputError",
+    "JointMotion",
     "JointTorque",
+    "Linearisation",
     "LoopClosure",
     "Mechanism",
     "SemiExplicitDAE",
@@ -104,6 +121,8 @@ __all__ = [
     "assemble",
     "backend",
     "bundled_models",
+    "equilibrium",
+    "linearise",
     "load",
     "load_solution",
     "n_four_bar",

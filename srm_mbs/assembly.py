@@ -74,7 +74,7 @@ def _describe(gaps: Mapping[str, tuple[float | None, float | None]]) -> str:
     return "; ".join(parts)
 
 
-def _free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:
+def free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:
     """Velocity indices of the joints that are not held."""
     free = np.ones(mechanism.model.nv, dtype=bool)
     for name in held:
@@ -90,7 +90,7 @@ def _quoted(names: Iterable[str]) -> str:
 def _positions(
     mechanism: Mechanism, problem: ClosureProblem, start: FloatArray, held: tuple[str, ...]
 ) -> FloatArray:
-    q = close_loops(problem, start, _free_coordinates(mechanism, held))
+    q = close_loops(problem, start, free_coordinates(mechanism, held))
     if problem.closed(q):
         return q
     gaps = problem.gaps(q)
@@ -99,13 +99,11 @@ def _positions(
         name
         for name in held
         if problem.closed(
-            close_loops(
-                problem, start, _free_coordinates(mechanism, [h for h in held if h != name])
-            )
+            close_loops(problem, start, free_coordinates(mechanism, [h for h in held if h != name]))
         )
     ]
     if not guilty and len(held) > 1:
-        everything_free = close_loops(problem, start, _free_coordinates(mechanism, ()))
+        everything_free = close_loops(problem, start, free_coordinates(mechanism, ()))
         guilty = list(held) if problem.closed(everything_free) else []
     if guilty:
         raise AssemblyError(
@@ -188,7 +186,7 @@ def _rates(
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
         """Rates in units, the largest G v left, and whether a motion has these rates."""
-        free = _free_coordinates(mechanism, names)
+        free = free_coordinates(mechanism, names)
         u = fit(v / problem.unit, free, conditions)
         if u is not None and close is not None:
             limit = branch_limit(close, q, u)

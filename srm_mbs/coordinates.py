@@ -8,11 +8,12 @@ planar joint; rates are linear then angular, in the moving body's frame.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 
@@ -73,3 +74,29 @@ def set_rate(mechanism: Mechanism, v: FloatArray, name: str, value: Any) -> None
     joint = mechanism.joint(name)
     what = "one finite number (rad/s or m/s)" if joint.nv == 1 else f"{joint.nv} finite numbers"
     v[joint.idx_v : joint.idx_v + joint.nv] = _numbers(value, name, {joint.nv: what})
+
+
+def coordinate_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """A name for each velocity component (nv,): the joint's, or ``joint[i]`` if it has several."""
+    names = []
+    for name in mechanism.joint_names:
+        count = mechanism.joint(name).nv
+        names += [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]
+    return tuple(names)
+
+
+def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
+    """Velocity indices of the joints ``names``, in that order.
+
+    Raises
+    ------
+    InputError
+        For an unknown joint, or one that is named twice.
+    """
+    indices: list[int] = []
+    for name in names:
+        joint = mechanism.joint(name)
+        if joint.idx_v in indices:
+            raise InputError(f"joint {name!r} is named twice", remedy="Name it once")
+        indices += range(joint.idx_v, joint.idx_v + joint.nv)
+    return np.array(indices, dtype=int)

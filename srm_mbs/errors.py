@@ -87,6 +87,14 @@ class AssemblyError(InputError):
         self.held = held
 
 
+class AnalysisError(SrmError, RuntimeError):
+    """An equilibrium or a path was not found; ``q`` (nq,) is how far the search came."""
+
+    def __init__(self, problem: str, *, q: Any, remedy: str | None = None) -> None:
+        super().__init__(f"{problem}. {remedy}" if remedy else problem)
+        self.q = q
+
+
 class EvaluationError(SrmError, ArithmeticError):
     """The equations of motion could not be evaluated at one Runge-Kutta stage."""
 

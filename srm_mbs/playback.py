@@ -24,7 +24,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.scene import ASPECT, draw_scene, import_meshcat
 
 if TYPE_CHECKING:
-    from srm_mbs.solution import Solution
+    from srm_mbs.motion import Playable
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ _open_visualizers: list[Any] = []
 
 
 def play(
-    solution: Solution,
+    solution: Playable,
     *,
     fps: float = 60.0,
     open_browser: bool = True,
@@ -176,7 +176,7 @@ class _Recorder:
         self.commands.append(command.lower())
 
 
-def export_html(solution: Solution, path: str | Path, *, fps: float = 60.0) -> None:
+def export_html(solution: Playable, path: str | Path, *, fps: float = 60.0) -> None:
     """Write one file that plays a run in any browser, without a network or a server.
 
     It starts at once and repeats for ever.  Below are pause, play and the time slider; the speed

@@ -22,7 +22,7 @@ from srm_mbs.mechanism import WORLD, Mechanism
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, Visual, visuals_of
 
 if TYPE_CHECKING:
-    from srm_mbs.solution import Solution
+    from srm_mbs.motion import Playable
 
 log = logging.getLogger(__name__)
 
@@ -70,20 +70,20 @@ class Motion:
         return float((len(self.times) - 1) / (self.times[-1] - self.times[0]))
 
 
-def sample_motion(solution: Solution, joints: tuple[int, ...], fps: float) -> Motion:
+def sample_motion(solution: Playable, joints: tuple[int, ...], fps: float) -> Motion:
     """Forward kinematics of the dense output at uniform times.
 
     Parameters
     ----------
     solution
-        The run.
+        The run, or a motion.
     joints
         Indices of joints of its model.
     fps
         Wanted key frames per second.  There are fewer if otherwise all bodies together had more
         than :data:`MAX_BODY_FRAMES`, but at least :data:`MIN_FPS` or ``fps``, the smaller one.
     """
-    start, end = float(solution.steps.times[0]), solution.steps.end
+    start, end = solution.span
     duration = end - start
     wanted = duration * fps * (1.0 - 1e-12)  # rounding must not add one to a whole number
     allowed = max(MAX_BODY_FRAMES // max(1, len(joints)), math.ceil(MIN_FPS * duration))
@@ -230,7 +230,7 @@ def _material(meshcat: Any, visual: Visual) -> Any:
     )
 
 
-def draw_scene(meshcat: Any, scene: Any, solution: Solution, fps: float) -> None:
+def draw_scene(meshcat: Any, scene: Any, solution: Playable, fps: float) -> None:
     """Send the whole scene, the motion included, to ``scene``, a meshcat Visualizer.
 
     ``fps`` is the wanted number of key frames per second (:func:`sample_motion`).

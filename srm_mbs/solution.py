@@ -203,6 +203,11 @@ class Solution:
         )
 
     @property
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the run, whatever ``t`` holds."""
+        return float(self.steps.times[0]), self.steps.end
+
+    @property
     def rejected(self) -> FloatArray:
         """Start and length (k, 2) s of the steps rejected for their error."""
         return self._attempts("rejected")

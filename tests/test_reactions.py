@@ -16,15 +16,13 @@ from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.multibody import ClosedSystem, make_system
 from srm_mbs.systems.reactions import reactions_at
-from tests.mechanisms import along_x, floating_ring, rod
+from tests.mechanisms import CLOSED_MODELS, along_x, floating_ring, rod
 from tests.test_structure import BRICARD_RATES, bricard
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
 G = 9.81
 load = cache(srm.load)
-CLOSED_MODELS = tuple(name for name in srm.bundled_models() if name != "pendulum_chain")
-
 every_closed_model = pytest.mark.parametrize("name", CLOSED_MODELS)
 
 

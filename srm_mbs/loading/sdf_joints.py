@@ -117,7 +117,7 @@ class JointReader:
         for tag in ("axis", "axis2"):
             if tag not in TYPES[kind] and node.find(tag) is not None:
                 values.remark(
-                    f"<{tag}> means nothing in a {kind} joint; it is ignored, with its limits and dynamics",
+                    f"<{tag}> of a {kind} joint means nothing; its limits and dynamics do not act",
                     name,
                 )
         if kind == "gearbox":

@@ -13,7 +13,9 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from srm_mbs.analysis.energy_balance import EnergyBalance
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
+    from srm_mbs.analysis.inverse_dynamics import InverseDynamics, inverse_dynamics
     from srm_mbs.analysis.linearisation import Linearisation, linearise
+    from srm_mbs.analysis.mobility import MobilityMap, mobility_map
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
     from srm_mbs.dae import DaeSolution, solve_dae
@@ -60,11 +62,13 @@ _HOME = {
     "FORCE_TYPES": "forces",
     "ForceElement": "mechanism",
     "InputError": "errors",
+    "InverseDynamics": "analysis.inverse_dynamics",
     "JointMotion": "motion",
     "JointTorque": "forces",
     "Linearisation": "analysis.linearisation",
     "LoopClosure": "mechanism",
     "Mechanism": "mechanism",
+    "MobilityMap": "analysis.mobility",
     "PSRM": "methods.psrm",
     "SRM": "methods.srm",
     "SemiExplicitDAE": "semi_explicit",
@@ -80,9 +84,11 @@ _HOME = {
     "backend": "kernel",
     "bundled_models": "loading",
     "equilibrium": "analysis.equilibrium",
+    "inverse_dynamics": "analysis.inverse_dynamics",
     "linearise": "analysis.linearisation",
     "load": "loading",
     "load_solution": "storage",
+    "mobility_map": "analysis.mobility",
     "n_four_bar": "loading",
     "simulate": "simulation",
     "solve_dae": "dae",
@@ -105,11 +111,13 @@ __all__ = [
     "Equilibrium",
     "ForceElement",
     "InputError",
+    "InverseDynamics",
     "JointMotion",
     "JointTorque",
     "Linearisation",
     "LoopClosure",
     "Mechanism",
+    "MobilityMap",
     "SemiExplicitDAE",
     "SimulationError",
     "Solution",
@@ -122,9 +130,11 @@ __all__ = [
     "backend",
     "bundled_models",
     "equilibrium",
+    "inverse_dynamics",
     "linearise",
     "load",
     "load_solution",
+    "mobility_map",
     "n_four_bar",
     "simulate",
     "solve_dae",

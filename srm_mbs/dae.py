@@ -23,8 +23,8 @@ from srm_mbs.options import (
     step_size_control,
 )
 from srm_mbs.progress import progress_of
+from srm_mbs.records import Statistics
 from srm_mbs.semi_explicit import SemiExplicitDAE
-from srm_mbs.solution import Statistics
 from srm_mbs.stepping.dense import DenseOutput, StepData, step_data
 from srm_mbs.stepping.events import EventWatch, prepare_events
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate

@@ -32,7 +32,8 @@ from srm_mbs.options import (
     step_size_control,
 )
 from srm_mbs.progress import progress_of
-from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
+from srm_mbs.records import ATTEMPT, Settings, Statistics
+from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.guard import BranchGuard

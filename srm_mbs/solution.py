@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.records import Settings, Statistics
 from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
@@ -26,56 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srm_mbs.analysis.energy_balance import EnergyBalance
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Work done by a run.
-
-    Attributes
-    ----------
-    steps, rejected
-        Accepted steps, and steps rejected for their error.
-    placements, replaced
-        Steps shortened in advance, and redone, so that no stage lies on a singular point.
-    zone_steps
-        Accepted steps with a stage so close to a singular configuration that rows were dropped.
-    evaluations
-        Evaluations of the equations of motion, the initial step's included.
-    factorisations
-        Factorisations of the constraint algebra; 0 for an open chain.
-    wall_time
-        Seconds.
-    """
-
-    steps: int
-    rejected: int
-    placements: int
-    replaced: int
-    zone_steps: int
-    evaluations: int
-    factorisations: int
-    wall_time: float
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a run was made; kept for saving and for reports."""
-
-    method: str
-    tableau: str
-    rtol: float
-    atol: tuple[float, ...]
-    step: float | None
-    controlled: bool
-    placement: str = "automatic"
-    singular_times: tuple[float, ...] = ()
-    backend: str = "python"
-
-
-ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
-"""A step that did not stand: its start and length (s), error estimate over tolerance, and whether
-it was ``"rejected"`` for its error or ``"replaced"`` because of a singular configuration."""
 
 
 class Solution:
@@ -287,6 +237,28 @@ class Solution:
         Constant torques and wrenches have no potential here.
         """
         return np.array([self._system.energy(np.concatenate(x)) for x in zip(self.q, self.v)])
+
+    @cached_property
+    def accelerations(self) -> FloatArray:
+        """v' (n, nv) of the equations of motion at ``t``, controller included.
+
+        Raises
+        ------
+        InputError
+            For a loaded run that had a controller.
+        """
+        self._need_controller("acceleration")
+        states = np.hstack([self.q, self.v])
+        nv = self.mechanism.model.nv
+        rates = [self._system.evaluate(t, x).rate()[nv:].copy() for t, x in zip(self.t, states)]
+        return np.array(rates).reshape(len(rates), nv)
+
+    @property
+    def degrees_of_freedom(self) -> NDArray[np.int_]:
+        """Momentary degrees of freedom (n,) at ``t``; more in :func:`srm_mbs.mobility_map`."""
+        from srm_mbs.analysis.mobility import mobility_map
+
+        return mobility_map(self).degrees_of_freedom
 
     @cached_property
     def energy_balance(self) -> EnergyBalance:

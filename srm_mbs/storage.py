@@ -29,7 +29,8 @@ from srm_mbs.mechanism import (
 )
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
-from srm_mbs.solution import ATTEMPT, Settings, Solution, Statistics
+from srm_mbs.records import ATTEMPT, Settings, Statistics
+from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure

@@ -15,7 +15,7 @@ PACKAGE = Path(srm_mbs.__file__).parent
 
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
-    ("_kernel", "arrays", "errors", "semi_explicit"),
+    ("_kernel", "arrays", "errors", "records", "semi_explicit"),
     ("closures",),
     ("mechanism",),
     ("coordinates", "forces", "systems"),

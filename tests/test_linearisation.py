@@ -64,7 +64,9 @@ def reduced_four_bar(mechanism: srm.Mechanism) -> Callable:
 
 def test_a_hanging_rod_swings_with_the_root_of_g_over_its_reduced_length() -> None:
     found = srm.linearise(chain([pin.JointModelRY()], q0=[0.5 * np.pi]))
-    np.testing.assert_allclose(found.eigenvalues, np.sqrt(1.5 * G) * np.array([1j, -1j]), atol=1e-11)
+    np.testing.assert_allclose(
+        found.eigenvalues, np.sqrt(1.5 * G) * np.array([1j, -1j]), atol=1e-11
+    )
     assert found.coordinates == found.inputs == ("joint_0",)
     np.testing.assert_allclose(found.B, [[0.0], [3.0]], atol=1e-13)
     np.testing.assert_allclose(found.drift, 0.0, atol=1e-14)

@@ -15,7 +15,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.stepping.crossings import Crossing, Watched, passage_at
 from srm_mbs.stepping.dense import DenseOutput, StepData
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
-from srm_mbs.systems.singular import nearest_singular
+from srm_mbs.systems.singular import SingularConfiguration, nearest_singular
 
 LOOKED_AT = 0.02
 """sigma below which a motion that turns back is looked at."""
@@ -45,6 +45,11 @@ class Bifurcation:
     distance: float
     stopped: bool
     _passage: Crossing = field(repr=False, compare=False)
+
+    @property
+    def singular(self) -> SingularConfiguration | None:
+        """Its local analysis; None if none was found close to the motion."""
+        return self._passage.singular
 
     @property
     def configuration(self) -> FloatArray | None:

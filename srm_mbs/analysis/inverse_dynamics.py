@@ -1,0 +1,260 @@
+r"""Inverse dynamics on closures: the forces of chosen joints for a prescribed motion.
+
+With the velocities N that keep the loops closed, and the acceleration a_0 that the mechanism has
+without actuators in the same state, M a + nle - forces = S^T tau - G^T lam becomes
+
+    N^T S^T tau = N^T M (a - a_0),
+
+without the multipliers.  Where there are more actuators than degrees of freedom the tau of least
+weighted norm is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray, IndexArray
+from srm_mbs.coordinates import coordinate_names, joint_coordinates
+from srm_mbs.errors import InputError
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.solution import Solution
+from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.multibody import make_system
+from srm_mbs.systems.reactions import reactions_at
+from srm_mbs.systems.tangent import tangent_basis
+
+TOLERANCE = 1e-6
+"""Default of ``tolerance``."""
+ACTUATES = 1e-12
+"""Relative singular value below which the actuators do not move a direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class InverseDynamics:
+    """Forces that a motion needs.
+
+    Attributes
+    ----------
+    t : (n,) s
+        Times.
+    actuated : na names
+        Joints (``joint[i]`` where one has several coordinates).
+    torques : (n, na)
+        Their forces, N m and N.
+    power : (n,) W
+        What they give to the mechanism.
+    residual : (n,)
+        Force that the actuators could not give, over the largest that the motion needs.
+    """
+
+    t: FloatArray
+    actuated: tuple[str, ...]
+    torques: FloatArray
+    power: FloatArray
+    residual: FloatArray
+    _reactions: Callable[[], Any] = field(repr=False)
+
+    @cached_property
+    def _computed(self) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
+        return self._reactions()  # type: ignore[no-any-return]
+
+    @property
+    def reactions(self) -> Mapping[str, FloatArray]:
+        """Per loop (n, 6), as ``solution.reactions``; computed when first read."""
+        return self._computed[0]
+
+    @property
+    def reaction_multipliers(self) -> Mapping[str, FloatArray]:
+        """Per loop (n, rows), as ``solution.reaction_multipliers``."""
+        return self._computed[1]
+
+
+def _motion(
+    mechanism: Mechanism, motion: Any, t: Any
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """t (n,), q (n, nq), v (n, nv), a (n, nv) of what was given."""
+    nq, nv = mechanism.model.nq, mechanism.model.nv
+    if isinstance(motion, Solution):
+        if (motion.mechanism.model.nq, motion.mechanism.model.nv) != (nq, nv):
+            raise InputError("the run is one of another mechanism", element="motion")
+        run = motion if t is None else motion.at(t)
+        return run.t, run.q, run.v, run.accelerations
+    if callable(motion):
+        if t is None:
+            raise InputError(
+                "a motion given as a function needs times", element="t", remedy="Give t (n,)"
+            )
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        states = [motion(float(time)) for time in times]
+        parts: list[Any] = [times, *(np.array(part, dtype=float) for part in zip(*states))]
+    elif t is not None:
+        raise InputError(
+            "times are part of a motion that is given as arrays", element="t", remedy="Leave it out"
+        )
+    else:
+        try:
+            parts = [np.array(part, dtype=float) for part in motion]
+        except (TypeError, ValueError):
+            parts = []
+    n = len(parts[0]) if parts and parts[0].ndim == 1 else 0
+    shapes = [part.shape for part in parts]
+    if shapes != [(n,), (n, nq), (n, nv), (n, nv)] or not all(
+        np.isfinite(part).all() for part in parts
+    ):
+        raise InputError(
+            f"a motion of shapes {shapes}, or with values that are not finite, cannot be",
+            element="motion",
+            remedy=f"Give a solution, (t, q, v, a) of shapes (n,), (n, {nq}), (n, {nv}), "
+            f"(n, {nv}), or a function of t that returns q, v, a",
+        )
+    return parts[0], parts[1], parts[2], parts[3]
+
+
+def inverse_dynamics(
+    mechanism: Mechanism,
+    motion: Any,
+    actuated: str | Iterable[str] | None = None,
+    *,
+    t: Any = None,
+    weights: Any = None,
+    tolerance: float = TOLERANCE,
+) -> InverseDynamics:
+    """The forces of the actuated joints that a motion needs.
+
+    Parameters
+    ----------
+    mechanism
+        Its gravity, force elements, damping and friction act as well.
+    motion
+        A run (:class:`~srm_mbs.solution.Solution`; its controller is part of what is to be found),
+        arrays (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t that
+        returns q, v, a.
+    actuated
+        Names of the joints with actuators; by default all joints.
+    t : (n,) s
+        Times for a function, or to read a run at.
+    weights : (na,)
+        Where the forces are not unique, the sum of weight times force squared is least; ones by
+        default, 1/N^2 m^2 and 1/N^2.
+    tolerance
+        Largest error of the motion against the closures, over units and rates, and largest force
+        that the actuators may leave, over the largest needed.
+
+    Raises
+    ------
+    InputError
+        If the motion violates the closures, stands on a singular configuration, or needs forces
+        that the actuated joints cannot give.
+    """
+    times, q, v, a = _motion(mechanism, motion, t)
+    names = mechanism.joint_names if actuated is None else actuated
+    columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
+    labels = coordinate_names(mechanism)
+    count = len(columns)
+    weight = np.ones(count) if weights is None else np.array(weights, dtype=float)
+    if weight.shape != (count,) or not np.all(weight > 0.0):
+        raise InputError(
+            f"weights of shape {weight.shape} do not fit {count} actuated coordinates",
+            element="weights",
+            remedy=f"Give {count} positive numbers",
+        )
+    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
+    unit, nv = geometry.unit, mechanism.model.nv
+    free = nv - mechanism.structure.rank
+    system = make_system(mechanism)
+    torques, missing, needed = np.zeros((len(times), count)), np.zeros(len(times)), 0.0
+    for i, time in enumerate(times):
+        _check_motion(geometry, time, q[i], v[i] / unit, a[i] / unit, tolerance)
+        basis, _ = tangent_basis(geometry, q[i], np.arange(nv))
+        if basis.shape[1] != free:
+            raise InputError(
+                f"at t = {time:.6g} s the motion stands on a singular configuration, where the "
+                "forces of the actuators are not determined",
+                element="motion",
+                remedy="Leave this time out",
+            )
+        own = system.evaluate(time, np.concatenate([q[i], v[i]])).rate()[nv:]
+        geometry.closure(q[i])
+        inertia = basis.T @ geometry.mass()
+        right = inertia @ ((a[i] - own) / unit)
+        needed = max(needed, *np.abs(right), *np.abs(inertia @ (a[i] / unit)), 0.0)
+        reach = basis[columns].T * (unit[columns] / np.sqrt(weight))
+        found = np.linalg.lstsq(reach, right, rcond=ACTUATES)[0]
+        torques[i] = found / np.sqrt(weight)
+        missing[i] = np.abs(reach @ found - right).max(initial=0.0)
+    residual = missing / needed if needed else missing
+    if residual.max(initial=0.0) > tolerance:
+        worst = int(np.argmax(residual))
+        raise InputError(
+            f"{', '.join(labels[j] for j in columns)} cannot drive this motion of {free} degrees "
+            f"of freedom: at t = {times[worst]:.6g} s {residual[worst]:.1e} of the largest force "
+            "is missing",
+            element="actuated",
+            remedy="Name more joints",
+        )
+
+    def reactions() -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
+        return _reactions(mechanism, times, q, v, torques, columns)
+
+    power = (torques * v[:, columns]).sum(axis=1)
+    return InverseDynamics(
+        times, tuple(labels[j] for j in columns), torques, power, residual, reactions
+    )
+
+
+def _check_motion(
+    geometry: ClosureGeometry,
+    time: float,
+    q: FloatArray,
+    u: FloatArray,
+    a: FloatArray,
+    tolerance: float,
+) -> None:
+    """Refuse positions, rates u and accelerations a, in units, that the closures forbid."""
+    g, G = geometry.closure(q)
+    speed = float(np.abs(u).max(initial=0.0))
+    bias = geometry.bias(q, u) * geometry.row_size
+    checks = (
+        ("positions", g, 1.0),
+        ("rates", G @ u, speed),
+        ("accelerations", G @ a + bias, max(float(np.abs(a).max(initial=0.0)), speed**2)),
+    )
+    for what, error, size in checks:
+        worst = float(np.abs(error).max(initial=0.0))
+        if worst > tolerance * size:
+            raise InputError(
+                f"at t = {time:.6g} s the {what} of the motion violate the closures by "
+                f"{worst / size if size else worst:.1e}",
+                element="motion",
+                remedy="Close positions and rates with srm.assemble, or simulate a motion",
+            )
+
+
+def _reactions(
+    mechanism: Mechanism,
+    times: FloatArray,
+    q: FloatArray,
+    v: FloatArray,
+    torques: FloatArray,
+    columns: IndexArray,
+) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
+    acting = np.zeros(mechanism.model.nv)
+    system = make_system(mechanism, lambda t, q, v: acting)
+    parts = []
+    for i in range(len(times)):
+        acting[columns] = torques[i]
+        own = slice(i, i + 1)
+        parts.append(reactions_at(system, times[own], q[own], v[own]))
+    wrenches, multipliers = (
+        {
+            loop.name: np.concatenate([part[k][loop.name] for part in parts])
+            for loop in mechanism.loops
+        }
+        for k in (0, 1)
+    )
+    return wrenches, multipliers

@@ -1,0 +1,121 @@
+"""Degrees of freedom along a run: what the closures leave, and where that changes.
+
+The momentary degrees of freedom are nv minus the rank of G.  They exceed the structural number only
+on singular configurations, which a run passes between two output times: those come from
+``solution.crossings`` and ``solution.bifurcations``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.coordinates import coordinate_names
+from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.tangent import tangent_basis
+
+if TYPE_CHECKING:
+    from srm_mbs.solution import Solution
+
+
+@dataclass(frozen=True)
+class MobilityChange:
+    """Where a run met a singular configuration.
+
+    Attributes
+    ----------
+    time
+        When it was closest to it (s).
+    degrees_of_freedom
+        Momentary degrees of freedom on it.
+    loops
+        The loops whose rows lose rank there.
+    """
+
+    time: float
+    degrees_of_freedom: int
+    loops: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MobilityMap:
+    """Degrees of freedom along a run.
+
+    Attributes
+    ----------
+    t : (n,) s
+        The times of the solution.
+    degrees_of_freedom : (n,) int
+        nv minus the rank of the closures, momentarily.
+    rank : (n,) int
+        Rank of the closures.
+    singular_values : (n, k)
+        Singular values of G in units, rows over their usual size, falling.
+    distance : (n,)
+        The last of them that the structural rank counts: 0 on a singular configuration; inf
+        without closures.
+    participation : (n, nv)
+        How much each coordinate takes part in what the closures leave free: 1 freely, 0 not at all.
+    coordinates : nv names
+        Of the coordinates.
+    """
+
+    t: FloatArray
+    degrees_of_freedom: NDArray[np.int_]
+    rank: NDArray[np.int_]
+    singular_values: FloatArray
+    distance: FloatArray
+    participation: FloatArray
+    coordinates: tuple[str, ...]
+    _solution: Solution = field(repr=False)
+
+    @cached_property
+    def changes(self) -> tuple[MobilityChange, ...]:
+        """Singular configurations that the run met, in order of time."""
+        return _changes(self._solution)
+
+
+def mobility_map(solution: Solution) -> MobilityMap:
+    """Degrees of freedom, rank and what can move at the times of ``solution``; see
+    :meth:`srm_mbs.solution.Solution.at` for other times."""
+    mechanism = solution.mechanism
+    model = mechanism.model
+    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
+    everything = np.arange(model.nv)
+    bases, values = [], []
+    for q in solution.q:
+        basis, singular = tangent_basis(geometry, q, everything)
+        bases.append(basis)
+        values.append(singular)
+    freedom = np.array([basis.shape[1] for basis in bases], dtype=int)
+    table = np.array(values).reshape(len(bases), -1)
+    structural = mechanism.structure.rank
+    parts = [np.linalg.norm(basis, axis=1) for basis in bases]
+    return MobilityMap(
+        solution.t,
+        freedom,
+        model.nv - freedom,
+        table,
+        table[:, structural - 1] if structural else np.full(len(bases), np.inf),
+        np.array(parts).reshape(len(bases), model.nv),
+        coordinate_names(mechanism),
+        solution,
+    )
+
+
+def _changes(solution: Solution) -> tuple[MobilityChange, ...]:
+    if not solution.mechanism.structure.rank:
+        return ()
+    nv = solution.mechanism.model.nv
+    met = [(passage.time, passage.singular, passage.loops) for passage in solution.crossings]
+    met += [(stay.start, stay.singular, stay.loops) for stay in solution.bifurcations]
+    return tuple(
+        MobilityChange(time, nv - found.rank, loops)
+        for time, found, loops in sorted(met, key=lambda entry: entry[0])
+        if found is not None
+    )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,7 +24,18 @@ from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.psrm import PSRM
-from srm_mbs.stepping import guard, hermite, kinks, loop, placement, stepsize, turning
+from srm_mbs.stepping import (
+    breakpoints,
+    guard,
+    hermite,
+    kinks,
+    loop,
+    placement,
+    starting,
+    stepsize,
+    turning,
+)
+from srm_mbs.stepping.breakpoints import Passing, Pieces
 from srm_mbs.stepping.dense import DenseOutput, StepData
 from srm_mbs.stepping.events import EventWatch
 from srm_mbs.stepping.loop import RunRecord, Tick
@@ -94,14 +106,21 @@ CONSTANTS = {
     "open": loop.OPEN,
     "lost": loop.LOST,
     "watched_steps": loop.WATCHED_STEPS,
+    "look": starting.LOOK,
+    "closer": breakpoints.CLOSER,
 }
 """Every number of the algorithm, from the module of the reference that has it."""
 
 
 def compiled(system: ClosedSystem | OpenSystem) -> Any:
     """The kernel's twin of ``system``, with a workspace of its own."""
-    controller = system.controlled_force if system.controlled else None
-    return core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
+    held = system.held
+    controller = system.controlled_force if system.controlled and held is None else None
+    twin = core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
+    if held is not None:
+        for t, force in zip(held.times, held.values):
+            twin.hold(t, force, True)
+    return twin
 
 
 class _TwinTerms:
@@ -137,6 +156,11 @@ class Evaluator:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._system, name)
+
+    def between(self, first: float, last: float) -> None:
+        """Times of both within [``first``, ``last``] (s); see :mod:`..stepping.breakpoints`."""
+        self._system.between(first, last)
+        self._twin.between(first, last)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.systems.base.System`."""
@@ -204,8 +228,10 @@ class CompiledRun:
         From :func:`compiled`.
     method, norm, memory, state
         As for :func:`~srm_mbs.stepping.loop.integrate`.
-    t_end, step, first_step, max_step
-        End of the run, fixed step or None, first and longest step of step-size control (s).
+    pieces
+        Of the run; its end is that of the last one.
+    step, first_step, max_step
+        Fixed step or None, first and longest step of step-size control (s).
     placed
         ``"automatic"`` or ``"off"``.
     """
@@ -217,7 +243,7 @@ class CompiledRun:
         norm: ErrorNorm,
         memory: Memory,
         state: FloatArray,
-        t_end: float,
+        pieces: Pieces,
         *,
         step: float | None,
         first_step: float,
@@ -225,7 +251,7 @@ class CompiledRun:
         placed: str,
     ) -> None:
         self.twin, self.method, self.norm = twin, method, norm
-        self.start, self.t_end = state.copy(), t_end
+        self.start, self.t_end = state.copy(), float(pieces.ends[-1])
         self.adaptive = step is None
         scheme = method.scheme
         gaps = np.array(scheme.gaps)
@@ -253,7 +279,10 @@ class CompiledRun:
                 "eps": None if eps is None else (eps.factor, eps.power),
                 "state": np.ascontiguousarray(state),
                 "t0": 0.0,
-                "t_end": t_end,
+                "ends": pieces.ends,
+                "first": pieces.first,
+                "last": pieces.last,
+                "given": pieces.given.astype(float),
                 "step": 0.0 if step is None else step,
                 "first_step": first_step,
                 "max_step": max_step,
@@ -296,11 +325,33 @@ class CompiledRun:
         """What it carries to the next step."""
         return _memory_from(self._run.memory())
 
+    def pass_breakpoint(self, passing: Passing) -> None:
+        """Go on behind a breakpoint at which the kernel stopped.
+
+        Raises
+        ------
+        ControllerError
+            If the sampled controller fails.
+        EvaluationError
+            If the first stage cannot be evaluated, or the motion on is not determined.
+        """
+        t, state = self._run.t, self._run.state
+        before = self.memory()
+        known = False
+        if self._run.at_breakpoint:
+            passing.enter(self._run.piece + 1, t, state)
+            with suppress(ArithmeticError):  # the reference says why
+                known = self._run.enter()
+        else:
+            passing.enter(self._run.piece, t, state)
+        if not known:
+            self._run.remember(_memory(passing.resolved(t, state, before)))
+
     def __getattr__(self, name: str) -> Any:
         return getattr(self._run, name)
 
 
-CHUNK_FULL, FINISHED, TOO_SHORT, STANDSTILL, CLOSURES, NOT_EVALUATED = range(6)
+CHUNK_FULL, FINISHED, TOO_SHORT, STANDSTILL, CLOSURES, NOT_EVALUATED, BREAKPOINT = range(7)
 """Why the kernel returned: ``Stop`` in run.hpp."""
 
 
@@ -331,7 +382,9 @@ class CompiledRecord(RunRecord):
             for step, (threshold, history) in arrays.pop("zones").items()
         }
         times, states = arrays.pop("times"), arrays.pop("states")
+        breaks = arrays.pop("breaks").astype(int)
         return StepData(
+            breaks=breaks,
             times=np.concatenate([[self.t0], times]),
             states=np.concatenate([self.x0[None], states]),
             zones=zones,
@@ -346,6 +399,7 @@ def integrate(
     *,
     tick: Tick | None = None,
     events: EventWatch | None = None,
+    passing: Passing | None = None,
 ) -> CompiledRecord:
     """As :func:`srm_mbs.stepping.loop.integrate`, on the kernel.
 
@@ -355,6 +409,8 @@ def integrate(
         The mechanism that ``run`` is of.
     tick, events
         With either, the kernel returns after every step.
+    passing
+        What happens at breakpoints, if there are any.
     """
     state = run.start
     record = CompiledRecord(0.0, state)
@@ -366,9 +422,12 @@ def integrate(
         if events is not None:
             events.begin(0.0, state)
         reason = CHUNK_FULL
-        while reason == CHUNK_FULL:
+        while reason in (CHUNK_FULL, BREAKPOINT):
             made = run.count
             reason = run.advance(1 if one_by_one else 0)
+            if reason == BREAKPOINT and passing is not None:
+                run.pass_breakpoint(passing)
+                continue
             if reason not in (CHUNK_FULL, FINISHED):
                 trouble = _trouble(reason, system, run)
                 loop.fail(record, run.t, run.h, run.memory().sigma, trouble, run.adaptive)
@@ -385,7 +444,7 @@ def integrate(
                 loop.tell(tick, t, result.h, result.state)
         else:
             record.finished(run.t_end)
-    except (KeyboardInterrupt, ControllerError, EventError) as error:
+    except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
         record.broken_off(run.t, error)
     record.attempts = [
         loop.Attempt(t, h, ratio, _VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
@@ -491,10 +550,12 @@ class CompiledDenseOutput(DenseOutput):
                 "width": steps.rates.shape[1],
                 "corrected": steps.corrections.shape[1] > 0,
                 "zones": list(steps.zones),
+                "breaks": steps.breaks.astype(float),
                 **{
                     name: np.ascontiguousarray(getattr(steps, name))
                     for name in (
                         "times", "states", "rates", "corrections", "sigmas", "end_rate",
+                        "break_rates",
                     )
                 },
             },

@@ -394,6 +394,11 @@ class Mechanism:
             )
         set_(self, "friction_speed", speed)
 
+    def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
+        """Times (s) from ``t0`` to ``t_end`` at which a part of it that depends on time is not
+        smooth: knots of tables, switches of drives.  Runs take no step across them."""
+        return ()
+
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
         changed = copy(self)

@@ -24,6 +24,9 @@ LOOSEST_RTOL = 1e-4
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 AVOIDABLE = 1e-9
 """Fraction of the run within which of its ends a given singular time cannot be avoided."""
+SAMPLED = 1e-9
+"""Part of a sample time before the end of a run from which no sample is taken."""
+MOST_SAMPLES = 10**8
 METHODS: dict[str, Callable[..., Method]] = {
     "psrm": PSRM,
     "srm": partial(SRM, restart=True, carry=True),
@@ -164,6 +167,53 @@ def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> Floa
             )
     inside: FloatArray = times[(times > t0) & (times < t_end)]
     return inside
+
+
+def checked_breakpoints(breakpoints: Any) -> FloatArray:
+    """The given times, in any order."""
+    if isinstance(breakpoints, tuple) and not breakpoints:
+        return np.zeros(0)
+    remedy = "Give times (s) at which a force jumps or has a kink"
+    times = numbers(breakpoints, "breakpoints", remedy)
+    if times.ndim != 1:
+        raise InputError(
+            f"breakpoints has shape {times.shape}", element="breakpoints", remedy=remedy
+        )
+    return times
+
+
+def check_avoidable(singular_times: FloatArray, breakpoints: FloatArray, t_end: float) -> None:
+    """Refuse singular times on breakpoints, on which a step has to end."""
+    if not len(singular_times):
+        return
+    apart = np.abs(singular_times[:, None] - breakpoints).min(axis=1)
+    if np.any(apart <= AVOIDABLE * t_end):
+        raise InputError(
+            f"a step must end at {singular_times[int(np.argmin(apart))]:g} s, a breakpoint",
+            element="singular_times",
+            remedy="Leave it out, or move the breakpoint",
+        )
+
+
+def checked_samples(sample_time: Any, controller: Any, t_end: float) -> FloatArray:
+    """Times (s) after 0 and before ``t_end`` at which a controller is sampled; often none."""
+    if sample_time is None:
+        return np.zeros(0)
+    period = positive(sample_time, "sample_time", " of seconds")
+    if controller is None:
+        raise InputError(
+            "sample_time is given, but no controller",
+            element="sample_time",
+            remedy="Give controller=, a function of (t, q, v)",
+        )
+    count: int = math.ceil(t_end / period - SAMPLED)
+    if count > MOST_SAMPLES:
+        raise InputError(
+            f"sample_time = {period:g} s makes {count} samples",
+            element="sample_time",
+            remedy=f"Give at least {t_end / MOST_SAMPLES:.1e} s for a run of this length",
+        )
+    return np.arange(1, count, dtype=np.float64) * np.float64(period)
 
 
 def check_embedded(scheme: ButcherTableau, step: float | None) -> None:

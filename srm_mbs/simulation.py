@@ -21,10 +21,13 @@ from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.psrm import PSRM
 from srm_mbs.options import (
+    check_avoidable,
     check_embedded,
+    checked_breakpoints,
     checked_method,
     checked_placement,
     checked_rtol,
+    checked_samples,
     checked_singular_times,
     checked_times,
     numbers,
@@ -34,6 +37,7 @@ from srm_mbs.options import (
 from srm_mbs.progress import progress_of
 from srm_mbs.records import ATTEMPT, Settings, Statistics
 from srm_mbs.solution import Solution
+from srm_mbs.stepping.breakpoints import Passing, pieces_between
 from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.guard import BranchGuard
@@ -46,8 +50,8 @@ from srm_mbs.stepping.stepsize import (
     Verdict,
     initial_step,
 )
-from srm_mbs.systems.base import System
-from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, make_system
+from srm_mbs.systems.held import HeldForce
+from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, called, make_system
 from srm_mbs.systems.units import row_units
 
 log = logging.getLogger(__name__)
@@ -133,6 +137,20 @@ def _check_consistent(mechanism: Mechanism) -> bool:
     return True
 
 
+def _sampler(
+    system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, twin: Any
+) -> Callable[[float, FloatArray], None]:
+    """What samples ``controller`` at (t, state), for ``held`` and for the kernel."""
+
+    def sample(t: float, state: FloatArray) -> None:
+        force = called(controller, t, *system.split(state))
+        held.hold(t, force)
+        if twin is not None:
+            twin.hold(t, force, True)
+
+    return sample
+
+
 def _control(
     system: OpenSystem | ClosedSystem,
     method: Method,
@@ -170,6 +188,8 @@ def simulate(
     t_eval: Any = None,
     events: Any = None,
     controller: Controller | None = None,
+    sample_time: float | None = None,
+    breakpoints: Any = (),
     placement: str = "automatic",
     singular_times: Any = (),
     progress: bool | Tick = False,
@@ -211,7 +231,14 @@ def simulate(
         or < 0) counts only zeros passed upwards or downwards.  Zeros at t = 0 are no events.
         Located on the dense output (:mod:`srm_mbs.stepping.events`).
     controller
-        (t, q, v) -> generalised forces (nv,), N and N m, called at every stage.
+        (t, q, v) -> generalised forces (nv,), N and N m, called at every stage; with
+        ``sample_time`` at 0, T, 2 T, ... only, and what it returned is held in between.
+    sample_time
+        T (s) of a sampled controller.  Steps end on the samples.
+    breakpoints : (k,)
+        Times (s) at which a force jumps or has a kink, in any order; those outside the run are
+        ignored.  Steps end there, and every scheme keeps its order; those of drives and tables
+        of the mechanism are known.
     placement
         How steps are placed around singular configurations: ``"automatic"``, from sigma;
         ``"halved"``, the thesis' rule 2.4.1 (1): a step h that ends on one is replaced by h/2
@@ -268,12 +295,17 @@ def simulate(
     method = _checked_method(method, tableau)
     rtol = checked_rtol(rtol)
     times = checked_times(t_eval, 0.0, t_end)
+    samples = checked_samples(sample_time, controller, t_end)
+    kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(0.0, t_end)])
+    pieces = pieces_between(kinks, samples, 0.0, t_end)
+    check_avoidable(avoided, pieces.ends, t_end)
     on_kernel = _uses_kernel(backend, method, placement, avoided)
     mechanism, state = _initial_state(mechanism, q0, v0)
     norm = ErrorNorm(
         _absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
     )
-    system = make_system(mechanism, controller)
+    held = None if sample_time is None else HeldForce()
+    system = make_system(mechanism, controller if held is None else held)
     if mechanism.loops:
         mechanism.at_start("consistent", lambda: _check_consistent(mechanism))
 
@@ -284,7 +316,11 @@ def simulate(
     try:
         if on_kernel:
             twin = kernel.compiled(system)
-        evaluator: System = system if twin is None else kernel.Evaluator(system, twin)
+        evaluator = system if twin is None else kernel.Evaluator(system, twin)
+        passing = Passing(pieces, system, method, norm, evaluator)
+        if held is not None and controller is not None:
+            passing.sample = _sampler(system, held, controller, twin)
+            passing.sample(0.0, state)
         memory = start(system, method, 0.0, state, norm, t_end, evaluator)
 
         def chosen_first_step() -> float:
@@ -303,13 +339,13 @@ def simulate(
                     norm,
                     memory,
                     state,
-                    t_end,
+                    pieces,
                     step=step,
                     first_step=chosen_first_step() if step is None else 0.0,
                     max_step=longest,
                     placed=placement,
                 )
-                record = kernel.integrate(system, run, tick=tick, events=watch)
+                record = kernel.integrate(system, run, tick=tick, events=watch, passing=passing)
             else:
                 control, wrappers = _control(
                     system, method, step, chosen_first_step, t_end, placement, avoided
@@ -326,7 +362,9 @@ def simulate(
                     max_step=longest,
                     tick=tick,
                     events=watch,
+                    breakpoints=passing,
                 )
+        passing.done()
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(0.0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = 0 s: {error}."

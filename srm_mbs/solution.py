@@ -18,6 +18,7 @@ from srm_mbs.records import Settings, Statistics
 from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.loops import all_rows, closure_errors
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 from srm_mbs.systems.reactions import reactions_at
@@ -101,6 +102,11 @@ class Solution:
             self.t_events, found = events
             self.q_events = [states[:, :nq] for states in found]
             self.v_events = [states[:, nq:] for states in found]
+
+    @property
+    def held(self) -> HeldForce | None:
+        """What a sampled controller held; None without one."""
+        return self._system.held
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output: q and v at time ``t`` (s), a scalar or an array of any order.

@@ -32,11 +32,12 @@ from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.records import ATTEMPT, Settings, Statistics
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import StepData
+from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure
 from srm_mbs.systems.units import Units
 
-FORMAT = 3
+FORMAT = 4
 _STEP_ARRAYS = (
     "times",
     "states",
@@ -48,6 +49,8 @@ _STEP_ARRAYS = (
     "placements",
     "held",
     "end_rate",
+    "breaks",
+    "break_rates",
 )
 
 
@@ -109,6 +112,8 @@ def save_solution(solution: Solution, path: Path) -> None:
         arrays[f"event_{k}_states"] = np.hstack([q, v])
     if solution.t_eval is not None:
         arrays["t_eval"] = solution.t_eval
+    if solution.held is not None:
+        arrays |= {"held_times": solution.held.times, "held_values": solution.held.values}
     arrays |= {
         "attempts": solution.attempts,
         "q0": mechanism.q0,
@@ -180,6 +185,19 @@ def _events(
     return times, states
 
 
+def _held(arrays: dict[str, FloatArray], nv: int) -> HeldForce | None:
+    """The output of a sampled controller."""
+    if "held_times" not in arrays:
+        return None
+    times, values = arrays["held_times"], arrays["held_values"]
+    if values.shape != (len(times), nv) or not len(times):
+        raise ValueError(f"held_values has shape {values.shape}, not {(len(times), nv)}")
+    held = HeldForce()
+    for t, value in zip(times.tolist(), values):
+        held.hold(t, value)
+    return held
+
+
 def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
     """Refuse arrays that do not belong together, before anything reads them."""
     n, s = steps.count, get_tableau(tableau).n_stages
@@ -192,6 +210,7 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
         "placements": (n,),
         "held": (n,),
         "end_rate": (m,),
+        "break_rates": (len(steps.breaks), m),
     }
     for name, shape in expected.items():
         if getattr(steps, name).shape != shape:
@@ -208,7 +227,8 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
 def load_solution(path: str | Path) -> Solution:
     """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
 
-    A controller is not saved: reactions of a controlled run cannot be computed afterwards.
+    A controller is not saved: reactions of a controlled run cannot be computed afterwards, unless
+    it was sampled; what it held is saved.
 
     Raises
     ------
@@ -252,7 +272,8 @@ def load_solution(path: str | Path) -> Solution:
         _check_shapes(mechanism, meta["settings"]["tableau"], steps)
         tuples = {key: tuple(meta["settings"][key]) for key in ("atol", "singular_times")}
         settings = Settings(**meta["settings"] | tuples)
-        system, scheme = make_system(mechanism), get_tableau(settings.tableau)
+        system = make_system(mechanism, _held(arrays, mechanism.model.nv))
+        scheme = get_tableau(settings.tableau)
         return Solution(
             mechanism,
             system,

@@ -15,6 +15,7 @@ import srm_mbs as srm
 from srm_mbs import kernel, options, simulation
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm
+from srm_mbs.stepping.breakpoints import Passing, pieces_between
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.placement import SingularityPlacement
 from srm_mbs.stepping.singular_times import SlopeOfSigma, placed
@@ -75,6 +76,8 @@ class Comparison:
         (t, reference, kernel) where the two decided differently.
     attempts, zones, replaced
         How many attempts there were, how many used the zone, how many were redone.
+    entered
+        How many breakpoints were passed.
     """
 
     h: float = 0.0
@@ -88,6 +91,7 @@ class Comparison:
     attempts: int = 0
     zones: int = 0
     replaced: int = 0
+    entered: int = 0
 
 
 def compare(
@@ -100,11 +104,14 @@ def compare(
     placement: str = "automatic",
     eps: float | str | None = None,
     max_step: float = np.inf,
+    controller: Any = None,
+    breakpoints: tuple[float, ...] = (),
 ) -> Comparison:
     """Run the reference and repeat each of its attempts on the kernel."""
     method = srm.PSRM(tableau, eps=eps)
     scheme = method.scheme
-    system = make_system(mechanism)
+    system = make_system(mechanism, controller)
+    pieces = pieces_between(np.array(breakpoints), np.zeros(0), 0.0, t_end)
     twin = kernel.compiled(system)
     norm = ErrorNorm(
         simulation._absolute_tolerance(mechanism, None, rtol),
@@ -127,7 +134,7 @@ def compare(
         norm,
         memory,
         x,
-        t_end,
+        pieces,
         step=step,
         first_step=first,
         max_step=max_step,
@@ -136,7 +143,17 @@ def compare(
     out = Comparison()
     one = np.concatenate([norm.one, norm.one])[: 2 * system.nv]
     t = 0.0
+    passing = Passing(pieces, system, method, norm)
+    control.aim(passing.end)
     while t < t_end and out.attempts < 4000:
+        if t >= passing.end:
+            memory = passing.next(t, x, memory)
+            control.aim(passing.end)
+            out.entered += 1
+            assert run.at_breakpoint
+            run.enter()
+            change = run.memory().rate - memory.rate
+            out.rates = max(out.rates, float(np.max(np.abs(change) / (np.abs(memory.rate) + one))))
         limit = min(max_step, system.step_limit(x))
         # Before the reference proposes: its proposal writes the slope into the memory.
         _, twin_verdict = run.attempt_from(t, x, memory, control_state(control))

@@ -218,7 +218,7 @@ def test_a_run_of_another_format_is_refused_as_such(tmp_path: Path) -> None:
     srm.simulate(srm.load("four_bar"), 0.1).save(tmp_path / "run.npz")
     with np.load(tmp_path / "run.npz") as file:
         arrays = dict(file)
-    arrays["meta"] = np.array(str(arrays["meta"]).replace('{"format": 3,', '{"format": 1,'))
+    arrays["meta"] = np.array(str(arrays["meta"]).replace('{"format": 4,', '{"format": 1,'))
     np.savez(tmp_path / "old.npz", **arrays)
-    with pytest.raises(srm.InputError, match=r"old\.npz: it has format 1, this version reads 3"):
+    with pytest.raises(srm.InputError, match=r"old\.npz: it has format 1, this version reads 4"):
         srm.load_solution(tmp_path / "old.npz")

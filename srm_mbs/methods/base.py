@@ -217,3 +217,15 @@ class Method(Protocol):
 
     def accept(self, memory: Memory, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
+
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> Memory:
+        """``memory`` behind a breakpoint at ``t``, where forces may have jumped: nothing that
+        depends on those before it is kept.
+
+        Raises
+        ------
+        EvaluationError
+            If the first stage cannot be evaluated.
+        """

@@ -204,6 +204,21 @@ class IteratedSweeps:
         memory.magnitude = result.magnitude
         memory.sweeps = result.sweeps
 
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> Memory:
+        """``memory`` behind a breakpoint; see :class:`~srm_mbs.methods.base.Method`.
+
+        Multipliers of corrector sweeps follow from positions and velocities alone, (2.6), and do
+        not jump; own histories go on.
+        """
+        fresh = self.start(system, t, state, norm)
+        fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
+        if self.own_history:
+            begun = fresh.sweeps[-1].history
+            fresh.sweeps = tuple(replace(node, rate=None, history=begun) for node in memory.sweeps)
+        return fresh
+
     def _own_sweeps(
         self,
         system: System,

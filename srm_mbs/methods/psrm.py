@@ -16,7 +16,7 @@ from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
 from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.methods.iterated import First, IteratedSweeps
 from srm_mbs.methods.regularisation import Regularisation, parse_eps
-from srm_mbs.methods.split import split_accept, split_start, split_step
+from srm_mbs.methods.split import split_accept, split_resume, split_start, split_step
 from srm_mbs.methods.sweeps import INTERPOLATIONS, checked_regulariser, checked_tableau, interpolant
 from srm_mbs.methods.tableaus import get_tableau
 from srm_mbs.systems.base import System
@@ -155,3 +155,11 @@ class PSRM:
             self._sweeps.accept(memory, result)
             return
         split_accept(memory, result)
+
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> Memory:
+        """``memory`` behind a breakpoint; see :class:`~srm_mbs.methods.base.Method`."""
+        if self._sweeps is not None:
+            return self._sweeps.resume(system, t, state, memory, norm)
+        return split_resume(system, t, state, memory)

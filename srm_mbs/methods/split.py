@@ -159,6 +159,13 @@ def split_step(
     )
 
 
+def split_resume(system: System, t: float, state: FloatArray, memory: Memory) -> Memory:
+    """``memory`` behind a breakpoint; see :class:`~srm_mbs.methods.base.Method`."""
+    fresh = split_start(system, t, state)
+    fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
+    return fresh
+
+
 def split_accept(memory: Memory, result: StepResult) -> None:
     """Move ``memory`` to the end of an accepted step."""
     memory.steps += 1

@@ -145,3 +145,9 @@ class SRM:
     def accept(self, memory: Memory, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
         self._sweeps.accept(memory, result)
+
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> Memory:
+        """``memory`` behind a breakpoint; see :class:`~srm_mbs.methods.base.Method`."""
+        return self._sweeps.resume(system, t, state, memory, norm)

@@ -12,11 +12,11 @@ tolerance of the closures.  The extra stages of dop853 are evaluated only when a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.methods.base import StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
@@ -59,6 +59,10 @@ class StepData:
         Step index -> (threshold, history) of the steps with a stage in the zone.
     stop
         Where a terminal event ended the run within the last step (s); None at the step's end.
+    breaks : (k,)
+        Numbers of the steps that end on a breakpoint, counted from 1: behind it rates are others.
+    break_rates : (k, m)
+        Tangent rates before those breakpoints.
     """
 
     times: FloatArray
@@ -73,6 +77,8 @@ class StepData:
     end_rate: FloatArray
     zones: dict[int, tuple[float, MultiplierHistory]]
     stop: float | None = None
+    breaks: IndexArray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    break_rates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def end(self) -> float:
@@ -84,6 +90,25 @@ class StepData:
         """Number of steps."""
         return len(self.times) - 1
 
+    def piece(self, step: int) -> tuple[int, int]:
+        """First and last end of a step, as indices into ``times``, between the breakpoints around
+        ``step``."""
+        k = int(np.searchsorted(self.breaks, step, side="right"))
+        first = int(self.breaks[k - 1]) if k else 0
+        last = int(self.breaks[k]) if k < len(self.breaks) else self.count
+        return first, last
+
+    def rate_at(self, node: int, last: int) -> FloatArray:
+        """Tangent rate (m,) at the end ``node`` of a step of the piece that ends at ``last``."""
+        rate: FloatArray
+        if node < last:
+            rate = self.rates[node, 0]
+        elif node == self.count:
+            rate = self.end_rate
+        else:
+            rate = self.break_rates[int(np.searchsorted(self.breaks, node))]
+        return rate
+
 
 def step_data(
     t0: float,
@@ -93,6 +118,7 @@ def step_data(
     scheme: ButcherTableau,
     tangent_size: int,
     stop: float | None = None,
+    breaks: Sequence[int] = (),
 ) -> StepData:
     """The ``steps`` from (``t0``, ``x0``), which end at ``times``, as arrays."""
     n, stages = len(steps), scheme.n_stages + 1
@@ -113,6 +139,8 @@ def step_data(
             if s.zone is not None and s.history is not None
         },
         stop=stop,
+        breaks=np.array(breaks, dtype=int),
+        break_rates=np.array([steps[i - 1].end_rate for i in breaks]).reshape(-1, tangent_size),
     )
 
 
@@ -180,7 +208,8 @@ class DenseOutput:
 
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
         data, system = self._steps, self._system
-        if data.count > 1 and (
+        first, last = data.piece(step)
+        if last - first > 1 and (
             step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
         ):
             if step not in self._smooth:

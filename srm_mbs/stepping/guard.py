@@ -90,6 +90,10 @@ class BranchGuard:
             self._tries = 0
         return verdict
 
+    def aim(self, end: float) -> None:
+        """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
+        self._inner.aim(end)
+
     def told(self) -> list[float]:
         """Times (s) up to which the motion may have changed its branch: the suspects, and the ends
         of longer passages (:mod:`srm_mbs.stepping.turning`) without any."""

@@ -52,6 +52,8 @@ class HermiteStep:
         self._system = system
         self._steps = steps
         self._step = step
+        # Rates jump at breakpoints: a polynomial goes no further.
+        self._piece = steps.piece(step)
         self._start = steps.states[step]
         self._h = steps.times[step + 1] - steps.times[step]
         polynomials = [self._through(count) for count in NODES]
@@ -62,10 +64,11 @@ class HermiteStep:
     def _nodes(self, count: int) -> list[int]:
         """Indices of up to ``count`` ends of steps around the step, none too close together."""
         times, near = self._steps.times, SPACING * self._h
+        first, last = self._piece
         before, after = [self._step], [self._step + 1]
         i, j = self._step - 1, self._step + 2
-        while len(before) + len(after) < count and (i >= 0 or j < len(times)):
-            left = i >= 0 and (j >= len(times) or len(before) <= len(after))
+        while len(before) + len(after) < count and (i >= first or j <= last):
+            left = i >= first and (j > last or len(before) <= len(after))
             if left:
                 if times[before[-1]] - times[i] >= near:
                     before.append(i)
@@ -80,13 +83,13 @@ class HermiteStep:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
-        last = steps.count
+        last = self._piece[1]
         t0 = steps.times[self._step]
         points: list[float] = []
         values: list[FloatArray] = []
         for i in self._nodes(count):
             delta = self._system.difference(self._start, steps.states[i])
-            rate = steps.rates[i, 0] if i < last else steps.end_rate
+            rate = steps.rate_at(i, last)
             points += 2 * [(steps.times[i] - t0) / self._h]
             values += [delta, self._h * self._system.chart_rate(delta, rate)]
         return KroghInterpolator(np.array(points), np.array(values))  # type: ignore[no-any-return]

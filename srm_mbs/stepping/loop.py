@@ -13,6 +13,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.stepping.breakpoints import Passing
 from srm_mbs.stepping.dense import StepData, step_data
 from srm_mbs.stepping.events import EventWatch, Stop
 from srm_mbs.stepping.stepsize import StepSizeControl, Verdict
@@ -72,6 +73,8 @@ class RunRecord:
         When, why, and what to try.
     stop
         Where a terminal event ended the run (s), within the last step; None without one.
+    breaks
+        Numbers of the steps after which a breakpoint lies.
     """
 
     t0: float
@@ -83,6 +86,7 @@ class RunRecord:
     message: str = ""
     stop: float | None = None
     wall_time: float = 0.0
+    breaks: list[int] = field(default_factory=list)
 
     def finished(self, t_end: float) -> None:
         """Mark it as complete."""
@@ -103,7 +107,16 @@ class RunRecord:
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        return step_data(self.t0, self.x0, self.times, self.steps, scheme, tangent_size, self.stop)
+        return step_data(
+            self.t0,
+            self.x0,
+            self.times,
+            self.steps,
+            scheme,
+            tangent_size,
+            self.stop,
+            self.breaks,
+        )
 
 
 Tick = Callable[[float, float, FloatArray], None]
@@ -123,6 +136,7 @@ def integrate(
     max_step: float = np.inf,
     tick: Tick | None = None,
     events: EventWatch | None = None,
+    breakpoints: Passing | None = None,
 ) -> RunRecord:
     """Integrate from ``t0`` to ``t_end``; never raises for what happens on the way.
 
@@ -140,6 +154,8 @@ def integrate(
         Called after every accepted step.
     events
         Looks for events in every accepted step.
+    breakpoints
+        Where the right-hand side is not smooth; None if it is.
 
     Returns
     -------
@@ -154,10 +170,16 @@ def integrate(
     t, x = t0, state
     trouble = ""
     redone = False
+    if breakpoints is not None:
+        control.aim(breakpoints.end)
     try:
         if events is not None:
             events.begin(t, x)
         while t < t_end:
+            if breakpoints is not None and t >= breakpoints.end:
+                record.breaks.append(len(record.times))
+                memory = breakpoints.next(t, x, memory)
+                control.aim(breakpoints.end)
             limit = min(max_step, system.step_limit(x))
             proposal = control.propose(t, limit, memory)
             h = proposal.h
@@ -204,7 +226,7 @@ def integrate(
                 tell(tick, t, h, x)
         else:
             record.finished(t_end)
-    except (KeyboardInterrupt, ControllerError, EventError) as error:
+    except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
         record.broken_off(t, error)
     # An interrupt between the two appends would leave one list longer.
     del record.times[min(len(record.times), len(record.steps)) :]

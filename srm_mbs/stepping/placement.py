@@ -133,9 +133,14 @@ class SingularityPlacement:
                 return Proposal(h, t + h, placed=True)
         return proposal
 
+    def aim(self, end: float) -> None:
+        """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
+        self._t_end = end
+        self._inner.aim(end)
+
     def _placed(self, distance: float, h: float, t: float) -> float:
         if t + h >= self._t_end and self._gaps.ends_on(distance, h):
-            return h  # the run ends there
+            return h  # the run, or its piece, ends there
         if self.adaptive:
             return self._gaps.longest_step(distance, h)
         # A fixed step may cross its grid point where that is singular: it could only creep up.
@@ -147,7 +152,7 @@ class SingularityPlacement:
     def _better_step(self, h: float, sigmas: FloatArray, slope: float, last: bool) -> float | None:
         """A better step length if a stage or the end came too close, else None.
 
-        ``last``: the run ends with this step, wherever that is.
+        ``last``: the run, or its piece, ends with this step, wherever that is.
         """
         values: list[float] = sigmas.tolist()
         reach = TOO_CLOSE * max(self._slope, slope) * h

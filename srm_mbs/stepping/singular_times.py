@@ -102,6 +102,11 @@ class AvoidTimes:
         """The inner control's verdict."""
         return self._inner.judge(proposal, result)
 
+    def aim(self, end: float) -> None:
+        """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
+        self._t_end = end
+        self._inner.aim(end)
+
     def _clear(self, h: float, distances: FloatArray) -> bool:
         """Whether a step of length ``h`` stays clear of times at ``distances`` (s)."""
         if self._end_blocked(h, distances):
@@ -153,6 +158,10 @@ class SlopeOfSigma:
             slope = sigma_slope(self._inverse, result.sigmas, proposal.h)
             self._slope = max(slope, 0.5 * self._slope)
         return verdict
+
+    def aim(self, end: float) -> None:
+        """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
+        self._inner.aim(end)
 
 
 class HalvedStep(SlopeOfSigma):
@@ -206,6 +215,11 @@ class HalvedStep(SlopeOfSigma):
         verdict = super().judge(proposal, result)
         self._plan = self._plan[1:] if verdict is Verdict.ACCEPTED else ()
         return verdict
+
+    def aim(self, end: float) -> None:
+        """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
+        self._t_end = end
+        super().aim(end)
 
     def _ends_on_a_singular_point(self, h: float, result: StepResult) -> bool:
         sigmas = result.sigmas

@@ -16,7 +16,8 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import ErrorNorm, Memory, Method
-from srm_mbs.stepping.leaving import Point, free_acceleration, known_multipliers
+from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.stepping.leaving import DIRECT_SIGMA, Point, free_acceleration, known_multipliers
 from srm_mbs.systems.base import System
 from srm_mbs.systems.branch_limit import BranchLimit, branch_next_to
 from srm_mbs.systems.branches import branch_tangents
@@ -121,6 +122,7 @@ def start(
     norm: ErrorNorm,
     t_end: float,
     evaluator: System | None = None,
+    memory: Memory | None = None,
 ) -> Memory:
     """The memory of ``method`` at the initial state, also on a singular configuration.
 
@@ -130,6 +132,9 @@ def start(
         End of the run (s): nothing is evaluated beyond it.
     evaluator
         Evaluates the first stage; ``system`` by default.
+    memory
+        Of a run that goes on here, at a breakpoint, with the first stage evaluated directly;
+        changed here.  Such a motion need not leave the singular configuration.
 
     Raises
     ------
@@ -139,20 +144,33 @@ def start(
     EvaluationError
         If the start, or what lies ahead of it, cannot be evaluated.
     """
-    memory = method.start(system if evaluator is None else evaluator, t, state, norm)
+    begins = memory is None
+    if memory is None:
+        memory = method.start(system if evaluator is None else evaluator, t, state, norm)
     if not isinstance(system, ClosedSystem) or not memory.sigma < LOOK:
         return memory
     mechanism = system.mechanism
-    geometry = ClosureGeometry(mechanism, mechanism.q0)
     q, v = system.split(state)
-    limit = _limit(geometry, mechanism.structure.rank, q, v, memory.sigma)
+    geometry = ClosureGeometry(mechanism, q)
+    try:
+        limit = _limit(geometry, mechanism.structure.rank, q, v, memory.sigma)
+    except InputError:
+        if begins or memory.sigma < UNDECIDED:
+            raise
+        return memory
     if limit is None:
         return memory
     free = free_acceleration(system, t, state)
     multiplier = limit.multiplier(v, free)
     memory.rate = np.concatenate([v, free - multiplier])
     here = Point(state, memory.rate, multiplier, memory.sigma)
-    history = known_multipliers(system, geometry, t, here, norm, t_end)
+    history = MultiplierHistory.begin(t, multiplier)
+    if begins or memory.sigma < DIRECT_SIGMA:
+        try:
+            history = known_multipliers(system, geometry, t, here, norm, t_end)
+        except InputError:
+            if begins:
+                raise
     if memory.history is not None:
         memory.history = history
     memory.sweeps = tuple(

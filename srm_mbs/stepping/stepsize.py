@@ -61,6 +61,9 @@ class StepSizeControl(Protocol):
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Judge a step; ``result`` is None if a stage could not be evaluated."""
 
+    def aim(self, end: float) -> None:
+        """A step ends on ``end`` (s): a breakpoint, or the end of the run."""
+
 
 def _until(t: float, h: float, end: float) -> Proposal:
     """A step of at most ``h`` that neither passes ``end`` nor leaves a sliver before it."""
@@ -112,10 +115,18 @@ class PIControl:
         factor = min(MAX_FACTOR, max(MIN_FACTOR, factor))
         if self._just_rejected:
             factor = min(factor, 1.0)
-        self._h = proposal.h * factor
+        h = proposal.h * factor
+        if proposal.t_new == self._t_end and proposal.h < self._h:
+            # Cut to end there: behind a breakpoint the step wanted before is the better guess.
+            h = max(h, self._h)
+        self._h = h
         self._xi_old = max(xi, XI_OLD_FLOOR)
         self._just_rejected = False
         return Verdict.ACCEPTED
+
+    def aim(self, end: float) -> None:
+        """See :class:`StepSizeControl`."""
+        self._t_end = end
 
 
 class FixedStep:
@@ -148,9 +159,17 @@ class FixedStep:
         """Accept every step that could be evaluated."""
         if result is None or not np.isfinite(result.state).all():
             return Verdict.REJECTED
-        while proposal.t_new >= self._t0 + self._index * self._step * (1.0 - 1e-14):
+        while proposal.t_new >= self._t0 + self._index * self._step - self._sliver():
             self._index += 1
         return Verdict.ACCEPTED
+
+    def _sliver(self) -> float:
+        """Distance (s) before a grid point that is not worth a step."""
+        return max(1e-9, 1e-14 * self._index) * self._step
+
+    def aim(self, end: float) -> None:
+        """See :class:`StepSizeControl`; the grid stays."""
+        self._t_end = end
 
 
 def initial_step(

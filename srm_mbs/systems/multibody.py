@@ -30,6 +30,7 @@ from srm_mbs.systems.charts import (
     planar_translation,
 )
 from srm_mbs.systems.forces import COINCIDENT, resolved_forces
+from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.projection import Projection, unwhiten
 from srm_mbs.systems.units import row_units
@@ -42,6 +43,26 @@ _sum_of_sizes = blas.dasum
 _NO_ROWS = np.zeros(0)
 _OVERFLOW = 1e100
 """Size of a state from which products of its rates may overflow."""
+
+
+def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+    """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v``.
+
+    Raises
+    ------
+    ControllerError
+        If it raises, or returns anything but nv finite numbers.
+    """
+    try:
+        tau = np.asarray(controller(t, q.copy(), v.copy()), dtype=float)
+    except Exception as error:
+        raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
+    if tau.shape != v.shape or not np.isfinite(tau).all():
+        raise ControllerError(
+            f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
+            f"it must return {len(v)} finite generalised forces"
+        )
+    return np.ascontiguousarray(tau)
 
 
 class _Mechanics:
@@ -70,6 +91,7 @@ class _Mechanics:
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
         self._position_of: IndexArray = mechanism.derived("position_of", self._vector_coordinates)
+        self._first, self._last = -np.inf, np.inf
 
     # Made when the reference first evaluates: the compiled kernel has its own.
     @cached_property
@@ -103,34 +125,29 @@ class _Mechanics:
         """Whether a controller acts."""
         return self._controller is not None
 
+    @property
+    def held(self) -> HeldForce | None:
+        """The controller, if it is one whose output is held between samples."""
+        return self._controller if isinstance(self._controller, HeldForce) else None
+
     def count(self, evaluations: int, factorisations: int) -> None:
         """Count what the compiled kernel did for this system."""
         self.evaluations += evaluations
+
+    def between(self, first: float, last: float) -> None:
+        """Evaluate at times within [``first``, ``last``] (s) only, the nearer of them for others:
+        on one side of a breakpoint, whatever ``evaluate`` is given."""
+        self._first, self._last = first, last
 
     def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Views (q, v) of a state."""
         return state[: self.nq], state[self.nq :]
 
     def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Generalised forces (nv,) of the controller, which gets copies of ``q`` and ``v``.
-
-        Raises
-        ------
-        ControllerError
-            If it raises, or returns anything but nv finite numbers.
-        """
+        """Generalised forces (nv,) of the controller, as :func:`called` returns them."""
         if self._controller is None:
             return np.zeros(self.nv)
-        try:
-            tau = np.asarray(self._controller(t, q.copy(), v.copy()), dtype=float)
-        except Exception as error:
-            raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
-        if tau.shape != (self.nv,) or not np.isfinite(tau).all():
-            raise ControllerError(
-                f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
-                f"it must return {self.nv} finite generalised forces"
-            )
-        return np.ascontiguousarray(tau)
+        return called(self._controller, t, q, v)
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
@@ -314,6 +331,7 @@ class OpenSystem(_Mechanics):
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """v' = aba(q, v, tau); see :class:`~srm_mbs.systems.base.System`."""
         self.evaluations += 1
+        t = min(max(t, self._first), self._last)
         q, v = state[: self.nq], state[self.nq :]
         force = self.applied_force(t, q, v)
         if self._forces is not None:
@@ -476,6 +494,7 @@ class ClosedSystem(_Mechanics):
         # First, because LAPACK may factorise what is not finite without reporting it.
         if not _sum_of_sizes(state) < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
+        t = min(max(t, self._first), self._last)
         model, data, nq = self.model, self.data, self.nq
         q, v = state[:nq], state[nq:]
         pin.crba(model, data, q, _WORLD)

@@ -57,7 +57,10 @@ Verdict PIControl::judge(const Proposal& proposal, const StepResult* result) {
                     std::pow(xi_old_, c.proportional / k);
     factor = std::min(c.max_factor, std::max(c.min_factor, factor));
     if (just_rejected_) factor = std::min(factor, 1.0);
-    h_ = proposal.h * factor;
+    double h = proposal.h * factor;
+    // Cut to end there: behind a breakpoint the step wanted before is the better guess.
+    if (proposal.t_new == t_end_ && proposal.h < h_) h = std::max(h, h_);
+    h_ = h;
     xi_old_ = std::max(xi, c.xi_old_floor);
     just_rejected_ = false;
     return Verdict::accepted;
@@ -73,7 +76,7 @@ Proposal FixedStep::propose(double t, double limit, Memory&) {
 Verdict FixedStep::judge(const Proposal& proposal, const StepResult* result) {
     if (!result || !finite(result->state.data(), static_cast<int>(result->state.size())))
         return Verdict::rejected;
-    while (proposal.t_new >= t0_ + static_cast<double>(index_) * step_ * (1.0 - 1e-14)) ++index_;
+    while (proposal.t_new >= t0_ + static_cast<double>(index_) * step_ - sliver()) ++index_;
     return Verdict::accepted;
 }
 
@@ -141,7 +144,8 @@ Proposal SingularityPlacement::propose(double t, double limit, Memory& memory) {
 }
 
 double SingularityPlacement::placed_step(double distance, double h, double t) const {
-    if (t + h >= t_end_ && gaps_.ends_on(distance, h)) return h;  // the run ends there
+    // The run, or its piece, ends there.
+    if (t + h >= t_end_ && gaps_.ends_on(distance, h)) return h;
     if (adaptive) return gaps_.longest_step(distance, h);
     // A fixed step may cross its grid point where that is singular: it could only creep up.
     if (!gaps_.ends_on(distance, h)) return distance < h ? gaps_.longest_step(distance, h) : h;

@@ -2,6 +2,7 @@
 // guard.py: how long the next step is, and whether the last one stands.
 #pragma once
 
+#include <algorithm>
 #include <limits>
 #include <memory>
 #include <vector>
@@ -45,6 +46,8 @@ public:
     virtual Proposal propose(double t, double limit, Memory& memory) = 0;
     // `result` is null if a stage could not be evaluated.
     virtual Verdict judge(const Proposal& proposal, const StepResult* result) = 0;
+    // A step ends on `end`: a breakpoint, or the end of the run.
+    virtual void aim(double end) = 0;
     bool adaptive = true;
     long placed = 0, replaced = 0;
 };
@@ -55,6 +58,7 @@ public:
         : t_end_(t_end), h_(first_step), order_(order), constants_(constants) {}
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void aim(double end) override { t_end_ = end; }
     void resume(const ControlState& s) override {
         h_ = s.h;
         xi_old_ = s.xi_old;
@@ -76,9 +80,12 @@ public:
     }
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void aim(double end) override { t_end_ = end; }
     void resume(const ControlState& s) override { index_ = s.index; }
 
 private:
+    double sliver() const { return std::max(1e-9, 1e-14 * static_cast<double>(index_)) * step_; }
+
     double t0_, t_end_, step_;
     long index_ = 1;
 };
@@ -102,6 +109,10 @@ public:
                          const ControlConstants& constants);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void aim(double end) override {
+        t_end_ = end;
+        inner_->aim(end);
+    }
     void resume(const ControlState& s) override {
         inner_->resume(s);
         slope_ = s.slope;
@@ -130,6 +141,7 @@ public:
     SlopeOfSigma(std::unique_ptr<Control> inner, const Scheme& scheme);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void aim(double end) override { inner_->aim(end); }
     void resume(const ControlState& s) override {
         inner_->resume(s);
         slope_ = s.slope;
@@ -147,6 +159,7 @@ public:
                 const ControlConstants& constants);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
+    void aim(double end) override { inner_->aim(end); }
     void resume(const ControlState& s) override {
         inner_->resume(s);
         limit_ = s.limit;

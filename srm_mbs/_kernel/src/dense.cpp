@@ -41,7 +41,22 @@ void DenseOutput::states(const double* t, long k, double* out) {
     }
 }
 
+std::pair<long, long> DenseOutput::piece(long step) const {
+    const auto& breaks = steps_.breaks;
+    const auto next = std::upper_bound(breaks.begin(), breaks.end(), step);
+    return {next == breaks.begin() ? 0 : *(next - 1), next == breaks.end() ? steps_.count : *next};
+}
+
+const double* DenseOutput::rate_at(long node, long last) const {
+    if (node < last) return steps_.rates + node * steps_.width * n_;
+    if (node == steps_.count) return steps_.end_rate;
+    const auto& breaks = steps_.breaks;
+    return steps_.break_rates + (std::lower_bound(breaks.begin(), breaks.end(), node) - breaks.begin()) * n_;
+}
+
 bool DenseOutput::close_to_singular(long step) const {
+    const auto [first, last] = piece(step);
+    if (last - first < 2) return false;  // without neighbours there is no polynomial
     if (steps_.in_zone[step]) return true;
     const int width = static_cast<int>(abscissae_.size());
     const double* sigmas = steps_.sigmas + step * width;
@@ -116,9 +131,10 @@ std::vector<long> DenseOutput::nodes(long step, int count) const {
     const double near = hermite_.spacing * (times[step + 1] - times[step]);
     std::vector<long> before{step}, after{step + 1};
     long i = step - 1, j = step + 2;
-    const long end = steps_.count + 1;
-    while (static_cast<int>(before.size() + after.size()) < count && (i >= 0 || j < end)) {
-        if (i >= 0 && (j >= end || before.size() <= after.size())) {
+    // Rates jump at breakpoints: a polynomial goes no further.
+    const auto [first, last] = piece(step);
+    while (static_cast<int>(before.size() + after.size()) < count && (i >= first || j <= last)) {
+        if (i >= first && (j > last || before.size() <= after.size())) {
             if (times[before.back()] - times[i] >= near) before.push_back(i);
             --i;
         } else {
@@ -137,12 +153,11 @@ DenseOutput::Polynomial DenseOutput::through(long step, int count) {
     const double h = times[step + 1] - times[step];
     Polynomial out;
     std::vector<double> slopes, rate(n_);
+    const long last = piece(step).second;
     for (long i : nodes(step, count)) {
         const double at = (times[i] - times[step]) / h;
         system_.difference(start, steps_.states + i * nx_, delta_.data());
-        const double* tangent =
-            i < steps_.count ? steps_.rates + i * steps_.width * n_ : steps_.end_rate;
-        system_.chart_rate(delta_.data(), tangent, rate.data());
+        system_.chart_rate(delta_.data(), rate_at(i, last), rate.data());
         for (int twice = 0; twice < 2; ++twice) {
             out.points.push_back(at);
             out.coefficients.insert(out.coefficients.end(), delta_.begin(), delta_.end());

@@ -1,6 +1,7 @@
 // Twin of srm_mbs/stepping/dense.py and hermite.py: the state at any time of a run.
 #pragma once
 
+#include <utility>
 #include <vector>
 
 #include "system.hpp"
@@ -26,6 +27,8 @@ struct StepArrays {
     bool corrected = false;
     const double *times, *states, *rates, *corrections, *sigmas, *end_rate;
     std::vector<char> in_zone;  // (count,)
+    std::vector<long> breaks;   // numbers of the steps that end on breakpoints, from 1
+    const double* break_rates = nullptr;  // tangent rates before them
 };
 
 class DenseOutput {
@@ -39,6 +42,9 @@ private:
     struct Polynomial {
         std::vector<double> points, coefficients;  // (k,), (k, n): Newton form
     };
+    // First and last end of a step between the breakpoints around a step.
+    std::pair<long, long> piece(long step) const;
+    const double* rate_at(long node, long last) const;
     bool close_to_singular(long step) const;
     void weights(double theta, double* out) const;
     const std::vector<double>& extra(long step, double h);

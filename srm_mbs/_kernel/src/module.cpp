@@ -67,7 +67,8 @@ ControlConstants control_constants_of(const nb::dict& d) {
 
 LoopConstants loop_constants_of(const nb::dict& d) {
     return {number(d, "smallest_step"), number(d, "standstill"), number(d, "large_correction"),
-            number(d, "open"),          number(d, "lost"),       whole(d, "watched_steps")};
+            number(d, "open"),          number(d, "lost"),       whole(d, "watched_steps"),
+            number(d, "look"),          number(d, "closer")};
 }
 
 ErrorNorm norm_of(const nb::dict& d) {
@@ -270,7 +271,9 @@ struct PyRun {
         const Scheme scheme = scheme_of(nb::cast<nb::dict>(d["scheme"]));
         const auto constants = nb::cast<nb::dict>(d["constants"]);
         const ControlConstants control_constants = control_constants_of(constants);
-        const double t0 = number(d, "t0"), t_end = number(d, "t_end");
+        Pieces pieces{vector_of(d["ends"]), vector_of(d["first"]), vector_of(d["last"]), {}};
+        for (double mark : vector_of(d["given"])) pieces.given.push_back(mark != 0.0);
+        const double t0 = number(d, "t0"), t_end = pieces.ends.back();
         const double step = number(d, "step"), first_step = number(d, "first_step");
         std::unique_ptr<Control> control;
         if (step > 0.0)
@@ -295,7 +298,7 @@ struct PyRun {
         run = std::make_unique<Run>(
             s, SplitStep(s, scheme, step_constants_of(constants), norm_of(nb::cast<nb::dict>(d["norm"]))),
             std::move(control), loop_constants_of(constants),
-            memory_of(nb::cast<nb::dict>(d["memory"]), s.nv), state.data(), t0, t_end,
+            memory_of(nb::cast<nb::dict>(d["memory"]), s.nv), state.data(), t0, std::move(pieces),
             number(d, "max_step"), eps);
     }
 
@@ -341,6 +344,9 @@ struct PyRun {
         out["placements"] = owned(std::move(r.placements), {count});
         out["held"] = owned(std::move(r.held), {count});
         out["end_rate"] = owned(r.end_rate, {n});
+        const std::size_t breaks = r.breaks.size();
+        out["breaks"] = owned(r.breaks, {breaks});
+        out["break_rates"] = owned(r.break_rates, {breaks, n});
         nb::dict zones;
         for (const ZoneRecord& zone : r.zones)
             zones[nb::int_(zone.step)] = nb::make_tuple(zone.threshold, dict_of(zone.history));
@@ -413,6 +419,8 @@ struct PyDense {
         arrays.sigmas = pointer("sigmas");
         arrays.end_rate = pointer("end_rate");
         arrays.count = nb::cast<long>(d["count"]);
+        for (double i : vector_of(d["breaks"])) arrays.breaks.push_back(static_cast<long>(i));
+        arrays.break_rates = pointer("break_rates");
         arrays.width = whole(d, "width");
         arrays.corrected = nb::cast<bool>(d["corrected"]);
         arrays.in_zone.assign(arrays.count, 0);
@@ -479,6 +487,11 @@ NB_MODULE(_core, m) {
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
         .def("repeat", &PySystem::repeat)
+        .def("between", [](PySystem& s, double first, double last) { s.system->between(first, last); })
+        .def("hold", [](PySystem& s, double t, const Array& force, bool keep) {
+            if (static_cast<int>(force.size()) != s.system->nv) throw nb::value_error("not (nv,)");
+            s.system->hold(t, force.data(), keep);
+        })
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
         .def_prop_ro("factorisations", [](const PySystem& s) { return s.system->factorisations(); });
@@ -493,6 +506,12 @@ NB_MODULE(_core, m) {
         .def("last", &PyRun::last)
         .def("attempts", &PyRun::attempts)
         .def("suspects", &PyRun::suspects)
+        .def("enter", [](PyRun& r) { return r.run->enter(); })
+        .def("remember", [](PyRun& r, const nb::dict& memory) {
+            r.run->memory = memory_of(memory, r.s.nv);
+        })
+        .def_prop_ro("at_breakpoint", [](PyRun& r) { return r.run->at_breakpoint(); })
+        .def_prop_ro("piece", [](PyRun& r) { return r.run->piece(); })
         .def("memory", [](PyRun& r) { return dict_of(r.run->memory); })
         .def_prop_ro("t", [](PyRun& r) { return r.run->t(); })
         .def_prop_ro("h", [](PyRun& r) { return r.run->last_h(); })

@@ -1,5 +1,6 @@
 #include "run.hpp"
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 
@@ -15,7 +16,7 @@ constexpr long clock_every = 16;
 }  // namespace
 
 Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control, LoopConstants constants,
-         Memory memory, const double* start, double t0, double t_end, double max_step,
+         Memory memory, const double* start, double t0, Pieces pieces, double max_step,
          Regularisation eps)
     : system(system),
       step(std::move(step_)),
@@ -25,12 +26,40 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control, Loop
       end_rate(2 * system.nv),
       constants_(constants),
       eps_(eps),
+      pieces_(std::move(pieces)),
       t0_(t0),
-      t_end_(t_end),
       max_step_(max_step),
       t_(t0),
-      smallest_(constants.smallest_step * std::abs(t_end - t0)),
-      seen_(constants.open) {}
+      smallest_(constants.smallest_step * std::abs(t_end() - t0)),
+      seen_(constants.open),
+      near_(constants.look) {
+    evaluate_within();
+}
+
+void Run::evaluate_within() {
+    system.between(pieces_.first[piece_], pieces_.last[piece_]);
+    control->aim(pieces_.ends[piece_]);
+}
+
+bool Run::enter() {
+    ++piece_;
+    evaluate_within();
+    breaks.push_back(static_cast<double>(count()));
+    break_rates.insert(break_rates.end(), end_rate.begin(), end_rate.end());
+    system.evaluate(t_, state.data(), System::ZoneView{});
+    system.rate(memory.rate.data());
+    memory.sigma = system.sigma();
+    system.magnitudes(state.data(), memory.magnitude.data());
+    if (!memory.has_history) return true;
+    memory.history.empty();
+    std::vector<double> multiplier(system.nv);
+    system.multiplier(multiplier.data());
+    memory.history.extend(t_, multiplier.data(), {}, 0);
+    if (memory.sigma >= constants_.look) near_ = constants_.look;
+    if (!(memory.sigma < near_)) return true;
+    near_ = constants_.closer * memory.sigma;
+    return false;
+}
 
 // Whether a step left the loops open; almost always without computing anything.
 bool Run::opens(const StepResult& r) {
@@ -69,6 +98,9 @@ void Run::record(const StepResult& r, double t_new, int placement) {
 
 void Run::resume(double t, const double* from, const Memory& known, const ControlState& known_control) {
     t_ = t;
+    const auto& ends = pieces_.ends;
+    piece_ = static_cast<std::size_t>(std::upper_bound(ends.begin(), ends.end() - 1, t) - ends.begin());
+    evaluate_within();
     std::copy(from, from + state.size(), state.begin());
     memory = known;
     control->resume(known_control);
@@ -82,7 +114,7 @@ Stop Run::attempt(Verdict& verdict) {
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
     const long made = count();
     if (made >= constants_.watched_steps && made % constants_.watched_steps == 0 &&
-        t_ - times[made - constants_.watched_steps] < constants_.standstill * (t_end_ - t0_))
+        t_ - times[made - constants_.watched_steps] < constants_.standstill * (t_end() - t0_))
         return Stop::standstill;
     const StepResult* result = nullptr;
     try {
@@ -106,7 +138,7 @@ Stop Run::attempt(Verdict& verdict) {
     std::copy(result->state.begin(), result->state.end(), state.begin());
     step.accept(memory);
     t_ = proposal.t_new;
-    return t_ < t_end_ ? Stop::chunk : Stop::finished;
+    return t_ < t_end() ? Stop::chunk : Stop::finished;
 }
 
 Stop Run::advance(long steps, double seconds) {
@@ -115,6 +147,14 @@ Stop Run::advance(long steps, double seconds) {
     const long last = steps > 0 ? count() + steps : std::numeric_limits<long>::max();
     Verdict verdict;
     for (long attempted = 1;; ++attempted) {
+        if (t_ >= pieces_.ends[piece_]) {
+            if (pieces_.given[piece_]) return Stop::breakpoint;
+            try {
+                if (!enter()) return Stop::breakpoint;
+            } catch (const EvaluationError&) {
+                return Stop::breakpoint;
+            }
+        }
         const Stop stop = attempt(verdict);
         if (stop != Stop::chunk || count() >= last) return stop;
         if (attempted % clock_every == 0 &&

@@ -15,12 +15,20 @@ enum class Stop {
     standstill = 3,  // the last steps covered almost nothing
     closures = 4,    // the step made last opens the loops
     evaluation = 5,  // a fixed step could not be evaluated
+    breakpoint = 6,  // the next piece begins, and Python has to look at it first
 };
 
 // The constants of srm_mbs/stepping/loop.py.
 struct LoopConstants {
     double smallest_step, standstill, large_correction, open, lost;
     int watched_steps;
+    double look, closer;  // breakpoints.py
+};
+
+// The pieces of a run between breakpoints; see srm_mbs/stepping/breakpoints.py.
+struct Pieces {
+    std::vector<double> ends, first, last;  // (n,)
+    std::vector<char> given;                // (n - 1,)
 };
 
 struct Attempt {
@@ -43,7 +51,7 @@ struct ZoneRecord {
 class Run {
 public:
     Run(System& system, SplitStep step, std::unique_ptr<Control> control, LoopConstants constants,
-        Memory memory, const double* state, double t0, double t_end, double max_step, Regularisation eps);
+        Memory memory, const double* state, double t0, Pieces pieces, double max_step, Regularisation eps);
 
     // Makes up to `steps` accepted steps, or as many as take `seconds`.
     Stop advance(long steps, double seconds);
@@ -52,9 +60,16 @@ public:
     void resume(double t, const double* state, const Memory& memory, const ControlState& control);
     // Proposes, makes and judges one step; `verdict` is only set if there was one.
     Stop attempt(Verdict& verdict);
+    // Goes on to the next piece; whether its first stage is accurate as it was evaluated: a
+    // singular configuration may be so near that it is not.
+    bool enter();
 
     double t() const { return t_; }
     double last_h() const { return h_; }
+    double t_end() const { return pieces_.ends.back(); }
+    // Whether the next piece has still to be entered.
+    bool at_breakpoint() const { return t_ >= pieces_.ends[piece_] && t_ < t_end(); }
+    long piece() const { return static_cast<long>(piece_); }
     long count() const { return static_cast<long>(times.size()); }
 
     System& system;
@@ -67,6 +82,7 @@ public:
     std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios,
         placements, held;
     std::vector<double> end_rate;
+    std::vector<double> breaks, break_rates;  // numbers of the steps before breakpoints; rates there
     std::vector<ZoneRecord> zones;
     std::vector<Attempt> attempts;
     bool trouble = false;  // the last attempt could not be evaluated
@@ -74,10 +90,13 @@ public:
 private:
     bool opens(const StepResult& result);
     void record(const StepResult& result, double t_new, int placement);
+    void evaluate_within();
 
     LoopConstants constants_;
     Regularisation eps_;
-    double t0_, t_end_, max_step_, t_, h_ = 0.0, smallest_, seen_;
+    Pieces pieces_;
+    std::size_t piece_ = 0;
+    double t0_, max_step_, t_, h_ = 0.0, smallest_, seen_, near_;
     bool redone_ = false;
 };
 

@@ -1,5 +1,6 @@
 #include "system.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -143,8 +144,28 @@ void System::update_loops(bool with_bias) {
     }
 }
 
+void System::hold(double t, const double* force, bool keep) {
+    if (!keep) {
+        held_from_.clear();
+        held_.clear();
+    }
+    held_from_.push_back(t);
+    held_.insert(held_.end(), force, force + nv);
+}
+
+const double* System::held_force(double t) const {
+    if (held_from_.empty()) return nullptr;
+    std::size_t k = held_from_.size() - 1;
+    if (t < held_from_[k] && k > 0) {
+        const auto after = std::upper_bound(held_from_.begin(), held_from_.end(), t);
+        k = after == held_from_.begin() ? 0 : static_cast<std::size_t>(after - held_from_.begin()) - 1;
+    }
+    return &held_[k * nv];
+}
+
 void System::evaluate(double t, const double* state, const ZoneView& zone) {
     ++evaluations;
+    t = std::min(std::max(t, first_), last_);
     if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
@@ -157,6 +178,8 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         controller_(t, state, state + nq, acted_.data());
         for (int i = 0; i < nv; ++i) f_[i] += acted_[i];
     }
+    if (const double* force = held_force(t))
+        for (int i = 0; i < nv; ++i) f_[i] += force[i];
     for (std::size_t i = 0; i < data_.friction.size(); ++i)
         f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
     if (!closed_) {

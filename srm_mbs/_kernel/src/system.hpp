@@ -7,6 +7,7 @@
 #pragma once
 
 #include <functional>
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -65,6 +66,14 @@ public:
     };
 
     void evaluate(double t, const double* state, const ZoneView& zone);
+    // Evaluates at times within [first, last] only: on one side of a breakpoint.
+    void between(double first, double last) {
+        first_ = first;
+        last_ = last;
+    }
+    // From t on a constant force (nv,) acts, beside all others; with `keep` those before stay in
+    // force at earlier times.
+    void hold(double t, const double* force, bool keep);
 
     // Terms of the stage evaluated last.
     bool constrained() const { return closed_; }
@@ -96,7 +105,11 @@ private:
     Pattern pattern() const;
     void update_loops(bool with_bias);
     void completed(const double* white, double* out) const;
+    const double* held_force(double t) const;
 
+    double first_ = -std::numeric_limits<double>::infinity();
+    double last_ = std::numeric_limits<double>::infinity();
+    std::vector<double> held_from_, held_;  // times, and forces (k, nv)
     SystemData data_;
     Controller controller_;
     std::unique_ptr<pinocchio_model::Workspace> work_;

@@ -14,6 +14,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -51,6 +52,17 @@ Model = Annotated[
 ]
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
+]
+Image = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.png", help="Write a picture of the run, at its end or --at S."),
+]
+At = Annotated[
+    float | None, typer.Option("--at", metavar="S", help="Time of the picture in the run (s).")
+]
+Video = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Write a film of the run; the suffix is .gif or .mp4."),
 ]
 
 
@@ -240,6 +252,9 @@ def simulate(
         Path | None,
         typer.Option(metavar="FILE.html", help="Write the animation as one page."),
     ] = None,
+    image: Image = None,
+    at: At = None,
+    video: Video = None,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
@@ -259,6 +274,7 @@ def simulate(
         _check_output(csv, "--csv", (".csv",))
     if html is not None:
         _check_output(html, "--html", (".html", ".htm"))
+    _check_pictures(image, video)
 
     mechanism = srm_mbs.load(model)
     defaults = mechanism.defaults
@@ -279,6 +295,8 @@ def simulate(
             (plot, solution.plot),
             (csv, solution.to_csv),
             (html, solution.export_html),
+            (image, partial(solution.export_image, t=at)),
+            (video, solution.export_video),
         ]
     )
     _table([*run_rows(solution), *(("written", str(path)) for path in written)])
@@ -289,6 +307,15 @@ def simulate(
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
         raise typer.Exit(RUN_FAILED)
+
+
+def _check_pictures(image: Path | None, video: Path | None) -> None:
+    from srm_mbs.rendering import FILMS
+
+    if image is not None:
+        _check_output(image, "--image", (".png",))
+    if video is not None:
+        _check_output(video, "--video", FILMS)
 
 
 def _first(*values: float | None) -> float:
@@ -348,9 +375,20 @@ def _first_sentence(path: Path) -> str:
 
 @app.command()
 @_reported()
-def play(run: Run) -> None:
-    """Play a saved run in the browser."""
-    _play(srm_mbs.load_solution(run))
+def play(run: Run, image: Image = None, at: At = None, video: Video = None) -> None:
+    """Play a saved run in the browser; with --image or --video, write these instead."""
+    _check_pictures(image, video)
+    solution = srm_mbs.load_solution(run)
+    if image is None and video is None:
+        _play(solution)
+        return
+    written, failed = _write(
+        [(image, partial(solution.export_image, t=at)), (video, solution.export_video)]
+    )
+    for path in written:
+        typer.echo(f"written: {path}")
+    if failed:
+        raise typer.Exit(BAD_INPUT)
 
 
 def _play(solution: Solution) -> None:

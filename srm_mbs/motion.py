@@ -91,3 +91,15 @@ class JointMotion:
         from srm_mbs.playback import export_html
 
         export_html(self, Path(path), **options)
+
+    def export_image(self, path: str | Path, **options: Any) -> None:
+        """Write a picture at one time; see :func:`srm_mbs.rendering.export_image`."""
+        from srm_mbs.rendering import export_image
+
+        export_image(self, path, **options)
+
+    def export_video(self, path: str | Path, **options: Any) -> None:
+        """Write a film; see :func:`srm_mbs.rendering.export_video`."""
+        from srm_mbs.rendering import export_video
+
+        export_video(self, path, **options)

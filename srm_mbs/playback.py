@@ -33,7 +33,14 @@ REPLY_TIME = 30.0  # s, for meshcat's server to accept one command
 # Playing ------------------------------------------------------------------------------------
 
 
-def _check_fps(fps: Any) -> float:
+def check_fps(fps: Any) -> float:
+    """``fps`` as a positive number.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
     try:
         value = float(fps)
     except (TypeError, ValueError):
@@ -85,7 +92,7 @@ def play(
     InputError
         If ``fps`` is not a positive number, or meshcat is missing or cannot start.
     """
-    fps = _check_fps(fps)
+    fps = check_fps(fps)
     meshcat = import_meshcat()
     visualizer = _start_server(meshcat)
     try:
@@ -198,7 +205,7 @@ def export_html(solution: Playable, path: str | Path, *, fps: float = 60.0) -> N
     InputError
         If ``fps`` is not a positive number, meshcat is missing, or the file cannot be written.
     """
-    fps = _check_fps(fps)
+    fps = check_fps(fps)
     meshcat = import_meshcat()
     recorder = _Recorder()
     draw_scene(meshcat, meshcat.Visualizer(window=recorder), solution, fps)

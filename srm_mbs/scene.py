@@ -240,7 +240,7 @@ def draw_scene(meshcat: Any, scene: Any, solution: Playable, fps: float) -> None
     names = _node_names(mechanism)
     joints = tuple(sorted({visual.joint for visual in visuals} - {0}))
     motion = sample_motion(solution, joints, fps)
-    view = choose_view(mechanism, _seen_points(visuals, motion))
+    view = choose_view(mechanism, seen_points(visuals, motion))
     _light(scene, view)
 
     root = scene["/mechanism"]
@@ -261,7 +261,7 @@ def draw_scene(meshcat: Any, scene: Any, solution: Playable, fps: float) -> None
         scene.set_animation(animation, play=True, repetitions=math.inf)
 
 
-def _seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
+def seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
     """Corners (n, 3) m of all shapes at sampled times."""
     chosen = np.unique(np.linspace(0, len(motion.times) - 1, SAMPLES).astype(int))
     corners: dict[int, list[FloatArray]] = {0: [np.empty((0, 3))]}

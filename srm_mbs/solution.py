@@ -356,6 +356,18 @@ class Solution:
 
         export_html(self, Path(path), **options)
 
+    def export_image(self, path: str | Path, **options: Any) -> None:
+        """Write a picture at one time; see :func:`srm_mbs.rendering.export_image`."""
+        from srm_mbs.rendering import export_image
+
+        export_image(self, path, **options)
+
+    def export_video(self, path: str | Path, **options: Any) -> None:
+        """Write a film; see :func:`srm_mbs.rendering.export_video`."""
+        from srm_mbs.rendering import export_video
+
+        export_video(self, path, **options)
+
     def __repr__(self) -> str:
         return (
             f"Solution({self.mechanism.name!r}, t={self.t[0] if len(self.t) else 0:.6g}.."

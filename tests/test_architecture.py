@@ -28,7 +28,7 @@ LAYERS = (
     ("options", "progress"),
     ("dae", "simulation"),
     ("analysis",),
-    ("plots", "visuals", "scene", "playback", "summary", "export"),
+    ("plots", "visuals", "scene", "playback", "rendering", "summary", "export"),
     ("cli",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs import scene
 from srm_mbs.playback import close, export_html, play
+from srm_mbs.rendering import browser as headless_browser
 from srm_mbs.scene import choose_view, sample_motion
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, visuals_of
 
@@ -439,25 +439,15 @@ def test_play_serves_until_it_is_interrupted_and_leaves_nothing_behind(
 
 # In the browser
 
-BROWSER_OPTIONS = [
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-]
-
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with api.sync_playwright() as playwright:
-        candidates = [shutil.which(name) for name in ("chromium", "chromium-browser", "chrome")]
-        candidates.append(playwright.chromium.executable_path)
-        installed = [path for path in candidates if path and Path(path).exists()]
-        if not installed:
-            pytest.skip("Chromium is not installed")
-        launched = playwright.chromium.launch(executable_path=installed[0], args=BROWSER_OPTIONS)
-        yield launched
-        launched.close()
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    try:
+        with headless_browser() as launched:
+            yield launched
+    except srm.InputError as error:
+        pytest.skip(str(error))
 
 
 @contextlib.contextmanager

@@ -8,166 +8,211 @@
 
 namespace srm {
 
-DenseProjection::DenseProjection(int nv, int rows, int structural_rank, double sigma_ref)
-    : Projection(nv, rows, structural_rank, sigma_ref),
-      U_(nv * nv),
-      A_(nv * rows),
-      tau_(rows),
-      norms_(rows),
-      first_norms_(rows),
-      order_(rows) {}
+namespace {
 
-double* DenseProjection::column(int row) {
-    double* out = &A_[row * nv];
-    std::fill(out, out + nv, 0.0);
-    return out;
-}
+// Up to this many coordinates the size is known to the compiler.
+constexpr int largest_unrolled = 8;
 
-void DenseProjection::cholesky(const double* M) {
-    for (int j = 0; j < nv; ++j) {
-        double* column = &U_[j * nv];
-        for (int i = 0; i < j; ++i)
-            column[i] = (M[j * nv + i] - dot(&U_[i * nv], column, i)) / U_[i * nv + i];
-        const double pivot = M[j * nv + j] - dot(column, column, j);
-        if (!(pivot > 0.0)) throw EvaluationError{Failure::mass_matrix};
-        column[j] = std::sqrt(pivot);
+// size = nv, or 0 for one that is not known.
+template <int size>
+class DenseProjection final : public Projection {
+public:
+    DenseProjection(int nv, int rows, int structural_rank, double sigma_ref)
+        : Projection(nv, rows, structural_rank, sigma_ref),
+          U_(nv * nv),
+          inverse_(nv),
+          row_(nv),
+          A_(nv * rows),
+          tau_(rows),
+          inverse_pivots_(rows),
+          squares_(rows),
+          order_(rows) {}
+
+    double* column(int row) override {
+        const int n = count();
+        double* out = &A_[row * n];
+        std::fill(out, out + n, 0.0);
+        return out;
     }
-}
 
-void DenseProjection::whiten(double* x) const {
-    int first = 0;
-    while (first < nv && x[first] == 0.0) ++first;
-    for (int i = first; i < nv; ++i)
-        x[i] = (x[i] - dot(&U_[i * nv + first], x + first, i - first)) / U_[i * nv + i];
-}
-
-void DenseProjection::unwhiten(double* x) const {
-    for (int i = nv - 1; i >= 0; --i) {
-        x[i] /= U_[i * nv + i];
-        add(-x[i], &U_[i * nv], x, i);
-    }
-}
-
-void DenseProjection::whiten_velocity(double* x) const {
-    for (int i = 0; i < nv; ++i) {
-        const double value = U_[i * nv + i] * x[i];
-        add(x[i], &U_[i * nv], x, i);
-        x[i] = value;
-    }
-}
-
-// Householder QR with column pivoting, with the pivot rule of LAPACK's xGEQP3 so that both
-// backends choose the same columns; it stops at the structural rank.
-void DenseProjection::pivoted_qr() {
-    for (int j = 0; j < rows; ++j) {
-        order_[j] = j;
-        norms_[j] = first_norms_[j] = norm(&A_[j * nv], nv);
-    }
-    const int count = std::min(structural_rank, std::min(nv, rows));
-    for (int k = 0; k < count; ++k) {
-        int pivot = k;
-        for (int j = k + 1; j < rows; ++j)
-            if (norms_[j] > norms_[pivot]) pivot = j;
-        if (pivot != k) {
-            std::swap_ranges(&A_[k * nv], &A_[k * nv] + nv, &A_[pivot * nv]);
-            std::swap(order_[k], order_[pivot]);
-            norms_[pivot] = norms_[k];
-            first_norms_[pivot] = first_norms_[k];
+    void normal(const double* g, double* white) const override {
+        const int n = count();
+        std::fill(white, white + n, 0.0);
+        for (int i = 0; i < rank; ++i) {
+            const double* column = &A_[i * n];
+            white[i] = (g[order_[i]] - dot(column, white, i)) * inverse_pivots_[i];
         }
-        double* column = &A_[k * nv];
-        const int below = nv - k - 1;
-        const double tail = norm(column + k + 1, below);
-        if (tail == 0.0) {
-            tau_[k] = 0.0;
-        } else {
-            const double alpha = column[k];
-            const double beta = -std::copysign(std::hypot(alpha, tail), alpha);
+        times_q(white);
+    }
+
+    void remove_normal(double* white) const override {
+        times_q_transposed(white);
+        std::fill(white, white + rank, 0.0);
+        times_q(white);
+    }
+
+    void whiten_velocity(double* x) const override {
+        const int n = count();
+        for (int i = 0; i < n; ++i) {
+            const double value = U_[i * n + i] * x[i];
+            add(x[i], &U_[i * n], x, i);
+            x[i] = value;
+        }
+    }
+
+    void unwhiten(double* x) const override {
+        const int n = count();
+        for (int i = n - 1; i >= 0; --i) {
+            x[i] *= inverse_[i];
+            add(-x[i], &U_[i * n], x, i);
+        }
+    }
+
+    void normals(double* out) const override {
+        const int n = count();
+        for (int k = 0; k < rank; ++k) {
+            double* column = out + k * n;
+            std::fill(column, column + n, 0.0);
+            column[k] = 1.0;
+            times_q(column);
+            unwhiten(column);
+        }
+    }
+
+    bool sparse() const override { return false; }
+
+private:
+    int count() const { return size ? size : nv; }
+
+    void keep_normal(double* white) const override {
+        times_q_transposed(white);
+        std::fill(white + rank, white + count(), 0.0);
+        times_q(white);
+    }
+
+    void factorise(const double* M, const double* f, const double* bias) override {
+        const int n = count();
+        std::copy(M, M + n * n, U_.begin());
+        std::copy(f, f + n, white_force.begin());
+        whiten_all();
+        for (int j = 0; j < rows; ++j)
+            gamma_[j] = dot(&A_[j * n], white_force.data(), n) + bias[j];
+        pivoted_qr();
+        for (int k = 0; k < structural_rank; ++k) pivots_[k] = std::abs(A_[k * n + k]);
+    }
+
+    // Cholesky's U of M in U_, and L^-1 applied to the rows and the forces on the way: row by row of
+    // U, because the updates that each row asks for do not wait for each other.
+    void whiten_all() {
+        const int n = count();
+        double* const U = U_.data();
+        double* const row = row_.data();
+        for (int k = 0; k < n; ++k) {
+            const double pivot = U[k * n + k];
+            if (!(pivot > 0.0)) throw EvaluationError{Failure::mass_matrix};
+            const double diagonal = std::sqrt(pivot), inverse = 1.0 / diagonal;
+            U[k * n + k] = diagonal;
+            inverse_[k] = inverse;
+            for (int j = k + 1; j < n; ++j) row[j] = U[j * n + k] *= inverse;
+            for (int j = k + 1; j < n; ++j) {
+                double* column = U + j * n;
+                for (int i = k + 1; i <= j; ++i) column[i] -= row[i] * row[j];
+            }
+            eliminate(k, inverse, white_force.data());
+            for (int j = 0; j < rows; ++j) eliminate(k, inverse, &A_[j * n]);
+        }
+    }
+
+    void eliminate(int k, double inverse, double* x) const {
+        if (x[k] == 0.0) return;
+        const double value = x[k] *= inverse;
+        const int n = count();
+        for (int i = k + 1; i < n; ++i) x[i] -= row_[i] * value;
+    }
+
+    // Householder QR with column pivoting, with the pivot rule of LAPACK's xGEQP3 so that both
+    // backends choose the same columns; it stops at the structural rank.  Column norms are computed
+    // anew in the loop that changes them, which LAPACK does only where updating loses digits.
+    void pivoted_qr() {
+        const int n = count();
+        for (int j = 0; j < rows; ++j) {
+            order_[j] = j;
+            squares_[j] = dot(&A_[j * n], &A_[j * n], n);
+        }
+        const int last = std::min(structural_rank, std::min(n, rows));
+        for (int k = 0; k < last; ++k) {
+            int pivot = k;
+            for (int j = k + 1; j < rows; ++j)
+                if (squares_[j] > squares_[pivot]) pivot = j;
+            if (pivot != k) {
+                std::swap_ranges(&A_[k * n], &A_[k * n] + n, &A_[pivot * n]);
+                std::swap(order_[k], order_[pivot]);
+                squares_[pivot] = squares_[k];
+            }
+            reflect(k);
+        }
+    }
+
+    // Reflects column k onto its first entry, and the columns after it.
+    void reflect(int k) {
+        const int n = count(), below = n - k - 1;
+        double* const v = &A_[k * n] + k + 1;
+        const double alpha = v[-1], tail = dot(v, v, below);
+        double beta = alpha;
+        tau_[k] = 0.0;
+        if (tail != 0.0) {
+            beta = -std::copysign(std::sqrt(alpha * alpha + tail), alpha);
             tau_[k] = (beta - alpha) / beta;
             const double scale = 1.0 / (alpha - beta);
-            for (int i = k + 1; i < nv; ++i) column[i] *= scale;
-            column[k] = beta;
+            for (int i = 0; i < below; ++i) v[i] *= scale;
+            v[-1] = beta;
         }
+        inverse_pivots_[k] = 1.0 / beta;
         for (int j = k + 1; j < rows; ++j) {
-            double* other = &A_[j * nv];
-            if (tau_[k] != 0.0) {
-                const double s = tau_[k] * (other[k] + dot(column + k + 1, other + k + 1, below));
-                other[k] -= s;
-                add(-s, column + k + 1, other + k + 1, below);
+            double* const x = &A_[j * n] + k + 1;
+            const double s = tau_[k] * (x[-1] + dot(v, x, below));
+            x[-1] -= s;
+            double square = 0.0;
+            for (int i = 0; i < below; ++i) {
+                x[i] -= s * v[i];
+                square += x[i] * x[i];
             }
-            if (norms_[j] == 0.0) continue;
-            const double part = std::abs(other[k]) / norms_[j];
-            const double left = std::max(0.0, 1.0 - part * part);
-            const double lost = norms_[j] / first_norms_[j];
-            if (left * lost * lost <= norm_lost) {
-                norms_[j] = first_norms_[j] = below > 0 ? norm(other + k + 1, below) : 0.0;
-            } else {
-                norms_[j] *= std::sqrt(left);
-            }
+            squares_[j] = square;
         }
     }
-}
 
-void DenseProjection::times_q_transposed(double* x) const {
-    for (int k = 0; k < rank; ++k) {
-        const double* column = &A_[k * nv];
-        const int below = nv - k - 1;
-        const double s = tau_[k] * (x[k] + dot(column + k + 1, x + k + 1, below));
+    void times_q_transposed(double* x) const {
+        for (int k = 0; k < rank; ++k) reflect(k, x);
+    }
+
+    void times_q(double* x) const {
+        for (int k = rank - 1; k >= 0; --k) reflect(k, x);
+    }
+
+    void reflect(int k, double* x) const {
+        const int n = count(), below = n - k - 1;
+        const double* v = &A_[k * n] + k + 1;
+        const double s = tau_[k] * (x[k] + dot(v, x + k + 1, below));
         x[k] -= s;
-        add(-s, column + k + 1, x + k + 1, below);
+        add(-s, v, x + k + 1, below);
     }
+
+    std::vector<double> U_, inverse_, row_, A_, tau_, inverse_pivots_, squares_;
+    std::vector<int> order_;
+};
+
+template <int size>
+std::unique_ptr<Projection> sized(int nv, int rows, int structural_rank, double sigma_ref) {
+    if constexpr (size > 0)
+        if (nv != size) return sized<size - 1>(nv, rows, structural_rank, sigma_ref);
+    return std::make_unique<DenseProjection<size>>(nv, rows, structural_rank, sigma_ref);
 }
 
-void DenseProjection::times_q(double* x) const {
-    for (int k = rank - 1; k >= 0; --k) {
-        const double* column = &A_[k * nv];
-        const int below = nv - k - 1;
-        const double s = tau_[k] * (x[k] + dot(column + k + 1, x + k + 1, below));
-        x[k] -= s;
-        add(-s, column + k + 1, x + k + 1, below);
-    }
-}
+}  // namespace
 
-void DenseProjection::normal(const double* g, double* white) const {
-    std::fill(white, white + nv, 0.0);
-    for (int i = 0; i < rank; ++i) {
-        const double* column = &A_[i * nv];
-        white[i] = (g[order_[i]] - dot(column, white, i)) / column[i];
-    }
-    times_q(white);
-}
-
-void DenseProjection::keep_normal(double* white) const {
-    times_q_transposed(white);
-    std::fill(white + rank, white + nv, 0.0);
-    times_q(white);
-}
-
-void DenseProjection::remove_normal(double* white) const {
-    times_q_transposed(white);
-    std::fill(white, white + rank, 0.0);
-    times_q(white);
-}
-
-void DenseProjection::normals(double* out) const {
-    for (int k = 0; k < rank; ++k) {
-        double* column = out + k * nv;
-        std::fill(column, column + nv, 0.0);
-        column[k] = 1.0;
-        times_q(column);
-        unwhiten(column);
-    }
-}
-
-void DenseProjection::factorise(const double* M, const double* f, const double* bias) {
-    cholesky(M);
-    std::copy(f, f + nv, white_force.begin());
-    whiten(white_force.data());
-    for (int j = 0; j < rows; ++j) {
-        whiten(&A_[j * nv]);
-        gamma_[j] = dot(&A_[j * nv], white_force.data(), nv) + bias[j];
-    }
-    pivoted_qr();
-    for (int k = 0; k < structural_rank; ++k) pivots_[k] = std::abs(A_[k * nv + k]);
+std::unique_ptr<Projection> make_dense_projection(int nv, int rows, int structural_rank,
+                                                  double sigma_ref) {
+    return sized<largest_unrolled>(nv, rows, structural_rank, sigma_ref);
 }
 
 }  // namespace srm

@@ -89,7 +89,7 @@ std::unique_ptr<Projection> make_projection(int structural_rank, double sigma_re
         return std::make_unique<SparseProjection>(structural_rank, sigma_ref, pattern);
     if (choice != "auto" && choice != "dense")
         throw std::invalid_argument("algebra must be auto, dense or sparse, not " + choice);
-    return std::make_unique<DenseProjection>(nv, rows, structural_rank, sigma_ref);
+    return make_dense_projection(nv, rows, structural_rank, sigma_ref);
 }
 
 }  // namespace srm

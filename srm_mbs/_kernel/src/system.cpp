@@ -13,6 +13,7 @@
 
 #include "errors.hpp"
 #include "linear.hpp"
+#include "terms.hpp"
 #include "workspace.hpp"
 
 namespace srm {
@@ -194,8 +195,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
-    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
-    pinocchio::nonLinearEffects(w.model, w.data, w.q, w.v);
+    pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
     if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());

@@ -1,0 +1,85 @@
+#include "terms.hpp"
+
+#include <pinocchio/algorithm/crba.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+
+#include "workspace.hpp"
+
+namespace pinocchio_model {
+
+namespace {
+
+using pinocchio::Data;
+using pinocchio::JointDataBase;
+using pinocchio::JointIndex;
+using pinocchio::JointModelBase;
+using pinocchio::Model;
+
+using CrbaBackward =
+    pinocchio::impl::CrbaWorldConventionBackwardStep<double, 0, pinocchio::JointCollectionDefaultTpl>;
+
+// CrbaWorldConventionForwardStep and NLEForwardStep.
+struct Forward : pinocchio::fusion::JointUnaryVisitorBase<Forward> {
+    using ArgsType = boost::fusion::vector<const Model&, Data&, const Argument&, const Argument&>;
+
+    template <typename JointModel>
+    static void algo(const JointModelBase<JointModel>& jmodel,
+                     JointDataBase<typename JointModel::JointDataDerived>& jdata,
+                     const Model& model, Data& data, const Argument& q, const Argument& v) {
+        const JointIndex i = jmodel.id(), parent = model.parents[i];
+        jmodel.calc(jdata.derived(), q, v);
+        data.liMi[i] = model.jointPlacements[i] * jdata.M();
+        data.v[i] = jdata.v();
+        if (parent > 0) {
+            data.oMi[i] = data.oMi[parent] * data.liMi[i];
+            data.v[i] += data.liMi[i].actInv(data.v[parent]);
+        } else {
+            data.oMi[i] = data.liMi[i];
+        }
+        jmodel.jointExtendedModelCols(data.J) = data.oMi[i].act(jdata.S());
+        data.oYcrb[i] = data.oMi[i].act(model.inertias[i]);
+        data.a_gf[i] = jdata.c() + (data.v[i] ^ jdata.v());
+        data.a_gf[i] += data.liMi[i].actInv(data.a_gf[parent]);
+        data.f[i] = model.inertias[i] * data.a_gf[i] + model.inertias[i].vxiv(data.v[i]);
+    }
+};
+
+// CrbaWorldConventionBackwardStep and NLEBackwardStep.
+struct Backward : pinocchio::fusion::JointUnaryVisitorBase<Backward> {
+    using ArgsType = boost::fusion::vector<const Model&, Data&>;
+
+    template <typename JointModel>
+    static void algo(const JointModelBase<JointModel>& jmodel,
+                     JointDataBase<typename JointModel::JointDataDerived>& jdata,
+                     const Model& model, Data& data) {
+        CrbaBackward::algo(jmodel, model, data);
+        const JointIndex i = jmodel.id(), parent = model.parents[i];
+        jmodel.JointMappedVelocitySelector(data.nle) += jdata.S().transpose() * data.f[i];
+        if (parent > 0) data.f[parent] += data.liMi[i].act(data.f[i]);
+    }
+};
+
+}  // namespace
+
+void compute_terms(Workspace& work) {
+    const Model& model = work.model;
+    Data& data = work.data;
+    const Argument q(work.q), v(work.v);
+    if (!model.mimicking_joints.empty()) {
+        pinocchio::crba(model, data, q, pinocchio::Convention::WORLD);
+        pinocchio::nonLinearEffects(model, data, q, v);
+        return;
+    }
+    data.oYcrb[0].setZero();
+    data.nle.setZero();
+    data.v[0].setZero();
+    data.a_gf[0] = -model.gravity;
+    const auto count = static_cast<JointIndex>(model.njoints);
+    for (JointIndex i = 1; i < count; ++i)
+        Forward::run(model.joints[i], data.joints[i], Forward::ArgsType(model, data, q, v));
+    for (JointIndex i = count - 1; i > 0; --i)
+        Backward::run(model.joints[i], data.joints[i], Backward::ArgsType(model, data));
+    data.M.diagonal() += model.armature;
+}
+
+}  // namespace pinocchio_model

@@ -338,7 +338,7 @@ def info(model: Model) -> None:
     _table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
     if mechanism.loops:
         typer.echo()
-        _table(loop_rows(mechanism), ("loop", "type", "anchor a", "anchor b", "gap at the start"))
+        _table(loop_rows(mechanism), ("loop", "type", "a", "b", "gap at the start"))
     if mechanism.forces:
         typer.echo()
         _table(force_rows(mechanism), ("force", "type", "acts on", "values"))

@@ -16,6 +16,7 @@ from srm_mbs.mechanism import LoopClosure
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.loops import support, world_jacobian
 from srm_mbs.systems.singular import sharpened
+from srm_mbs.systems.units import row_angles
 
 CLOSED = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
@@ -32,17 +33,27 @@ PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts when the guess itself leads nowhere."""
 
 
+def _plain(loop: LoopClosure) -> IndexArray:
+    """The rows of ``loop`` whose only zeros are the intended closing."""
+    lengths, alignments, joints = loop.rows.blocks
+    rows = np.arange(loop.rows.count)
+    turns = () if len(loop.rows.matched) else rows[alignments]
+    return np.concatenate([rows[lengths], turns, rows[joints]]).astype(int)
+
+
 class ClosureProblem(ClosureGeometry):
     """Closure equations of a mechanism, and how far it is from the intended closing."""
 
     def mismatch(self, q: FloatArray) -> FloatArray:
         """Closing residual whose only zero is the intended closing: gaps and axis differences."""
-        self.closure(q)
-        parts = []
+        g, _ = self.closure(q)
+        parts, at = [], 0
         for loop in self.mechanism.loops:
-            Ta, Tb = self._anchors(loop)
-            parts.append(loop.rows.directions @ Tb.actInv(Ta.translation) / self.length)
+            own = g[at : at + loop.rows.count]
+            at += loop.rows.count
+            parts.append(own[_plain(loop)])
             if len(loop.rows.matched):
+                Ta, Tb = self._anchors(loop)
                 R = Tb.rotation.T @ Ta.rotation
                 parts.append((loop.rows.matched @ R.T - loop.rows.matched).ravel())
         return np.concatenate(parts)
@@ -52,12 +63,12 @@ class ClosureProblem(ClosureGeometry):
         _, G = self.closure(q)
         parts, at = [], 0
         for loop in self.mechanism.loops:
-            parts.append(G[at : at + len(loop.rows.directions)])
+            parts.append(G[at : at + loop.rows.count][_plain(loop)])
             at += loop.rows.count
             if len(loop.rows.matched):
                 Ta, Tb = self._anchors(loop)
-                moves = support(self.model, loop.a.resolve(self.model)[0])
-                moves = moves - support(self.model, loop.b.resolve(self.model)[0])
+                joint_a, joint_b = (joint for joint, _ in loop.resolve(self.model))
+                moves = support(self.model, joint_a) - support(self.model, joint_b)
                 turn = Tb.rotation.T @ (world_jacobian(self.data)[3:] * moves * self.unit)
                 R = Tb.rotation.T @ Ta.rotation
                 parts += [-pin.skew(m) @ turn for m in loop.rows.matched @ R.T]
@@ -65,34 +76,42 @@ class ClosureProblem(ClosureGeometry):
 
     def gaps(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
         """Gap (m) and misalignment (rad) of each loop at q; None where a type has none."""
-        self.closure(q)
+        g = self.closure(q)[0] * self.row_unit
+        angles = row_angles(self.mechanism)
         out = {}
+        at = 0
         for loop in self.mechanism.loops:
-            Ta, Tb = self._anchors(loop)
-            gap = angle = None
-            if len(loop.rows.directions):
-                gap = float(np.linalg.norm(loop.rows.directions @ Tb.actInv(Ta.translation)))
+            own = slice(at, at + loop.rows.count)
+            at = own.stop
+            rows, turned = g[own][_plain(loop)], angles[own][_plain(loop)]
+            gap = float(np.linalg.norm(rows[~turned])) if not turned.all() else None
+            angle = float(np.linalg.norm(rows[turned])) if turned.any() else None
             if len(loop.rows.matched):
+                Ta, Tb = self._anchors(loop)
                 R = Tb.rotation.T @ Ta.rotation
                 # chord of the unit vectors -> angle, accurate for small ones
                 chords = np.linalg.norm(loop.rows.matched @ R.T - loop.rows.matched, axis=1)
                 angle = float(np.max(2.0 * np.arcsin(np.minimum(0.5 * chords, 1.0))))
+            elif len(loop.rows.alignments):
+                angle = float(np.max(np.arcsin(np.minimum(np.abs(rows[turned]), 1.0))))
             out[loop.name] = (gap, angle)
         return out
 
     def _anchors(self, loop: LoopClosure) -> tuple[pin.SE3, pin.SE3]:
-        joint_a, in_a = loop.a.resolve(self.model)
-        joint_b, in_b = loop.b.resolve(self.model)
-        return self.data.oMi[joint_a] * in_a, self.data.oMi[joint_b] * in_b
+        a, b = (self.data.oMi[joint] * inside for joint, inside in loop.resolve(self.model))
+        return a, b
 
     def distance(self, q: FloatArray) -> float:
         """From the start to q: the norm of the joint motions in units."""
         return float(np.linalg.norm(self.difference(self.start, q)))
 
     def unwound(self, q: FloatArray) -> FloatArray:
-        """q without full turns of its hinges away from the start."""
+        """q without full turns of its hinges away from the start, except of coupled ones."""
         q = q.copy()
-        for joint in list(self.model.joints)[1:]:
+        coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
+        for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
+            if name in coupled:
+                continue
             if joint.nq == joint.nv == 1 and joint.shortname().startswith("JointModelR"):
                 turns = np.round((q[joint.idx_q] - self.start[joint.idx_q]) / (2.0 * np.pi))
                 if turns:

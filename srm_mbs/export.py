@@ -25,6 +25,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.summary import JOINT_TYPES
+from srm_mbs.systems.units import row_dimensions
 
 _LENGTHS, _QUATERNION = ("x (m)", "y (m)", "z (m)"), ("qx", "qy", "qz", "qw")
 _LINEAR, _ANGULAR = ("vx (m/s)", "vy (m/s)", "vz (m/s)"), ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)")
@@ -102,6 +103,5 @@ def _unit(joint_type: str) -> str:
 
 def _drift_units(mechanism: Mechanism) -> tuple[str, str]:
     """Units of the closure errors and of their rates; semicolons, so that nothing is quoted."""
-    if any(len(loop.rows.alignments) for loop in mechanism.loops):
-        return "m; rad", "m/s; rad/s"
-    return "m", "m/s"
+    parts = row_dimensions(mechanism)
+    return "; ".join(parts), "; ".join(f"{part}/s" for part in parts)

@@ -16,175 +16,29 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD, Anchor, finite_numbers, resolve_apart
 from srm_mbs.arrays import FloatArray
-from srm_mbs.closures import CLOSURE_TYPES, RowSet
 from srm_mbs.errors import InputError
+from srm_mbs.loop_closure import LoopClosure
 
 if TYPE_CHECKING:
     from srm_mbs.systems.structure import Structure
 
-WORLD = "world"
-"""Reserved link name: the fixed ground."""
+__all__ = [
+    "FRICTION_SPEED",
+    "WORLD",
+    "Anchor",
+    "ForceElement",
+    "LoopClosure",
+    "Mechanism",
+    "SimulationDefaults",
+    "Source",
+    "finite_numbers",
+    "resolve_apart",
+]
+
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
-
-
-def finite_numbers(values: Any, count: int, what: str, remedy: str) -> tuple[float, ...]:
-    """``values`` as a tuple of ``count`` finite floats.
-
-    Raises
-    ------
-    InputError
-        About the element ``what``, with that ``remedy``, if they are anything else.
-    """
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise InputError(
-            f"{what} must be {count} finite numbers, not {values!r}", element=what, remedy=remedy
-        )
-    return tuple(array.tolist())
-
-
-def _vector(values: Sequence[float], what: str) -> tuple[float, float, float]:
-    x, y, z = finite_numbers(values, 3, what, "Give [x, y, z]")
-    return (x, y, z)
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """A frame fixed on a body: where a closure takes hold.
-
-    Parameters
-    ----------
-    link
-        Name of a link (a Pinocchio ``BODY`` frame), or ``"world"``.
-    frame
-        Name of any Pinocchio frame, instead of ``link``.
-    xyz : (3,) m
-        Origin of the anchor in the link's or frame's own frame.
-    rpy : (3,) rad
-        Its orientation there: fixed-axis roll, pitch, yaw as in URDF.
-
-    Raises
-    ------
-    InputError
-        If neither or both of ``link`` and ``frame`` are given, or a vector is malformed.
-    """
-
-    link: str | None = None
-    frame: str | None = None
-    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if (self.link is None) == (self.frame is None):
-            raise InputError(
-                "an anchor needs either a link or a frame",
-                element="anchor",
-                remedy='Write { link = "rod" } or { frame = "rod_tip" }, not both',
-            )
-        object.__setattr__(self, "xyz", _vector(self.xyz, "xyz"))
-        object.__setattr__(self, "rpy", _vector(self.rpy, "rpy"))
-
-    @property
-    def where(self) -> str:
-        """Name of the link or frame."""
-        return str(self.link if self.link is not None else self.frame)
-
-    def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
-        """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.
-
-        Raises
-        ------
-        InputError
-            If the model has no such link or frame; the message lists those it has.
-        """
-        offset = pin.SE3(pin.rpy.rpyToMatrix(np.array(self.rpy)), np.array(self.xyz))
-        if self.link == WORLD:
-            return 0, offset
-        if self.link is not None:
-            known = model.existFrame(self.link, pin.FrameType.BODY)
-            index = model.getFrameId(self.link, pin.FrameType.BODY) if known else -1
-        else:
-            index = next((i for i, f in enumerate(model.frames) if f.name == self.frame), -1)
-        if index < 0:
-            kind = "link" if self.link is not None else "frame"
-            body = pin.FrameType.BODY
-            names = [f.name for f in model.frames if kind == "frame" or f.type == body]
-            shown = ", ".join(sorted(set(names) - {"universe"} | {WORLD}))
-            raise InputError(f"there is no {kind} {self.where!r}", remedy=f"Known: {shown}")
-        frame = model.frames[index]
-        return int(frame.parentJoint), frame.placement * offset
-
-
-@dataclass(frozen=True)
-class LoopClosure:
-    """One loop closure between anchors ``a`` and ``b``.
-
-    Parameters
-    ----------
-    type
-        A key of :data:`srm_mbs.closures.CLOSURE_TYPES`.
-    a, b
-        The two anchors.
-    axis : (3,)
-        Direction in b's frame, for the types that have one; normalised here.
-    name
-        Unique name; by default made from the type and the links.
-
-    Raises
-    ------
-    InputError
-        For an unknown type, or an axis that is missing, zero or superfluous.
-    """
-
-    type: str
-    a: Anchor
-    b: Anchor
-    axis: tuple[float, float, float] | None = None
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        if not self.name:
-            object.__setattr__(self, "name", f"{self.type}_{self.a.where}_{self.b.where}")
-        kind = CLOSURE_TYPES.get(self.type)
-        if kind is None:
-            raise InputError(
-                f"there is no closure type {self.type!r}",
-                element=f"loop {self.name!r}",
-                remedy=f"This version knows {', '.join(CLOSURE_TYPES)}",
-            )
-        if kind.needs_axis != (self.axis is not None):
-            need = "needs an axis" if kind.needs_axis else "takes no axis"
-            raise InputError(
-                f"a {self.type} closure {need}",
-                element=f"loop {self.name!r}",
-                remedy='Give "axis = [x, y, z]", in b\'s frame'
-                if kind.needs_axis
-                else 'Remove "axis"',
-            )
-        if self.axis is not None:
-            axis = np.array(_vector(self.axis, "axis"))
-            length = float(np.linalg.norm(axis))
-            if length == 0.0:
-                raise InputError(
-                    "the axis is zero", element=f"loop {self.name!r}", remedy="Give a direction"
-                )
-            axis /= length
-            object.__setattr__(self, "axis", (float(axis[0]), float(axis[1]), float(axis[2])))
-
-    @cached_property
-    def rows(self) -> RowSet:
-        """The scalar rows of this closure, in its anchors."""
-        return CLOSURE_TYPES[self.type].rows(np.array(self.axis if self.axis else (0.0, 0.0, 0.0)))
-
-    @property
-    def row_names(self) -> tuple[str, ...]:
-        """``loop.row`` for every row."""
-        return tuple(f"{self.name}.{label}" for label in self.rows.labels)
 
 
 class ForceElement(ABC):
@@ -213,33 +67,6 @@ class ForceElement(ABC):
         InputError
             Naming the element and the remedy.
         """
-
-
-def resolve_apart(
-    model: pin.Model, a: Anchor, b: Anchor, element: str
-) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
-    """Both anchors of ``element`` as in :meth:`Anchor.resolve`, on two different bodies.
-
-    Raises
-    ------
-    InputError
-        If the model has no such link or frame, or both lie on the same body.
-    """
-    resolved = []
-    for side, anchor in (("a", a), ("b", b)):
-        try:
-            resolved.append(anchor.resolve(model))
-        except InputError as error:
-            error.element = f"{element}, anchor {side}"
-            raise
-    if resolved[0][0] == resolved[1][0]:
-        raise InputError(
-            "both anchors lie on the same body",
-            element=element,
-            remedy="Anchor it on two bodies that move relative to each other "
-            "(locked and fixed joints join bodies)",
-        )
-    return resolved[0], resolved[1]
 
 
 def _check_names(what: str, names: Sequence[str]) -> None:
@@ -322,7 +149,7 @@ class Mechanism:
         The spanning tree, gravity included; ``model.damping`` acts on the joints (N m s/rad,
         N s/m), and ``model.friction`` F (N m, N) with -F tanh(v / friction_speed).
     loops
-        Loop closures; names must be unique.
+        Loop closures; names must be unique.  A ``distance`` without a length takes the one at q0.
     q0 : (nq,), v0 : (nv,)
         Initial state; by default the neutral configuration at rest.  :func:`srm_mbs.load`
         assembles it; from a ``pin.Model`` in hand use :func:`srm_mbs.assemble`.
@@ -340,9 +167,9 @@ class Mechanism:
     Raises
     ------
     InputError
-        If names repeat, an anchor or the joint of a force is unknown, a shape does not fit, the
-        joints of the model are not in depth-first order, joint friction is negative, or it has
-        mimic joints, which this version does not simulate.
+        If names repeat, an anchor or the joint of a force or coupling is unknown or cannot take it,
+        a shape does not fit, the joints of the model are not in depth-first order, joint friction
+        is negative, or it has mimic joints, which this version does not simulate.
     """
 
     model: pin.Model
@@ -374,7 +201,8 @@ class Mechanism:
         )
         _check_names("loop", [loop.name for loop in self.loops])
         for loop in self.loops:
-            resolve_apart(model, loop.a, loop.b, f"loop {loop.name!r}")
+            loop.check(model)
+        set_(self, "loops", tuple(loop.measured(model, self.q0) for loop in self.loops))
         set_(self, "forces", tuple(self.forces))
         _check_names("force", [force.name for force in self.forces])
         for force in self.forces:

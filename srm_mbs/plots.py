@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from srm_mbs.errors import InputError
+from srm_mbs.systems.units import row_dimensions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,8 +162,8 @@ def _log_axis(axes: Axes) -> None:
 
 
 def _drift(axes: Axes, solution: Solution) -> str:
-    rotations = any(len(loop.rows.alignments) for loop in solution.mechanism.loops)
-    units = ("m, rad", "m/s, rad/s") if rotations else ("m", "m/s")
+    parts = row_dimensions(solution.mechanism)
+    units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
     names = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
     drift = _finite(solution.drift)
     # The positions as dots: at round-off a line would jump to and fro between a few values.

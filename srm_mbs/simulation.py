@@ -122,7 +122,7 @@ def _check_consistent(mechanism: Mechanism) -> bool:
     v0 = mechanism.v0
     g, c = mechanism.initial_errors
     units = mechanism.structure.units
-    unit = row_units(mechanism.loops, units.length)
+    unit = row_units(mechanism, units)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit

@@ -126,6 +126,11 @@ def save_solution(solution: Solution, path: Path) -> None:
         np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
 
 
+def _loop(entry: dict[str, Any]) -> LoopClosure:
+    anchors = {side: Anchor(**entry[side]) for side in "ab" if entry[side] is not None}
+    return LoopClosure(**entry | anchors)
+
+
 def _force_entry(force: ForceElement) -> dict[str, Any]:
     return {"type": force.type} | asdict(force)  # type: ignore[call-overload,no-any-return]
 
@@ -147,19 +152,9 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
     else:
         source, model = None, pin.Model()
         model.loadFromString(entry["model"])
-    loops = [
-        LoopClosure(
-            loop["type"],
-            Anchor(**loop["a"]),
-            Anchor(**loop["b"]),
-            loop["axis"],
-            loop["name"],
-        )
-        for loop in entry["loops"]
-    ]
     return Mechanism(
         model,
-        tuple(loops),
+        tuple(_loop(loop) for loop in entry["loops"]),
         q0=arrays["q0"],
         v0=arrays["v0"],
         forces=tuple(_force(force) for force in entry["forces"]),

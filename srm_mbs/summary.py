@@ -8,9 +8,10 @@ from dataclasses import fields
 import numpy as np
 
 from srm_mbs.kernel import backend
-from srm_mbs.mechanism import Anchor, Mechanism
+from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.systems.loops import closure_errors
+from srm_mbs.systems.units import row_angles
 
 JOINT_TYPES = {
     **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
@@ -89,14 +90,31 @@ def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
 
 
 def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
-    """(name, type, anchor a, anchor b, gap at the start) of each loop."""
+    """(name, type, anchor a or joints, anchor b or relation, gap at the start) of each loop."""
     model, loops = mechanism.model, mechanism.loops
     g = closure_errors(model, loops, mechanism.q0[None], mechanism.v0[None])[0][0]
-    for loop, own in zip(loops, np.split(g, np.cumsum([loop.rows.count for loop in loops])[:-1])):
-        positions = len(loop.rows.directions)
-        gaps = [(own[:positions], "m"), (own[positions:], "rad")]
+    angles = row_angles(mechanism)
+    at = 0
+    for loop in loops:
+        own, turned = g[at : at + loop.rows.count], angles[at : at + loop.rows.count]
+        at += loop.rows.count
+        gaps = [(own[~turned], "m"), (own[turned], "rad")]
         gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
-        yield loop.name, loop.type, _anchor(loop.a), _anchor(loop.b), gap
+        if loop.joints is not None:
+            yield loop.name, loop.type, ", ".join(loop.joints), _relation(loop), gap
+            continue
+        a, b = map(_anchor, loop.anchors)
+        yield loop.name, loop.type, a, b, gap
+
+
+def _relation(loop: LoopClosure) -> str:
+    """A coupling in words: "first = 2 second + 0.1"."""
+    (row,) = loop.rows.joint_rows
+    if loop.ratio is not None:
+        terms = f"{row.joints[0]} = {loop.ratio:g} {row.joints[1]}"
+        return f"{terms} {row.offset:+g}" if row.offset else terms
+    terms = " ".join(f"{c:+g} {name}" for c, name in zip(row.coefficients, row.joints))
+    return f"{terms} = {row.offset:g}"
 
 
 def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:

@@ -282,7 +282,7 @@ def _skeleton(mechanism: Mechanism) -> list[Visual]:
     ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
     for joint in range(1, model.njoints):
         ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
-    anchors = [side.resolve(model) for loop in mechanism.loops for side in (loop.a, loop.b)]
+    anchors = [side.resolve(model) for loop in mechanism.loops for side in loop.anchors]
     for joint, placement in anchors:
         ends[joint].append(placement.translation)
     # The last body of a chain ends in its centre of mass, for want of anything else.

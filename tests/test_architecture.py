@@ -16,7 +16,8 @@ PACKAGE = Path(srm_mbs.__file__).parent
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
     ("_kernel", "arrays", "errors", "records", "semi_explicit"),
-    ("closures",),
+    ("anchors", "closures"),
+    ("loop_closure",),
     ("mechanism",),
     ("coordinates", "forces", "systems"),
     ("methods",),

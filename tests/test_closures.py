@@ -7,21 +7,30 @@ be right off the closure manifold too: stages and corrections live there.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
+import srm_mbs as srm
+from srm_mbs import kernel
 from srm_mbs.arrays import FloatArray
 from srm_mbs.closures import CLOSURE_TYPES, perpendicular_basis
+from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import WORLD, Anchor, LoopClosure
 from srm_mbs.systems.loops import LoopKinematics, row_wrenches
+from srm_mbs.systems.multibody import ClosedSystem
+from srm_mbs.systems.structure import Structure
+from srm_mbs.systems.units import Units
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
-TYPES = tuple(CLOSURE_TYPES)
+TYPES = tuple(name for name, kind in CLOSURE_TYPES.items() if "a" in kind.needs)
+"""Those between anchors; tests/test_couplings.py has those between joints."""
 GRAVITY = np.array([3.0, -5.0, -9.81])
 
 # Anchors of a closure: both branches of the tree, one branch and the ground, one chain.
@@ -83,10 +92,11 @@ def random_anchor(link: str, rng: np.random.Generator) -> Anchor:
 
 def random_loop(kind: str, place: str, rng: np.random.Generator) -> LoopClosure:
     link_a, link_b = PLACES[place]
-    axis = tuple(rng.standard_normal(3)) if CLOSURE_TYPES[kind].needs_axis else None
-    return LoopClosure(
-        kind, random_anchor(link_a, rng), random_anchor(link_b, rng), axis, name=f"{kind} {place}"
-    )
+    keys = (*CLOSURE_TYPES[kind].needs, *CLOSURE_TYPES[kind].takes)
+    axes = {key: tuple(rng.standard_normal(3)) for key in keys if key.startswith("axis")}
+    anchors = random_anchor(link_a, rng), random_anchor(link_b, rng)
+    length = rng.uniform(0.5, 2.0) if "length" in keys else None
+    return LoopClosure(kind, *anchors, **axes, length=length, name=f"{kind} {place}")
 
 
 def evaluate(
@@ -96,7 +106,7 @@ def evaluate(
     data = model.createData()
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, v)
-    rows.update(data)
+    rows.update(data, q)
     return rows.g.copy(), rows.G.copy(), rows.bias.copy()
 
 
@@ -197,12 +207,23 @@ def rows_from_placements(loop: LoopClosure, R: FloatArray, p: FloatArray) -> Flo
     """The rows of every type written out, for a's rotation R and position p in b."""
     if loop.type == "point":
         return p
+    turns = [R[2, 1], R[0, 2], R[1, 0]]
     if loop.type == "frame":
-        return np.array([*p, R[2, 1], R[0, 2], R[1, 0]])
+        return np.array([*p, *turns])
+    if loop.type == "universal":
+        return np.array([*p, np.array(loop.axis_b) @ R @ np.array(loop.axis_a)])
+    if loop.type == "distance":
+        return np.array([np.linalg.norm(p) - loop.length])
     axis = np.array(loop.axis)
     n1, n2 = perpendicular_basis(axis)
     if loop.type == "revolute":
         return np.array([*p, n1 @ R @ axis, n2 @ R @ axis])
+    if loop.type == "prismatic":
+        return np.array([n1 @ p, n2 @ p, *turns])
+    if loop.type == "cylindrical":
+        return np.array([n1 @ p, n2 @ p, n1 @ R @ axis, n2 @ R @ axis])
+    if loop.type == "planar":
+        return np.array([axis @ p, n1 @ R @ axis, n2 @ R @ axis])
     if loop.type == "point_on_line":
         return np.array([n1 @ p, n2 @ p])
     if loop.type == "point_on_plane":
@@ -315,7 +336,7 @@ def test_update_without_bias_leaves_the_rows_the_same() -> None:
     rows = LoopKinematics(model, loops)
     data = model.createData()
     pin.crba(model, data, q, pin.Convention.WORLD)
-    rows.update(data, with_bias=False)
+    rows.update(data, q, with_bias=False)
     np.testing.assert_array_equal(rows.g, g)
     np.testing.assert_array_equal(rows.G, G)
 
@@ -324,12 +345,30 @@ def free_motion(loop: LoopClosure, rng: np.random.Generator) -> pin.SE3:
     """A relative placement of a in b that the closure allows."""
     axis = np.zeros(3) if loop.axis is None else np.array(loop.axis)
     any_rotation = Rotation.random(random_state=rng).as_matrix()
+    about_axis = Rotation.from_rotvec(rng.uniform(-3, 3) * axis).as_matrix()
+    if loop.type == "prismatic":
+        return pin.SE3(np.eye(3), rng.uniform(-2, 2) * axis)
+    if loop.type == "cylindrical":
+        return pin.SE3(about_axis, rng.uniform(-2, 2) * axis)
+    if loop.type == "planar":
+        offset = rng.uniform(-2, 2, 3)
+        return pin.SE3(about_axis, offset - axis * (axis @ offset))
+    if loop.type == "universal":
+        # The axes made perpendicular in one way, then turns about each of them.
+        u, n = np.array(loop.axis_a), np.array(loop.axis_b)
+        across = perpendicular_basis(n)[0]
+        start = Rotation.align_vectors(across[None], u[None])[0]
+        about_a, about_b = (Rotation.from_rotvec(rng.uniform(-3, 3) * w) for w in (u, n))
+        return pin.SE3((about_b * start * about_a).as_matrix(), np.zeros(3))
+    if loop.type == "distance":
+        direction = rng.standard_normal(3)
+        return pin.SE3(any_rotation, loop.length * direction / np.linalg.norm(direction))
     if loop.type == "point":
         return pin.SE3(any_rotation, np.zeros(3))
     if loop.type == "frame":
         return pin.SE3.Identity()
     if loop.type == "revolute":
-        return pin.SE3(Rotation.from_rotvec(rng.uniform(-3, 3) * axis).as_matrix(), np.zeros(3))
+        return pin.SE3(about_axis, np.zeros(3))
     if loop.type == "point_on_line":
         return pin.SE3(any_rotation, rng.uniform(-2, 2) * axis)
     if loop.type == "point_on_plane":
@@ -351,7 +390,7 @@ def closed_by_anchor(
         xyz=tuple(inside.translation),
         rpy=tuple(Rotation.from_matrix(inside.rotation).as_euler("xyz")),
     )
-    return LoopClosure(loop.type, loop.a, anchor, loop.axis, loop.name)
+    return replace(loop, b=anchor)
 
 
 @every_row
@@ -379,17 +418,25 @@ def test_rows_are_nonzero_where_the_closure_is_violated(kind: str, seed: int) ->
     axis = np.zeros(3) if loop.axis is None else np.array(loop.axis)
     n1, n2 = perpendicular_basis(axis) if axis.any() else (np.zeros(3), np.zeros(3))
     eye = list(np.eye(3))
+    crossed = np.zeros(3)
+    if loop.type == "universal":
+        crossed = np.cross(free.rotation @ np.array(loop.axis_a), np.array(loop.axis_b))
     shifts, turns = {
         "point": (eye, []),
         "frame": (eye, eye),
         "revolute": (eye, [n1, n2]),
+        "prismatic": ([n1, n2], eye),
+        "cylindrical": ([n1, n2], [n1, n2]),
+        "universal": (eye, [crossed]),
+        "planar": ([axis], [n1, n2]),
+        "distance": ([free.translation / (loop.length or 1.0)], []),
         "point_on_line": ([n1, n2], []),
         "point_on_plane": ([axis], []),
     }[kind]
     size = 1e-4
     found = []
     for shift in shifts:
-        moved = pin.SE3(free.rotation, free.translation + size * shift)
+        moved = pin.SE3(free.rotation, free.translation + size * np.array(shift))
         closed = closed_by_anchor(model, q, loop, moved)
         found.append(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0])
     for turn in turns:
@@ -436,19 +483,15 @@ def test_an_anchor_on_a_frame_equals_the_same_anchor_on_its_link(kind: str) -> N
     loop = random_loop(kind, "two branches", rng)
     offset = anchor_offset(loop.a)
     whole = inside * offset
-    on_link = LoopClosure(
-        kind,
-        Anchor(
+    on_link = replace(
+        loop,
+        a=Anchor(
             "leg_3",
             xyz=tuple(whole.translation),
             rpy=tuple(Rotation.from_matrix(whole.rotation).as_euler("xyz")),
         ),
-        loop.b,
-        loop.axis,
     )
-    on_frame = LoopClosure(
-        kind, Anchor(frame="tip", xyz=loop.a.xyz, rpy=loop.a.rpy), loop.b, loop.axis
-    )
+    on_frame = replace(loop, a=Anchor(frame="tip", xyz=loop.a.xyz, rpy=loop.a.rpy))
     q, v = random_state(model, rng)
     for x, y in zip(
         evaluate(model, LoopKinematics(model, (on_link,)), q, v),
@@ -508,21 +551,28 @@ def test_perpendicular_basis_of_a_coordinate_axis_is_the_other_coordinate_axes(
 def test_rows_of_a_type_are_unit_and_alignments_perpendicular(kind: str) -> None:
     rng = np.random.default_rng(16)
     rows = random_loop(kind, "two branches", rng).rows
+    count = len(rows.directions) + len(rows.distances) + len(rows.alignments)
+    assert rows.count == count
+    assert [block.stop - block.start for block in rows.blocks] == [
+        count - len(rows.alignments), len(rows.alignments), 0
+    ]  # fmt: skip
     assert_close(np.linalg.norm(rows.directions, axis=1), 1.0, atol=1e-15)
     assert_close(rows.directions @ rows.directions.T, np.eye(len(rows.directions)), atol=1e-15)
     for u, n in rows.alignments:
-        assert u @ n == pytest.approx(0.0, abs=1e-15)
+        if kind != "universal":  # whose axes are perpendicular where it is assembled
+            assert u @ n == pytest.approx(0.0, abs=1e-15)
         assert np.linalg.norm(u) == pytest.approx(1.0)
         assert np.linalg.norm(n) == pytest.approx(1.0)
     assert_close(np.linalg.norm(rows.matched, axis=1), 1.0, atol=1e-15)
 
 
-def test_a_reversed_hinge_satisfies_the_rows_but_not_the_matched_axis() -> None:
+@pytest.mark.parametrize("kind", ["revolute", "prismatic", "cylindrical", "planar"])
+def test_a_reversed_axis_satisfies_the_rows_but_not_the_matched_axes(kind: str) -> None:
     rng = np.random.default_rng(17)
     model = tree(0)
     q, v = random_state(model, rng)
-    loop = random_loop("revolute", "two branches", rng)
-    across = perpendicular_basis(np.array(loop.axis))[0]
+    loop = random_loop(kind, "two branches", rng)
+    across = perpendicular_basis(np.array(loop.axis))[0] if kind != "prismatic" else np.eye(3)[0]
     reversed_ = pin.SE3(Rotation.from_rotvec(np.pi * across).as_matrix(), np.zeros(3))
     closed = closed_by_anchor(model, q, loop, reversed_)
     assert_close(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0], 0.0, atol=1e-13)
@@ -530,10 +580,137 @@ def test_a_reversed_hinge_satisfies_the_rows_but_not_the_matched_axis() -> None:
     assert np.abs(closed.rows.matched @ R.T - closed.rows.matched).max() > 0.5
 
 
-def test_every_type_says_whether_it_takes_an_axis() -> None:
-    assert {name: kind.needs_axis for name, kind in CLOSURE_TYPES.items()} == {
-        name: name in ("revolute", "point_on_line", "point_on_plane") for name in TYPES
+@pytest.mark.parametrize("place", ["two branches", "body and ground", "ground and body"])
+def test_points_that_coincide_have_no_distance(place: str) -> None:
+    rng = np.random.default_rng(18)
+    model = tree(0)
+    q, v = random_state(model, rng)
+    loop = random_loop("distance", place, rng)
+    closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
+    with pytest.raises(EvaluationError, match=rf"points of the loop 'distance {place}' coincide"):
+        evaluate(model, LoopKinematics(model, (closed,)), q, v)
+
+
+def test_every_type_says_what_it_needs_and_takes() -> None:
+    axis = ("revolute", "prismatic", "cylindrical", "planar", "point_on_line", "point_on_plane")
+    needs = dict.fromkeys(axis, ("a", "b", "axis")) | {
+        "point": ("a", "b"),
+        "frame": ("a", "b"),
+        "universal": ("a", "b", "axis_a", "axis_b"),
+        "distance": ("a", "b"),
+        "coupling": ("joints",),
     }
+    assert {name: kind.needs for name, kind in CLOSURE_TYPES.items()} == needs
+    takes = {"distance": ("length",), "coupling": ("ratio", "coefficients", "offset")}
     for name, kind in CLOSURE_TYPES.items():
+        assert kind.takes == takes.get(name, ())
         assert kind.name == name
         assert kind.summary
+
+
+SOUND: dict[str, dict[str, Any]] = {
+    "a": {"a": Anchor("leg_3")},
+    "b": {"b": Anchor("arm_3")},
+    "axis": {"axis": (1.0, 0.0, 0.0)},
+    "axis_a": {"axis_a": (1.0, 0.0, 0.0)},
+    "axis_b": {"axis_b": (0.0, 1.0, 0.0)},
+    "length": {"length": 1.0},
+    "joints": {"joints": ("x", "y"), "ratio": 2.0},
+}
+"""For each key, values that a closure can have."""
+
+
+@pytest.mark.parametrize("kind", CLOSURE_TYPES)
+def test_a_missing_or_superfluous_key_is_refused_with_the_remedy(kind: str) -> None:
+    needs = CLOSURE_TYPES[kind].needs
+    good: dict[str, Any] = {}
+    for key in needs:
+        good |= SOUND[key]
+    assert LoopClosure(kind, **good).name.startswith(f"{kind}_")
+    for key in needs:
+        less = {name: value for name, value in good.items() if name != key}
+        with pytest.raises(srm.InputError, match=rf"a {kind} closure needs .*Give \"{key} = "):
+            LoopClosure(kind, **less)
+    for key, values in SOUND.items():
+        if key in needs or key in CLOSURE_TYPES[kind].takes:
+            continue
+        with pytest.raises(srm.InputError, match=rf"a {kind} closure takes no {key}.*Remove"):
+            LoopClosure(kind, **good | {key: values[key]})
+    for key in needs:
+        if key.startswith("axis"):
+            with pytest.raises(srm.InputError, match=rf"the {key} is zero\. Give a direction"):
+                LoopClosure(kind, **good | {key: (0.0, 0.0, 0.0)})
+
+
+def test_a_length_must_be_positive_and_zero_is_a_point() -> None:
+    a, b = Anchor("leg_3"), Anchor("arm_3")
+    with pytest.raises(srm.InputError, match=r'of 0 has no direction\. Use type = "point"'):
+        LoopClosure("distance", a, b, length=0.0)
+    with pytest.raises(srm.InputError, match="-1 m is negative"):
+        LoopClosure("distance", a, b, length=-1.0)
+    with pytest.raises(srm.InputError, match="length must be 1 finite numbers"):
+        LoopClosure("distance", a, b, length=np.nan)
+
+
+def test_a_length_that_is_not_given_is_the_distance_in_the_initial_configuration() -> None:
+    rng = np.random.default_rng(19)
+    model = tree(0)
+    loop = random_loop("distance", "two branches", rng)
+    bare = replace(loop, length=None)
+    with pytest.raises(srm.InputError, match=r"known only when it is part.*mechanism\.loops"):
+        _ = bare.rows
+    q, _ = random_state(model, rng)
+    mechanism = srm.Mechanism(model, (bare,), q0=q)
+    (resolved,) = mechanism.loops
+    expected = np.linalg.norm(relative_placement(model, q, loop)[1])
+    assert resolved.length == pytest.approx(expected, rel=1e-14)
+    other, v = random_state(model, rng)
+    assert mechanism.with_state(other, v).loops == (resolved,)  # the guess, not a later start
+    closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
+    with pytest.raises(srm.InputError, match=r'coincide in the guess.*Use type = "point"'):
+        srm.Mechanism(model, (replace(closed, length=None),), q0=q)
+
+
+@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+@every_row
+def test_the_kernel_evaluates_every_type_like_the_reference(kind: str) -> None:
+    """g, G and Gdot v enter E g and the acceleration, at open configurations."""
+    rng = np.random.default_rng(20)
+    model = tree(1)
+    loops = tuple(random_loop(kind, place, rng) for place in PLACES)
+    for chosen in (*((loop,) for loop in loops), loops[:2]):
+        mechanism = srm.Mechanism(model, chosen)
+        names = tuple(name for loop in chosen for name in loop.row_names)
+        units = Units(1.3, np.ones(model.nv), 1.0)
+        scale = rng.uniform(0.5, 2.0, len(names))
+        mechanism.__dict__["structure"] = Structure(  # the analysis is not what is tested here
+            names, scale, np.ones(len(names), bool), len(names), 0.7, units, 1, ()
+        )
+        system = ClosedSystem(mechanism)
+        for algebra in ("dense", "sparse"):
+            constants = system.constants() | {"algebra": algebra}
+            twin = kernel.core.System(model, constants, None)  # type: ignore[union-attr]
+            for _ in range(2):
+                x = np.concatenate(random_state(model, rng))
+                terms = system.evaluate(0.0, x)
+                found = twin.terms(0.0, x, -1.0)
+                assert found["rank"] == terms.rank
+                for what in ("rate", "correction"):
+                    expected = getattr(terms, what)()
+                    size = 1.0 + np.abs(expected).max()
+                    assert_close(found[what], expected, atol=1e-10 * size)
+                assert found["gap"] == pytest.approx(terms.gap(), rel=1e-12)
+                assert found["sigma"] == pytest.approx(terms.sigma, rel=1e-10)
+
+
+@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+def test_the_kernel_refuses_points_that_coincide_as_well() -> None:
+    rng = np.random.default_rng(21)
+    model = tree(0)
+    q, v = random_state(model, rng)
+    loop = random_loop("distance", "two branches", rng)
+    closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
+    system = ClosedSystem(srm.Mechanism(model, (closed,)))
+    twin = kernel.compiled(system)
+    with pytest.raises(ArithmeticError):
+        twin.terms(0.0, np.concatenate([q, v]), -1.0)

@@ -138,7 +138,7 @@ def closure(mechanism: srm.Mechanism, q: FloatArray, v: FloatArray) -> FloatArra
     rows = LoopKinematics(model, mechanism.loops)
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, v)
-    rows.update(data)
+    rows.update(data, q)
     return np.concatenate([rows.g, rows.G @ v, rows.bias])
 
 

@@ -240,7 +240,7 @@ def test_reactions_do_no_work_in_admissible_motions(name: str) -> None:
     rows = LoopKinematics(mechanism.model, mechanism.loops)
     data = mechanism.model.createData()
     pin.crba(mechanism.model, data, q, pin.Convention.WORLD)
-    rows.update(data, with_bias=False)
+    rows.update(data, q, with_bias=False)
     free = null_space(rows.G)
     assert free.shape[1] == mechanism.degrees_of_freedom
     for direction in free.T:
@@ -269,7 +269,7 @@ def test_multipliers_of_a_run_balance_the_equations_of_motion(name: str) -> None
     for i, (q, v) in enumerate(zip(run.q, run.v)):
         a = system.evaluate(0.0, np.concatenate([q, v])).rate()[nv:]
         pin.crba(model, data, q, pin.Convention.WORLD)
-        rows.update(data, with_bias=False)
+        rows.update(data, q, with_bias=False)
         pin.nonLinearEffects(model, data, q, v)
         elements = forces.generalised(data, q, v)
         inverse_dynamics = pin.rnea(model, data, q, v, a) - elements
@@ -286,7 +286,7 @@ def test_wrenches_act_on_the_joints_as_the_multipliers_do(name: str) -> None:
     data = mechanism.model.createData()
     rows = LoopKinematics(mechanism.model, mechanism.loops)
     pin.crba(mechanism.model, data, q, pin.Convention.WORLD)
-    rows.update(data, with_bias=False)
+    rows.update(data, q, with_bias=False)
     lam = np.concatenate([multipliers[loop.name] for loop in mechanism.loops])
     for e in np.eye(mechanism.model.nv):
         power = sum(wrenches[k] @ (b - a) for k, (a, b) in body_twists(mechanism, q, e).items())
@@ -369,7 +369,7 @@ def test_reactions_of_an_overconstrained_loop_have_the_least_norm() -> None:
     rows = LoopKinematics(mechanism.model, mechanism.loops, mechanism.structure.row_scale)
     data = mechanism.model.createData()
     pin.crba(mechanism.model, data, q, pin.Convention.WORLD)
-    rows.update(data, with_bias=False)
+    rows.update(data, q, with_bias=False)
     left, singular, _ = np.linalg.svd(rows.G)
     assert singular[4] < 1e-8 < 1e-2 < singular[3]
     # Nothing along the combination of rows that forces nothing.

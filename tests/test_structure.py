@@ -505,7 +505,7 @@ def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(n
         q = pin.integrate(model, mechanism.q0, spread)
         M = np.triu(pin.crba(model, data, q, pin.Convention.WORLD))
         M = M + np.triu(M, 1).T
-        rows.update(data, with_bias=False)
+        rows.update(data, q, with_bias=False)
         squares += np.einsum("ij,ji->i", rows.G, np.linalg.solve(M, rows.G.T)) / count
     # All bundled closures have position rows only: one kind in each.
     start = 0

@@ -27,6 +27,18 @@ from srm_mbs.systems.forces import friction_time
 log = logging.getLogger(__name__)
 
 
+def _joints_that_must_move(description: Description) -> list[tuple[str, Sequence[str]]]:
+    """Keys of the elements that act on joints, and the names there."""
+    return [
+        *(
+            (f"force[{i}].joint", [force.joint])
+            for i, force in enumerate(description.force)
+            if isinstance(force, TorqueEntry | TorsionSpringEntry)
+        ),
+        *((f"loop[{i}].joints", loop.joints or []) for i, loop in enumerate(description.loop)),
+    ]
+
+
 def _check_joint_names(description: Description, model: pin.Model, file: str) -> None:
     """Refuse names in [initial] and lock that are no moving joints."""
     known = tuple(model.names)[1:]
@@ -35,11 +47,7 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
         ("initial.q", list(description.initial.q)),
         ("initial.v", list(description.initial.v)),
         ("initial.guess", list(description.initial.guess)),
-        *(
-            (f"force[{i}].joint", [force.joint])
-            for i, force in enumerate(description.force)
-            if isinstance(force, TorqueEntry | TorsionSpringEntry)
-        ),
+        *_joints_that_must_move(description),
     ]
     for where, names in places:
         for name in names:
@@ -50,14 +58,15 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
                     element=where,
                     remedy=f"Known: {', '.join(known)}",
                 )
-    for i, force in enumerate(description.force):
-        if isinstance(force, TorqueEntry | TorsionSpringEntry) and force.joint in description.lock:
-            raise InputError(
-                f"joint {force.joint!r} is locked",
-                file=file,
-                element=f"force[{i}].joint",
-                remedy="Remove the force, or the joint from lock",
-            )
+    for where, names in _joints_that_must_move(description):
+        for name in names:
+            if name in description.lock:
+                raise InputError(
+                    f"joint {name!r} is locked",
+                    file=file,
+                    element=where,
+                    remedy=f"Remove the {where.partition('[')[0]}, or the joint from lock",
+                )
     for i, name in enumerate(description.lock):
         if name in description.lock[:i]:
             raise InputError(
@@ -160,16 +169,28 @@ def unassembled(
         Naming file, element and remedy.
     """
     file = source.path
-    built = build_urdf(source.urdf, source.urdf_path, source.base, description.lock)
+    built = build_urdf(
+        source.urdf, source.urdf_path, source.base, description.lock, description.coupled_joints()
+    )
     built.model.gravity.linear = np.array(source.gravity)
     _check_joint_names(description, built.model, file)
     model, q, v, guess = _without_locked(description, built.model, file)
     check_inertia(model, source.urdf_path)
     _check_frames(description, model)
+    tree = Mechanism(model)
+    start = np.array(tree.q0)
+    for where, values in (("initial.guess", guess), ("initial.q", q)):
+        for name, value in values.items():
+            with _element(where):
+                set_position(tree, start, name, value)
+    for name, value in v.items():
+        with _element("initial.v"):
+            set_rate(tree, np.zeros(model.nv), name, value)
     defaults = description.simulation
     mechanism = Mechanism(
         model,
         description.closures(),
+        q0=start,
         forces=description.force_elements(),
         friction_speed=description.friction_speed,
         name=description.name or model.name,
@@ -177,15 +198,6 @@ def unassembled(
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
         notes=(*notes, *built.notes),
     )
-    start = np.array(mechanism.q0)
-    for where, values in (("initial.guess", guess), ("initial.q", q)):
-        for name, value in values.items():
-            with _element(where):
-                set_position(mechanism, start, name, value)
-    for name, value in v.items():
-        with _element("initial.v"):
-            set_rate(mechanism, np.zeros(model.nv), name, value)
-    mechanism = replace(mechanism, q0=start)
     return replace(mechanism, notes=mechanism.notes + _friction_note(mechanism)), q, v
 
 

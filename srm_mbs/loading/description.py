@@ -82,9 +82,16 @@ class LoopEntry(_Strict):
 
     name: StrictStr = ""
     type: StrictStr
-    a: AnchorEntry
-    b: AnchorEntry
+    a: AnchorEntry | None = None
+    b: AnchorEntry | None = None
     axis: Vector | None = None
+    axis_a: Vector | None = None
+    axis_b: Vector | None = None
+    length: Number | None = None
+    joints: list[StrictStr] | None = None
+    ratio: Number | None = None
+    coefficients: list[Number] | None = None
+    offset: Number | None = None
 
 
 class ForceEntry(_Strict):
@@ -206,10 +213,12 @@ class Description(_Strict):
         out = []
         for i, entry in enumerate(self.loop):
             with _labelled("loop", i, entry.name) as label:
-                a, b = (_anchor(label, side, getattr(entry, side)) for side in "ab")
-                axis = None if entry.axis is None else _triple(entry.axis)
-                out.append(LoopClosure(entry.type, a, b, axis, entry.name))
+                out.append(LoopClosure(**_with_anchors(label, entry)))
         return tuple(out)
+
+    def coupled_joints(self) -> frozenset[str]:
+        """Names of the joints that take part in a coupling."""
+        return frozenset(name for entry in self.loop for name in entry.joints or ())
 
     def anchors(self) -> Iterator[tuple[str, AnchorEntry]]:
         """Every anchor with its key, ``loop[0].a`` for example."""
@@ -233,12 +242,8 @@ class Description(_Strict):
         out = []
         for i, entry in enumerate(self.force):
             with _labelled("force", i, entry.name) as label:
-                values = {
-                    key: _anchor(label, key, value) if isinstance(value, AnchorEntry) else value
-                    for key, value in entry
-                    if key != "type"
-                }
-                out.append(FORCE_TYPES[entry.type](**values))
+                values = _with_anchors(label, entry)
+                out.append(FORCE_TYPES[values.pop("type")](**values))
         return tuple(out)
 
 
@@ -261,6 +266,14 @@ def _anchor(label: str, side: str, given: AnchorEntry) -> Anchor:
         what = "" if error.element == "anchor" else f": {error.element}"
         error.element = f"{label}, anchor {side}{what}"
         raise
+
+
+def _with_anchors(label: str, entry: LoopEntry | ForceEntry) -> dict[str, Any]:
+    """The keys of an element, its anchors made."""
+    return {
+        key: _anchor(label, key, value) if isinstance(value, AnchorEntry) else value
+        for key, value in entry
+    }
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:
@@ -373,4 +386,9 @@ def parse_description(text: str, file: str) -> Description:
                 element=f"loop[{i}].type",
                 remedy=f"This version knows {', '.join(CLOSURE_TYPES)}",
             )
+        for side in "ab":
+            if side in CLOSURE_TYPES[entry.type].needs and getattr(entry, side) is None:
+                raise InputError(
+                    "this key is missing", file=file, element=f"loop[{i}].{side}", remedy="Add it"
+                )
     return description

@@ -8,10 +8,10 @@ the notes.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
-from xml.etree.ElementTree import tostring
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 import pinocchio as pin
@@ -135,7 +135,13 @@ def _velocity_end(model: pin.Model, joint: int) -> int:
     return int(model.joints[joint].idx_v + model.joints[joint].nv)
 
 
-def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> UrdfModel:
+def build_urdf(
+    text: str,
+    file: str,
+    base: str,
+    locked: Sequence[str] = (),
+    counting_turns: Collection[str] = (),
+) -> UrdfModel:
     """Check ``text`` and build its tree on a fixed, floating or planar base.
 
     Inertias are checked by :func:`check_inertia`, after locking.
@@ -149,6 +155,9 @@ def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> U
         the x-y plane of the world).
     locked
         Joints that will be locked: ``<mimic>`` does not matter there.
+    counting_turns
+        Joints whose angle must count turns: ``continuous`` ones among them are built as revolute
+        joints without limits, because Pinocchio stores the others as (cos, sin).
 
     Raises
     ------
@@ -158,6 +167,7 @@ def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> U
     checker = UrdfChecker(file)
     root = parse_urdf(text, file)
     checker.check(root, base, locked)
+    unlimited = _without_limits(root, set(counting_turns) - set(locked))
     extended = take_extended(root)
     text = tostring(root, encoding="unicode")
     root_joint = ROOT_JOINTS[base]
@@ -168,9 +178,34 @@ def build_urdf(text: str, file: str, base: str, locked: Sequence[str] = ()) -> U
             model = pin.buildModelFromXML(text, root_joint())
     except Exception as error:  # Boost.Python raises whatever Pinocchio throws
         raise InputError(f"Pinocchio cannot read it: {error}", file=file) from error
+    for name, bare in unlimited.items():
+        joint = model.joints[model.getJointId(name)]
+        model.lowerPositionLimit[joint.idx_q] = -np.inf
+        model.upperPositionLimit[joint.idx_q] = np.inf
+        if bare:
+            model.effortLimit[joint.idx_v] = model.velocityLimit[joint.idx_v] = np.inf
     for note in checker.notes:
         log.info("%s: %s", file, note)
     return UrdfModel(with_joints(model, extended), tuple(checker.notes))
+
+
+def _without_limits(root: Element, names: Collection[str]) -> dict[str, bool]:
+    """Make revolute joints of the continuous ones among ``names``.
+
+    Returns those that were changed, and whether they had no <limit> of effort and velocity.
+    """
+    changed = {}
+    for joint in root.findall("joint"):
+        name = joint.get("name", "")
+        if name not in names or joint.get("type") != "continuous":
+            continue
+        joint.set("type", "revolute")
+        limit = joint.find("limit")
+        changed[name] = limit is None
+        if limit is None:
+            limit = SubElement(joint, "limit", effort="0", velocity="0")
+        limit.attrib |= {"lower": "0", "upper": "0"}
+    return changed
 
 
 def lock_joints(model: pin.Model, names: list[str], q: Any) -> pin.Model:

@@ -46,19 +46,19 @@ class ClosureGeometry:
         units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
         self.unit = units.coordinate
         self.length = units.length
-        self.row_unit = row_units(mechanism.loops, units.length)
+        self.row_unit = row_units(mechanism, units)
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self.rows.update(self.data, with_bias=False)
+        self.rows.update(self.data, q, with_bias=False)
         return self.rows.g / self.row_unit, self.rows.G / self.row_unit[:, None] * self.unit
 
     @cached_property
     def row_size(self) -> FloatArray:
         """Usual norm of the rows of G in :meth:`closure`: rms over open configurations (rows,).
 
-        One size for the position rows of a loop and one for its alignments; 1 where all are zero.
+        One size for the lengths of a loop and one for its alignments; 1 where all are zero.
         """
         rng = np.random.default_rng(0)
         squares = np.zeros(len(self.row_unit))
@@ -74,13 +74,13 @@ class ClosureGeometry:
             uncancelled += np.array([shift @ shift, turn @ turn]) / 8
         at = 0
         for loop in self.mechanism.loops:
-            middle, end = at + len(loop.rows.directions), at + loop.rows.count
-            for block, whole in zip((slice(at, middle), slice(middle, end)), uncancelled):
+            own = squares[at : at + loop.rows.count]
+            for block, whole in zip(loop.rows.blocks[:2], uncancelled):
                 if block.stop > block.start:
-                    mean = squares[block].mean()
+                    mean = own[block].mean()
                     # Always satisfied: rounding must not be scaled up to a row.
-                    squares[block] = mean if mean > ROUNDING_ROW**2 * whole else whole
-            at = end
+                    own[block] = mean if mean > ROUNDING_ROW**2 * whole else whole
+            at += loop.rows.count
         return np.sqrt(np.where(squares > 0.0, squares, 1.0))
 
     def normalised(self, q: FloatArray) -> FloatArray:
@@ -91,7 +91,7 @@ class ClosureGeometry:
         """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
         pin.nonLinearEffects(self.model, self.data, q, u * self.unit)
-        self.rows.update(self.data)
+        self.rows.update(self.data, q)
         return self.rows.bias / self.row_unit / self.row_size
 
     def mass(self) -> FloatArray:

@@ -21,11 +21,9 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.forces import Bushing, JointTorque, SpringDamper, TorsionSpring, Wrench
 from srm_mbs.mechanism import Anchor, ForceElement, Mechanism
-from srm_mbs.systems.loops import cross, placement_numbers, support, world_jacobian
+from srm_mbs.systems.loops import COINCIDENT, placement_numbers, support, world_jacobian
 from srm_mbs.systems.projection import cholesky, whiten
-
-COINCIDENT = 1e-9
-"""Distance over rest length below which the line between two points has no direction."""
+from srm_mbs.systems.vectors import cross
 
 
 class _Evaluator(Protocol):

@@ -2,16 +2,19 @@ r"""Closure rows on Pinocchio kinematics: g, G and Gdot v.
 
 For one closure let H be the frame with the axes of anchor b and its origin at anchor a.  In H
 
-    W = H^{-1}(V_a - V_b) = (r, w)          relative velocity; r = p'
+    W = H^{-1}(V_a - V_b) = (r, w)          relative velocity; r = p' as b sees it
     B = H^{-1}(A_a - A_b - V_b x V_a)       its rate without the joint accelerations
 
 (V, A spatial velocities and bias accelerations in world axes at the world origin), so that a
-position row g = d . p and an alignment row g = n . m, m = R u, have
+position row g = d . p, a distance row g = |p| - L, d = p/|p|, and an alignment row g = n . m,
+m = R u, have
 
     G  = d^T X_lin (J_a - J_b),             Gdot v = d . (B_lin + w x r),
+    G  = d^T X_lin (J_a - J_b),             Gdot v = d . (B_lin + w x r) + |d x r|^2/|p|,
     G  = (m x n)^T X_ang (J_a - J_b),       Gdot v = n . (B_ang x m + w x (w x m)),
 
-with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.
+with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row has constant
+entries c_i in G, and Gdot v = 0.
 
 Three numbers are multiplied before NumPy starts, so each row is made of plain floats, in the axes
 of the joint that carries b (the world's for a closure to the ground).  With e = R_b d and x the
@@ -22,6 +25,7 @@ A(x) = a + alpha x x + omega x (v + omega x x) of the point of a body that is at
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from typing import Any
@@ -30,57 +34,13 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
+from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import LoopClosure, Mechanism
+from srm_mbs.systems.joint_rows import JointRows
+from srm_mbs.systems.vectors import cross, cross3, dot, from_world, minus, plus_cross, to_world
 
-Vector = Sequence[float]
-"""Three numbers."""
-Triple = tuple[float, float, float]
-
-
-def cross3(a: Vector, b: Vector) -> Triple:
-    """a x b."""
-    ax, ay, az = a
-    bx, by, bz = b
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-def cross(a: Vector | FloatArray, b: Vector | FloatArray) -> FloatArray:
-    """a x b as an array; ``numpy.cross`` costs ten times as much on three numbers."""
-    return np.array(cross3(a, b))  # type: ignore[arg-type]
-
-
-def _plus_cross(c: Vector, a: Vector, b: Vector) -> Triple:
-    """c + a x b."""
-    ax, ay, az = a
-    bx, by, bz = b
-    cx, cy, cz = c
-    return cx + (ay * bz - az * by), cy + (az * bx - ax * bz), cz + (ax * by - ay * bx)
-
-
-def _minus(a: Vector, b: Vector) -> Triple:
-    ax, ay, az = a
-    bx, by, bz = b
-    return ax - bx, ay - by, az - bz
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    ax, ay, az = a
-    bx, by, bz = b
-    return ax * bx + ay * by + az * bz
-
-
-def _to_world(R: Sequence[Vector], a: Vector) -> Triple:
-    """R a."""
-    x, y, z = a
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
-    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
-
-
-def _from_world(R: Sequence[Vector], a: Vector) -> Triple:
-    """R^T a."""
-    x, y, z = a
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
-    return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+COINCIDENT = 1e-9
+"""Distance of two points, over the length that it should have, from which it has a direction."""
 
 
 def world_jacobian(data: pin.Data) -> FloatArray:
@@ -122,25 +82,31 @@ class _Body:
 
 
 class _LoopRows:
-    """The kept, scaled rows of one closure, resolved against a model."""
+    """The kept, scaled rows of one closure between anchors, resolved against a model."""
 
     def __init__(
         self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
     ) -> None:
-        self.joint_a, self.in_a = loop.a.resolve(model)
-        self.joint_b, self.in_b = loop.b.resolve(model)
+        self.name = loop.name
+        (self.joint_a, self.in_a), (self.joint_b, self.in_b) = loop.resolve(model)
         rows = loop.rows
-        k = len(rows.directions)
+        k, turns = len(rows.directions), rows.blocks[1]
         inverse = 1.0 / scale
         self.directions = (rows.directions * inverse[:k, None])[keep[:k]]
-        pairs = rows.alignments[keep[k:]]
+        # With their factor, the inverse of the row scale.
+        self._distances = [
+            (length, float(factor))
+            for length, factor, kept in zip(rows.distances, inverse[k:], keep[k:])
+            if kept
+        ]
+        pairs = rows.alignments[keep[turns]]
         # The row scale sits in n, so that no evaluation has to divide.
         self.alignments = [
-            (u, n) for u, n in zip(pairs[:, 0], pairs[:, 1] * inverse[k:][keep[k:], None])
+            (u, n) for u, n in zip(pairs[:, 0], pairs[:, 1] * inverse[turns][keep[turns], None])
         ]
         self.support = support(model, self.joint_a) - support(model, self.joint_b)
         self.first_row = start
-        self.count = len(self.directions) + len(self.alignments)
+        self.count = len(self.directions) + len(self._distances) + len(self.alignments)
         # The same in the axes of the joints, as plain floats.
         self._at_a: list[float] = self.in_a.translation.tolist()
         self._at_b: list[float] = self.in_b.translation.tolist()
@@ -157,6 +123,7 @@ class _LoopRows:
             "in_a": placement_numbers(self.in_a),
             "in_b": placement_numbers(self.in_b),
             "directions": np.ascontiguousarray(self.directions, dtype=float).ravel(),
+            "distances": np.array(self._distances, dtype=float).ravel(),
             "alignments": np.array([np.concatenate(pair) for pair in self.alignments]).ravel(),
             "support": self.support,
             "first_row": self.first_row,
@@ -166,9 +133,9 @@ class _LoopRows:
         """Read the bodies of ``data`` from now on."""
         self._a, self._b = _Body(data, self.joint_a), _Body(data, self.joint_b)
 
-    def evaluate(self, with_bias: bool, out: list[float]) -> None:
+    def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
         """Append for each row (force, moment) of G = (force, moment) J, then g, then Gdot v."""
-        if self._d:
+        if self._d or self._distances:
             self._positions(with_bias, out)
         if self._un:
             self._alignments(with_bias, out)
@@ -176,52 +143,69 @@ class _LoopRows:
     def _positions(self, with_bias: bool, out: list[float]) -> None:
         a, b, ground = self._a, self._b, self.joint_b == 0
         Ra, at_a = a.rotation(), self._at_a
-        rx, ry, rz = _to_world(Ra, at_a)
+        rx, ry, rz = to_world(Ra, at_a)
         ox, oy, oz = a.origin()
         x = at_b = (rx + ox, ry + oy, rz + oz)
         if not ground:
             Rb = b.rotation()
-            at_b = _from_world(Rb, _minus(x, b.origin()))
+            at_b = from_world(Rb, minus(x, b.origin()))
         if with_bias:
             spin = a.spin()
-            speed = _plus_cross(a.velocity(), spin, at_a)
-            bias = _plus_cross(a.bias(), a.spin_bias(), at_a)
-            bias = _to_world(Ra, _plus_cross(bias, spin, speed))
+            speed = plus_cross(a.velocity(), spin, at_a)
+            bias = plus_cross(a.bias(), a.spin_bias(), at_a)
+            bias = to_world(Ra, plus_cross(bias, spin, speed))
             if ground:
-                bias = _minus(bias, b.bias())  # the ground's is -gravity, as in every body's
+                bias = minus(bias, b.bias())  # the ground's is -gravity, as in every body's
+                r = to_world(Ra, speed)
             else:
                 spin = b.spin()
-                sx, sy, sz = _from_world(Rb, _to_world(Ra, speed))
-                cx, cy, cz = _plus_cross(b.velocity(), spin, at_b)
+                sx, sy, sz = from_world(Rb, to_world(Ra, speed))
+                cx, cy, cz = plus_cross(b.velocity(), spin, at_b)
                 # omega_b x (carried + 2 r), r = speed - carried
                 twice = (2.0 * sx - cx, 2.0 * sy - cy, 2.0 * sz - cz)
-                carried = _plus_cross(b.bias(), b.spin_bias(), at_b)
-                bias = _minus(_from_world(Rb, bias), _plus_cross(carried, spin, twice))
+                r = sx - cx, sy - cy, sz - cz
+                carried = plus_cross(b.bias(), b.spin_bias(), at_b)
+                bias = minus(from_world(Rb, bias), plus_cross(carried, spin, twice))
         else:
-            bias = (0.0, 0.0, 0.0)
-        p = _minus(at_b, self._at_b)
+            r = bias = (0.0, 0.0, 0.0)
+        p = minus(at_b, self._at_b)
         for d in self._d:
-            e = d if ground else _to_world(Rb, d)
+            e = d if ground else to_world(Rb, d)
             out += e
             out += cross3(x, e)
-            out += _dot(d, p), _dot(d, bias)
+            out += dot(d, p), dot(d, bias)
+        for length, factor in self._distances:
+            apart = math.sqrt(dot(p, p))
+            if apart < COINCIDENT * length:
+                raise EvaluationError(
+                    f"the two points of the loop {self.name!r} coincide: their distance has no "
+                    "direction"
+                )
+            by = factor / apart
+            px, py, pz = p
+            d = [by * px, by * py, by * pz]
+            e = d if ground else to_world(Rb, d)
+            across = cross3(d, r)
+            out += e
+            out += cross3(x, e)
+            out += factor * (apart - length), dot(d, bias) + dot(across, across) / (by * apart**2)
 
     def _alignments(self, with_bias: bool, out: list[float]) -> None:
         a, b = self._a, self._b
         Ra, Rb = a.rotation(), b.rotation()
         if with_bias:
             carried = b.spin()
-            spin = _from_world(Rb, _to_world(Ra, a.spin()))
-            w = _minus(spin, carried)
-            bias = _minus(_from_world(Rb, _to_world(Ra, a.spin_bias())), b.spin_bias())
-            bias = _minus(bias, cross3(carried, spin))
+            spin = from_world(Rb, to_world(Ra, a.spin()))
+            w = minus(spin, carried)
+            bias = minus(from_world(Rb, to_world(Ra, a.spin_bias())), b.spin_bias())
+            bias = minus(bias, cross3(carried, spin))
         else:
             w = bias = (0.0, 0.0, 0.0)
         for u, n in self._un:
-            m = _from_world(Rb, _to_world(Ra, u))
+            m = from_world(Rb, to_world(Ra, u))
             out += 0.0, 0.0, 0.0
-            out += _to_world(Rb, cross3(m, n))
-            out += _dot(n, m), _dot(n, _plus_cross(cross3(bias, m), w, cross3(w, m)))
+            out += to_world(Rb, cross3(m, n))
+            out += dot(n, m), dot(n, plus_cross(cross3(bias, m), w, cross3(w, m)))
 
 
 class LoopKinematics:
@@ -252,11 +236,12 @@ class LoopKinematics:
         total = sum(loop.rows.count for loop in loops)
         scale = np.ones(total) if scale is None else scale
         mask = np.ones(total, dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
-        self._loops: list[_LoopRows] = []
+        self._loops: list[_LoopRows | JointRows] = []
         at = m = 0
         for loop in loops:
             rows = slice(at, at + loop.rows.count)
-            resolved = _LoopRows(model, loop, scale[rows], mask[rows], m)
+            kind = JointRows if loop.rows.joint_rows else _LoopRows
+            resolved = kind(model, loop, scale[rows], mask[rows], m)
             at = rows.stop
             m += resolved.count
             if resolved.count:
@@ -265,6 +250,11 @@ class LoopKinematics:
         for resolved in self._loops:
             first = resolved.first_row
             self._support[first : first + resolved.count] = resolved.support
+        self._joint_rows = [loop for loop in self._loops if isinstance(loop, JointRows)]
+        self._constant = [
+            (slice(rows.first_row, rows.first_row + rows.count), rows.G)
+            for rows in self._joint_rows
+        ]
         self._allocate()
 
     def _allocate(self) -> None:
@@ -282,15 +272,23 @@ class LoopKinematics:
         other._allocate()
         return other
 
-    def constants(self) -> list[dict[str, Any]]:
-        """What the compiled kernel needs of each closure."""
-        return [loop.constants() for loop in self._loops]
+    def constants(self) -> dict[str, Any]:
+        """What the compiled kernel needs of the rows: ``loops`` between anchors, ``joint_rows``."""
+        return {
+            "loops": [loop.constants() for loop in self._loops if isinstance(loop, _LoopRows)],
+            "joint_rows": [row for rows in self._joint_rows for row in rows.constants()],
+        }
 
-    def update(self, data: pin.Data, with_bias: bool = True) -> None:
-        """Evaluate g and G, and Gdot v unless ``with_bias`` is false.
+    def update(self, data: pin.Data, q: FloatArray, with_bias: bool = True) -> None:
+        """Evaluate g and G, and Gdot v unless ``with_bias`` is false, at the configuration q (nq,).
 
         ``data`` must hold crba in the WORLD convention (placements, world Jacobian) and, for the
         bias, nonLinearEffects (velocities, bias accelerations) at the current state.
+
+        Raises
+        ------
+        EvaluationError
+            If the points of a ``distance`` coincide.
         """
         if data is not self._data:
             self._data, self._J = data, world_jacobian(data)
@@ -298,11 +296,13 @@ class LoopKinematics:
                 loop.bind(data)
         numbers: list[float] = []
         for loop in self._loops:
-            loop.evaluate(with_bias, numbers)
+            loop.evaluate(q, with_bias, numbers)
         self._numbers[:] = numbers
         G = self.G
         np.dot(self._wrenches, self._J, G)
         np.multiply(G, self._support, G)
+        for own, entries in self._constant:
+            G[own] = entries
 
 
 def all_rows(mechanism: Mechanism) -> LoopKinematics:
@@ -330,7 +330,7 @@ def closure_errors(
     c = np.empty_like(g)
     for i in range(len(q)):
         pin.crba(model, data, q[i], pin.Convention.WORLD)
-        rows.update(data, with_bias=False)
+        rows.update(data, q[i], with_bias=False)
         g[i] = rows.g
         c[i] = rows.G @ v[i]
     return g, c
@@ -339,18 +339,17 @@ def closure_errors(
 def row_wrenches(loop: LoopClosure, model: pin.Model, data: pin.Data) -> FloatArray:
     """Wrench on b, at b's origin in world axes, per unit multiplier of each row: (rows, 6).
 
-    ``data`` must hold the joint placements.  Force (3) then moment (3); a's body feels the
-    opposite wrench at the same point.
+    For closures between anchors.  ``data`` must hold the joint placements.  Force (3) then moment
+    (3); a's body feels the opposite wrench at the same point.
     """
-    joint_a, in_a = loop.a.resolve(model)
-    joint_b, in_b = loop.b.resolve(model)
-    Ta = data.oMi[joint_a] * in_a
-    Tb = data.oMi[joint_b] * in_b
+    Ta, Tb = (data.oMi[joint] * inside for joint, inside in loop.resolve(model))
     gap = Ta.translation - Tb.translation
     out = []
     for d in loop.rows.directions:
         force = Tb.rotation @ d
         out.append(np.concatenate([force, cross(gap, force)]))
+    if loop.rows.distances:  # along the line through both origins
+        out.append(np.concatenate([gap / np.linalg.norm(gap), np.zeros(3)]))
     for u, n in loop.rows.alignments:
         moment = cross(Ta.rotation @ u, Tb.rotation @ n)
         out.append(np.concatenate([np.zeros(3), moment]))

@@ -29,9 +29,9 @@ from srm_mbs.systems.charts import (
     group_joints,
     planar_translation,
 )
-from srm_mbs.systems.forces import COINCIDENT, resolved_forces
+from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.held import HeldForce
-from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.loops import COINCIDENT, LoopKinematics
 from srm_mbs.systems.projection import Projection, unwhiten
 from srm_mbs.systems.units import row_units
 
@@ -188,6 +188,7 @@ class _Mechanics:
         """Those that do not depend on the start."""
         return {
             "loops": [],
+            "joint_rows": [],
             "rows": 0,
             "structural_rank": 0,
             "sigma_ref": 1.0,
@@ -443,7 +444,7 @@ class ClosedSystem(_Mechanics):
 
     def _gap_scales(self) -> FloatArray:
         structure = self.structure
-        unit = row_units(self.mechanism.loops, structure.units.length)
+        unit = row_units(self.mechanism, structure.units)
         scale: FloatArray = (structure.row_scale / unit)[structure.kept]
         return scale
 
@@ -467,12 +468,12 @@ class ClosedSystem(_Mechanics):
         return super().constants() | {"gap_scale": self._gap_scale}
 
     def _constants(self) -> dict[str, Any]:
-        return super()._constants() | {
-            "loops": self.loops.constants(),
+        own = {
             "rows": len(self.loops.g),
             "structural_rank": self.structure.rank,
             "sigma_ref": self.structure.sigma_ref,
         }
+        return super()._constants() | self.loops.constants() | own
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Count what the compiled kernel did for this system."""
@@ -505,7 +506,7 @@ class ClosedSystem(_Mechanics):
         if self._forces is not None:
             f += self._forces.generalised(data, q, v)
         loops = self.loops
-        loops.update(data)
+        loops.update(data, q)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
         projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
@@ -534,7 +535,7 @@ class ClosedSystem(_Mechanics):
         """Scaled closure errors g (m,) and closure rates G v (m,) of the kept rows."""
         q, v = self.split(state)
         pin.crba(self.model, self.data, q, _WORLD)
-        self.loops.update(self.data, with_bias=False)
+        self.loops.update(self.data, q, with_bias=False)
         return self.loops.g.copy(), self.loops.G @ v
 
 

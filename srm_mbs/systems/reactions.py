@@ -28,7 +28,7 @@ def reactions_at(
     """
     mechanism = system.mechanism
     model = mechanism.model
-    wrenches = {loop.name: np.zeros((len(t), 6)) for loop in mechanism.loops}
+    wrenches = {loop.name: np.zeros((len(t), 6)) for loop in mechanism.loops if loop.anchors}
     multipliers = {loop.name: np.zeros((len(t), loop.rows.count)) for loop in mechanism.loops}
     if not isinstance(system, ClosedSystem):
         return wrenches, multipliers
@@ -39,7 +39,7 @@ def reactions_at(
         terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
         yhat = terms.multiplier().copy()
         pin.crba(model, data, q[i], pin.Convention.WORLD)
-        rows.update(data, with_bias=False)
+        rows.update(data, q[i], with_bias=False)
         U = cholesky(data.M)
         W = whiten(U, np.asfortranarray((rows.G / scale[:, None]).T))
         left, singular, right = np.linalg.svd(W, full_matrices=False)
@@ -50,5 +50,6 @@ def reactions_at(
             own = lam[at : at + loop.rows.count]
             at += loop.rows.count
             multipliers[loop.name][i] = own
-            wrenches[loop.name][i] = row_wrenches(loop, model, data).T @ own
+            if loop.anchors:
+                wrenches[loop.name][i] = row_wrenches(loop, model, data).T @ own
     return wrenches, multipliers

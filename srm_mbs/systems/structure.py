@@ -92,13 +92,13 @@ class _Walker:
         self.data = self.model.createData()
         self.units = units
         self.rows = LoopKinematics(self.model, mechanism.loops)
-        self.row_unit = row_units(mechanism.loops, units.length)
+        self.row_unit = row_units(mechanism, units)
         self.scale = np.ones(len(self.rows.g))
 
     def evaluate(self, q: FloatArray) -> None:
         """g and G of ``rows``, and M in ``data``, at q."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self.rows.update(self.data, with_bias=False)
+        self.rows.update(self.data, q, with_bias=False)
 
     def white(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """W = L^-1 G^T (nv, m) of the scaled rows, and the Cholesky factor U (nv, nv), at q."""
@@ -139,13 +139,15 @@ class _Walker:
         uncancelled /= OPEN_SAMPLES
         at = 0
         for loop in mechanism.loops:
-            k = len(loop.rows.directions)
-            blocks = (slice(at, at + k), slice(at + k, at + loop.rows.count))
-            for block, whole in zip(blocks, uncancelled):
-                mean = squares[block].mean() if block.stop > block.start else 0.0
+            lengths, turns, joints = loop.rows.blocks
+            own = squares[at : at + loop.rows.count]
+            scale = self.scale[at : at + loop.rows.count]
+            for block, whole in zip((lengths, turns), uncancelled):
+                mean = own[block].mean() if block.stop > block.start else 0.0
                 if mean <= ROUNDING_ROW**2 * whole:
                     mean = whole  # always satisfied: keep rounding from being scaled up to a row
-                self.scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
+                scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
+            scale[joints] = np.sqrt(own[joints])  # constant entries: nothing cancels
             at += loop.rows.count
 
     def step(self, q: FloatArray, direction: FloatArray, reach: float) -> FloatArray | None:

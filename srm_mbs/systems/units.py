@@ -6,15 +6,14 @@ or on another time scale, takes the same steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
-from srm_mbs.mechanism import LoopClosure, Mechanism
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.loops import world_jacobian
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
@@ -45,16 +44,58 @@ class Units:
     rate: float
 
 
-def row_units(loops: Sequence[LoopClosure], length: float) -> FloatArray:
-    """Units of the closure rows (rows,): ``length`` (m) for position rows, 1 rad for the others.
+def row_angles(mechanism: Mechanism) -> BoolArray:
+    """Which closure rows (rows,) are in rad; the others are in m.
 
-    Closure errors over these are pure numbers, whatever the unit of length.
+    Joint rows are in the unit of their first joint.
     """
-    units = [
-        np.repeat([length, 1.0], [len(loop.rows.directions), len(loop.rows.alignments)])
-        for loop in loops
-    ]
-    return np.concatenate(units) if units else np.zeros(0)
+    angles: BoolArray = mechanism.derived("row_angles", lambda: _row_angles(mechanism))
+    return angles
+
+
+def _row_angles(mechanism: Mechanism) -> BoolArray:
+    model = mechanism.model
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    turning = _turning(data)
+    out: list[bool] = []
+    for loop in mechanism.loops:
+        lengths, alignments, _ = loop.rows.blocks
+        out += [False] * lengths.stop + [True] * (alignments.stop - alignments.start)
+        for row in loop.rows.joint_rows:
+            out.append(bool(turning[model.joints[model.getJointId(row.joints[0])].idx_v]))
+    return np.array(out, dtype=bool)
+
+
+def row_dimensions(mechanism: Mechanism) -> tuple[str, ...]:
+    """Units that closure errors have: "m", "rad" or both, in this order."""
+    angles = row_angles(mechanism)
+    return tuple(unit for unit, own in (("m", ~angles), ("rad", angles)) if own.any())
+
+
+def _turning(data: pin.Data) -> BoolArray:
+    """Which velocity components (nv,) turn something, by the Jacobian in ``data``."""
+    out: BoolArray = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
+    return out
+
+
+def row_units(mechanism: Mechanism, units: Units) -> FloatArray:
+    """Units of the closure rows (rows,): the scene diagonal (m) for lengths, 1 rad for alignments.
+
+    A joint row is as large as its largest term, |c_i| times the unit of joint i, so that neither
+    the rounding of a large ratio nor the pitch of a screw makes it impossible to close.  Closure
+    errors over these are pure numbers, whatever the unit of length.
+    """
+    model = mechanism.model
+    out: list[float] = []
+    for loop in mechanism.loops:
+        lengths, alignments, _ = loop.rows.blocks
+        out += [units.length] * lengths.stop + [1.0] * (alignments.stop - alignments.start)
+        for row in loop.rows.joint_rows:
+            joints = (model.joints[model.getJointId(name)] for name in row.joints)
+            terms = zip(row.coefficients, joints)
+            out.append(max(abs(c) * float(units.coordinate[j.idx_v]) for c, j in terms))
+    return np.array(out)
 
 
 def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
@@ -72,8 +113,7 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
     corners = np.array(points) if points else np.zeros((1, 3))
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     length = diagonal if diagonal > 0.0 else 1.0
-    angular = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
-    coordinate = np.where(angular, 1.0, length)
+    coordinate = np.where(_turning(data), 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
     if rate == 0.0:
         rates = np.abs(v) / coordinate
@@ -89,7 +129,7 @@ def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
     found = []
     for loop in mechanism.loops:
-        for anchor in (loop.a, loop.b):
+        for anchor in loop.anchors:
             joint, placement = anchor.resolve(mechanism.model)
             found.append((joint, placement.translation.copy()))
     return found

@@ -46,9 +46,9 @@ def rank_at_start(mechanism: srm.Mechanism) -> int:
     data = model.createData()
     rows = LoopKinematics(model, mechanism.loops)
     pin.crba(model, data, mechanism.q0, pin.Convention.WORLD)
-    rows.update(data, with_bias=False)
+    rows.update(data, mechanism.q0, with_bias=False)
     units = mechanism.structure.units
-    G = rows.G / row_units(mechanism.loops, units.length)[:, None] * units.coordinate
+    G = rows.G / row_units(mechanism, units)[:, None] * units.coordinate
     return int(np.linalg.matrix_rank(G, tol=1e-9))
 
 
@@ -58,7 +58,7 @@ def assembled(spec: Spec) -> srm.Mechanism:
     model, units = mechanism.model, mechanism.structure.units
     beside = 0.02 * units.coordinate * np.random.default_rng(spec.seed).standard_normal(model.nv)
     state = srm.assemble(mechanism, pin.integrate(model, mechanism.q0, beside), rates)
-    size = row_units(mechanism.loops, units.length)
+    size = row_units(mechanism, units)
     speed = max(1.0, float(np.abs(state.v / units.coordinate).max()))
     assert np.abs(state.residuals / size).max() <= 1e-12
     assert np.abs(state.rate_residuals / size).max() <= 1e-11 * speed
@@ -81,7 +81,7 @@ def check(spec: Spec) -> None:
     bound = 1e-6 * max(1.0, turns / MANY_TURNS)
     assert np.abs(energy - energy[0]).max() <= bound * max(kinetic)
 
-    size = row_units(mechanism.loops, units.length)
+    size = row_units(mechanism, units)
     g, c = closure_errors(model, mechanism.loops, solution.q, solution.v)
     assert np.abs(g / size).max() <= 1e-9
     # Rates are projected with the Jacobian just before the positions are corrected.

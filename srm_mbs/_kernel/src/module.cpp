@@ -183,10 +183,18 @@ struct PySystem {
             std::copy_n(a.begin(), 12, rows.in_a);
             std::copy_n(b.begin(), 12, rows.in_b);
             rows.directions = vector_of(loop["directions"]);
+            rows.distances = vector_of(loop["distances"]);
             rows.alignments = vector_of(loop["alignments"]);
             take_support(loop, rows.columns, rows.signs);
             rows.first_row = whole(loop, "first_row");
             data.loops.push_back(std::move(rows));
+        }
+        for (nb::handle item : nb::cast<nb::list>(d["joint_rows"])) {
+            const nb::dict row = nb::cast<nb::dict>(item);
+            data.joint_rows.push_back({whole(row, "row"), vector_of(row["coefficients"]),
+                                       nb::cast<std::vector<int>>(row["in_q"]),
+                                       nb::cast<std::vector<int>>(row["in_v"]),
+                                       number(row, "offset")});
         }
         data.rows = whole(d, "rows");
         data.structural_rank = whole(d, "structural_rank");

@@ -64,10 +64,13 @@ System::~System() = default;
 Pattern System::pattern() const {
     Pattern out;
     out.parents.assign(work_->data.parents_fromRow.begin(), work_->data.parents_fromRow.end());
+    out.supports.resize(data_.rows);
     for (const LoopRows& loop : data_.loops)
-        out.supports.insert(out.supports.end(),
-                            (loop.directions.size() / 3) + (loop.alignments.size() / 6),
-                            loop.columns);
+        std::fill_n(out.supports.begin() + loop.first_row,
+                    loop.directions.size() / 3 + loop.distances.size() / 2 +
+                        loop.alignments.size() / 6,
+                    loop.columns);
+    for (const JointRow& joints : data_.joint_rows) out.supports[joints.row] = joints.in_v;
     return out;
 }
 
@@ -78,69 +81,98 @@ int System::rank() const { return closed_ ? projection_->rank : 0; }
 bool System::weak() const { return closed_ && projection_->weak; }
 bool System::held() const { return closed_ && projection_->held; }
 
-void System::update_loops(bool with_bias) {
+// All rows: g, Gdot v, and G into the columns of the projection.
+void System::update_loops(const double* q, bool with_bias) {
+    for (const LoopRows& loop : data_.loops) update_anchored(loop, with_bias);
+    for (const JointRow& joints : data_.joint_rows) {
+        double* const out = projection_->column(joints.row);
+        double g = -joints.offset;
+        for (std::size_t k = 0; k < joints.coefficients.size(); ++k) {
+            out[joints.in_v[k]] = joints.coefficients[k];
+            g += joints.coefficients[k] * q[joints.in_q[k]];
+        }
+        g_[joints.row] = g;
+        bias_[joints.row] = 0.0;
+    }
+}
+
+// The rows of a closure between anchors.
+void System::update_anchored(const LoopRows& loop, bool with_bias) {
     const auto& data = work_->data;
     const double* J = data.J.data();
-    for (const LoopRows& loop : data_.loops) {
-        const int ja = loop.joint_a, jb = loop.joint_b;
-        const SE3 in_a = placement(loop.in_a), in_b = placement(loop.in_b);
-        const SE3 Ta = ja ? data.oMi[ja] * in_a : in_a;
-        const SE3 Tb = jb ? data.oMi[jb] * in_b : in_b;
-        const SE3 H(Tb.rotation(), Ta.translation());
-        Motion W, B;
-        if (with_bias) {
-            // a_gf carries -gravity on every body and on the ground: it cancels here.
-            if (jb == 0) {
-                W = H.actInv(data.oMi[ja].act(data.v[ja]));
-                B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.a_gf[0]);
-            } else {
-                const Motion Va = data.oMi[ja].act(data.v[ja]), Vb = data.oMi[jb].act(data.v[jb]);
-                W = H.actInv(Va - Vb);
-                B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.oMi[jb].act(data.a_gf[jb]) -
-                             Vb.cross(Va));
-            }
+    const int ja = loop.joint_a, jb = loop.joint_b;
+    const SE3 in_a = placement(loop.in_a), in_b = placement(loop.in_b);
+    const SE3 Ta = ja ? data.oMi[ja] * in_a : in_a;
+    const SE3 Tb = jb ? data.oMi[jb] * in_b : in_b;
+    const SE3 H(Tb.rotation(), Ta.translation());
+    Motion W, B;
+    if (with_bias) {
+        // a_gf carries -gravity on every body and on the ground: it cancels here.
+        if (jb == 0) {
+            W = H.actInv(data.oMi[ja].act(data.v[ja]));
+            B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.a_gf[0]);
+        } else {
+            const Motion Va = data.oMi[ja].act(data.v[ja]), Vb = data.oMi[jb].act(data.v[jb]);
+            W = H.actInv(Va - Vb);
+            B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.oMi[jb].act(data.a_gf[jb]) -
+                         Vb.cross(Va));
         }
-        int row = loop.first_row;
-        const auto fill = [&](int row, const double* a) {
-            double* const out = projection_->column(row);
-            for (std::size_t k = 0; k < loop.columns.size(); ++k) {
-                const int j = loop.columns[k];
-                const double* column = J + 6 * j;
-                out[j] = loop.signs[k] *
-                         (a[0] * column[0] + a[1] * column[1] + a[2] * column[2] +
-                          a[3] * column[3] + a[4] * column[4] + a[5] * column[5]);
-            }
-        };
-        if (!loop.directions.empty()) {
-            const Eigen::Vector3d p = Tb.actInv(Ta.translation());
-            Eigen::Vector3d acceleration = Eigen::Vector3d::Zero();
-            if (with_bias) acceleration = B.linear() + W.angular().cross(W.linear());
-            for (std::size_t k = 0; k < loop.directions.size(); k += 3, ++row) {
-                const Eigen::Map<const Eigen::Vector3d> d(&loop.directions[k]);
-                g_[row] = d.dot(p);
-                if (with_bias) bias_[row] = d.dot(acceleration);
-                Eigen::Matrix<double, 6, 1> a;
-                a.head<3>() = H.rotation() * d;
-                a.tail<3>() = H.translation().cross(a.head<3>());
-                fill(row, a.data());
-            }
+    }
+    int row = loop.first_row;
+    const auto fill = [&](int row, const double* a) {
+        double* const out = projection_->column(row);
+        for (std::size_t k = 0; k < loop.columns.size(); ++k) {
+            const int j = loop.columns[k];
+            const double* column = J + 6 * j;
+            out[j] = loop.signs[k] *
+                     (a[0] * column[0] + a[1] * column[1] + a[2] * column[2] +
+                      a[3] * column[3] + a[4] * column[4] + a[5] * column[5]);
         }
-        if (!loop.alignments.empty()) {
-            const Eigen::Matrix3d R = Tb.rotation().transpose() * Ta.rotation();
-            for (std::size_t k = 0; k < loop.alignments.size(); k += 6, ++row) {
-                const Eigen::Map<const Eigen::Vector3d> u(&loop.alignments[k]);
-                const Eigen::Map<const Eigen::Vector3d> n(&loop.alignments[k + 3]);
-                const Eigen::Vector3d m = R * u;
-                g_[row] = n.dot(m);
-                if (with_bias) {
-                    const Eigen::Vector3d w = W.angular();
-                    bias_[row] = n.dot(B.angular().cross(m) + w.cross(w.cross(m)));
-                }
-                Eigen::Matrix<double, 6, 1> a;
-                a.head<3>().setZero();
-                a.tail<3>() = H.rotation() * m.cross(n);
-                fill(row, a.data());
+    };
+    // A row whose rate is d times the velocity of a's origin, d in b's axes.
+    const auto fill_along = [&](int row, const Eigen::Vector3d& d) {
+        Eigen::Matrix<double, 6, 1> a;
+        a.head<3>() = H.rotation() * d;
+        a.tail<3>() = H.translation().cross(a.head<3>());
+        fill(row, a.data());
+    };
+    if (!loop.directions.empty() || !loop.distances.empty()) {
+        const Eigen::Vector3d p = Tb.actInv(Ta.translation());
+        Eigen::Vector3d acceleration = Eigen::Vector3d::Zero();
+        if (with_bias) acceleration = B.linear() + W.angular().cross(W.linear());
+        for (std::size_t k = 0; k < loop.directions.size(); k += 3, ++row) {
+            const Eigen::Map<const Eigen::Vector3d> d(&loop.directions[k]);
+            g_[row] = d.dot(p);
+            if (with_bias) bias_[row] = d.dot(acceleration);
+            fill_along(row, d);
+        }
+        for (std::size_t k = 0; k < loop.distances.size(); k += 2, ++row) {
+            const double length = loop.distances[k], factor = loop.distances[k + 1];
+            const double apart = p.norm();
+            if (apart < data_.coincident * length) throw EvaluationError{Failure::coincident};
+            const Eigen::Vector3d d = p / apart;
+            g_[row] = factor * (apart - length);
+            if (with_bias)
+                bias_[row] = factor * (d.dot(acceleration) +
+                                       d.cross(W.linear()).squaredNorm() / apart);
+            fill_along(row, factor * d);
+        }
+    }
+    if (!loop.alignments.empty()) {
+        const Eigen::Matrix3d R = Tb.rotation().transpose() * Ta.rotation();
+        for (std::size_t k = 0; k < loop.alignments.size(); k += 6, ++row) {
+            const Eigen::Map<const Eigen::Vector3d> u(&loop.alignments[k]);
+            const Eigen::Map<const Eigen::Vector3d> n(&loop.alignments[k + 3]);
+            const Eigen::Vector3d m = R * u;
+            g_[row] = n.dot(m);
+            if (with_bias) {
+                const Eigen::Vector3d w = W.angular();
+                bias_[row] = n.dot(B.angular().cross(m) + w.cross(w.cross(m)));
             }
+            Eigen::Matrix<double, 6, 1> a;
+            a.head<3>().setZero();
+            a.tail<3>() = H.rotation() * m.cross(n);
+            fill(row, a.data());
         }
     }
 }
@@ -199,7 +231,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
     if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
-    update_loops(true);
+    update_loops(state, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);
     predicted_ = false;
@@ -342,7 +374,7 @@ double System::closure_gap(const double* state) {
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
     pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
-    update_loops(false);
+    update_loops(state, false);
     return gap();
 }
 

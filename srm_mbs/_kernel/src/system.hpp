@@ -24,10 +24,19 @@ struct LoopRows {
     int joint_a, joint_b;
     double in_a[12], in_b[12];  // placements: rotation (3, 3) row-major, translation
     std::vector<double> directions;       // (k, 3)
+    std::vector<double> distances;        // (l, 2): length, factor of the row
     std::vector<double> alignments;       // (l, 6): u in a, n in b
     std::vector<int> columns;             // velocity components that move a against b
     std::vector<double> signs;            // +1 where they move a, -1 where b
     int first_row;
+};
+
+// A kept, scaled joint row: sum c_i q_i - offset.
+struct JointRow {
+    int row;
+    std::vector<double> coefficients;
+    std::vector<int> in_q, in_v;
+    double offset;
 };
 
 // (t, q, v) -> generalised forces (nv,), added to tau.
@@ -35,6 +44,7 @@ using Controller = std::function<void(double, const double*, const double*, doub
 
 struct SystemData {
     std::vector<LoopRows> loops;
+    std::vector<JointRow> joint_rows;
     int rows = 0, structural_rank = 0;
     double sigma_ref = 1.0;
     std::string algebra = "auto";       // "auto", "dense" or "sparse"
@@ -103,7 +113,8 @@ public:
 
 private:
     Pattern pattern() const;
-    void update_loops(bool with_bias);
+    void update_loops(const double* q, bool with_bias);
+    void update_anchored(const LoopRows& loop, bool with_bias);
     void completed(const double* white, double* out) const;
     const double* held_force(double t) const;
 

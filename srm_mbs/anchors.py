@@ -1,0 +1,140 @@
+"""Anchors: frames fixed on bodies, where closures and forces take hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.errors import InputError
+
+WORLD = "world"
+"""Reserved link name: the fixed ground."""
+
+
+def finite_numbers(values: Any, count: int, what: str, remedy: str) -> tuple[float, ...]:
+    """``values`` as a tuple of ``count`` finite floats.
+
+    Raises
+    ------
+    InputError
+        About the element ``what``, with that ``remedy``, if they are anything else.
+    """
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} must be {count} finite numbers, not {values!r}", element=what, remedy=remedy
+        )
+    return tuple(array.tolist())
+
+
+def vector(values: Sequence[float], what: str) -> tuple[float, float, float]:
+    """``values`` as three finite floats.
+
+    Raises
+    ------
+    InputError
+        About the element ``what``, if they are anything else.
+    """
+    x, y, z = finite_numbers(values, 3, what, "Give [x, y, z]")
+    return (x, y, z)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A frame fixed on a body: where a closure takes hold.
+
+    Parameters
+    ----------
+    link
+        Name of a link (a Pinocchio ``BODY`` frame), or ``"world"``.
+    frame
+        Name of any Pinocchio frame, instead of ``link``.
+    xyz : (3,) m
+        Origin of the anchor in the link's or frame's own frame.
+    rpy : (3,) rad
+        Its orientation there: fixed-axis roll, pitch, yaw as in URDF.
+
+    Raises
+    ------
+    InputError
+        If neither or both of ``link`` and ``frame`` are given, or a vector is malformed.
+    """
+
+    link: str | None = None
+    frame: str | None = None
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if (self.link is None) == (self.frame is None):
+            raise InputError(
+                "an anchor needs either a link or a frame",
+                element="anchor",
+                remedy='Write { link = "rod" } or { frame = "rod_tip" }, not both',
+            )
+        object.__setattr__(self, "xyz", vector(self.xyz, "xyz"))
+        object.__setattr__(self, "rpy", vector(self.rpy, "rpy"))
+
+    @property
+    def where(self) -> str:
+        """Name of the link or frame."""
+        return str(self.link if self.link is not None else self.frame)
+
+    def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
+        """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.
+
+        Raises
+        ------
+        InputError
+            If the model has no such link or frame; the message lists those it has.
+        """
+        offset = pin.SE3(pin.rpy.rpyToMatrix(np.array(self.rpy)), np.array(self.xyz))
+        if self.link == WORLD:
+            return 0, offset
+        if self.link is not None:
+            known = model.existFrame(self.link, pin.FrameType.BODY)
+            index = model.getFrameId(self.link, pin.FrameType.BODY) if known else -1
+        else:
+            index = next((i for i, f in enumerate(model.frames) if f.name == self.frame), -1)
+        if index < 0:
+            kind = "link" if self.link is not None else "frame"
+            body = pin.FrameType.BODY
+            names = [f.name for f in model.frames if kind == "frame" or f.type == body]
+            shown = ", ".join(sorted(set(names) - {"universe"} | {WORLD}))
+            raise InputError(f"there is no {kind} {self.where!r}", remedy=f"Known: {shown}")
+        frame = model.frames[index]
+        return int(frame.parentJoint), frame.placement * offset
+
+
+def resolve_apart(
+    model: pin.Model, a: Anchor, b: Anchor, element: str
+) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
+    """Both anchors of ``element`` as in :meth:`Anchor.resolve`, on two different bodies.
+
+    Raises
+    ------
+    InputError
+        If the model has no such link or frame, or both lie on the same body.
+    """
+    resolved = []
+    for side, anchor in (("a", a), ("b", b)):
+        try:
+            resolved.append(anchor.resolve(model))
+        except InputError as error:
+            error.element = f"{element}, anchor {side}"
+            raise
+    if resolved[0][0] == resolved[1][0]:
+        raise InputError(
+            "both anchors lie on the same body",
+            element=element,
+            remedy="Anchor it on two bodies that move relative to each other "
+            "(locked and fixed joints join bodies)",
+        )
+    return resolved[0], resolved[1]

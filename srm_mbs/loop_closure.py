@@ -1,0 +1,267 @@
+"""Loop closures as immutable descriptions; :mod:`srm_mbs.systems.loops` evaluates them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.anchors import Anchor, finite_numbers, resolve_apart, vector
+from srm_mbs.arrays import FloatArray
+from srm_mbs.closures import CLOSURE_TYPES, ClosureValues, JointRow, RowSet
+from srm_mbs.errors import InputError
+
+_KEYS = {
+    "a": ("an anchor a", 'Give "a = { link = ... }"'),
+    "b": ("an anchor b", 'Give "b = { link = ... }"'),
+    "axis": ("an axis", 'Give "axis = [x, y, z]", in b\'s frame'),
+    "axis_a": ("an axis_a", 'Give "axis_a = [x, y, z]", in a\'s frame'),
+    "axis_b": ("an axis_b", 'Give "axis_b = [x, y, z]", in b\'s frame'),
+    "length": ("a length", 'Give "length = ...", in m'),
+    "joints": ("joints", 'Give "joints = [first, second]"'),
+    "ratio": ("a ratio", 'Give "ratio = ..."'),
+    "coefficients": ("coefficients", 'Give "coefficients = [...]"'),
+    "offset": ("an offset", 'Give "offset = ..."'),
+}
+"""Keys of a closure: in words, and how to give them."""
+_COINCIDENT = 1e-9
+"""Distance, over that of the points from the world's origin, below which it is rounding."""
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """One loop closure: between anchors ``a`` and ``b``, or (``coupling``) between joints.
+
+    Parameters
+    ----------
+    type
+        A key of :data:`srm_mbs.closures.CLOSURE_TYPES`.
+    a, b
+        The two anchors.
+    axis : (3,)
+        Direction in b's frame, for the types that have one; normalised here.
+    name
+        Unique name; by default made from the type and the links or joints.
+    axis_a, axis_b : (3,)
+        ``universal``: the axes of the cross, in a's and in b's frame; normalised here.
+    length
+        ``distance``: m; by default the distance in the initial configuration (the guess), which
+        :class:`~srm_mbs.mechanism.Mechanism` fills in.
+    joints
+        ``coupling``: names of joints with one degree of freedom.
+    ratio, offset
+        ``coupling`` of two joints: q_a = ratio q_b + offset, in rad or m; offset 0 by default.
+    coefficients
+        ``coupling`` of any number of joints, instead of ``ratio``: sum c_i q_i = offset.
+
+    Raises
+    ------
+    InputError
+        For an unknown type; for an anchor, axis or other key that is missing, superfluous or
+        cannot be.
+    """
+
+    type: str
+    a: Anchor | None = None
+    b: Anchor | None = None
+    axis: tuple[float, float, float] | None = None
+    name: str = ""
+    axis_a: tuple[float, float, float] | None = None
+    axis_b: tuple[float, float, float] | None = None
+    length: float | None = None
+    joints: tuple[str, ...] | None = None
+    ratio: float | None = None
+    coefficients: tuple[float, ...] | None = None
+    offset: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            where = [anchor.where for anchor in self.anchors] or [*(self.joints or ())]
+            object.__setattr__(self, "name", "_".join((self.type, *where)))
+        kind = CLOSURE_TYPES.get(self.type)
+        if kind is None:
+            raise self._fault(
+                f"there is no closure type {self.type!r}",
+                f"This version knows {', '.join(CLOSURE_TYPES)}",
+            )
+        for key, (words, remedy) in _KEYS.items():
+            given = getattr(self, key) is not None
+            if not given and key in kind.needs:
+                raise self._fault(f"a {self.type} closure needs {words}", remedy)
+            if given and key not in (*kind.needs, *kind.takes):
+                raise self._fault(f"a {self.type} closure takes no {key}", f'Remove "{key}"')
+        for key in ("axis", "axis_a", "axis_b"):
+            if getattr(self, key) is not None:
+                self._take_axis(key)
+        if self.length is not None:
+            self._take_length()
+        if self.joints is not None:
+            self._take_joints(self.joints)
+
+    def _fault(self, problem: str, remedy: str) -> InputError:
+        return InputError(problem, element=f"loop {self.name!r}", remedy=remedy)
+
+    def _take_axis(self, key: str) -> None:
+        axis = np.array(vector(getattr(self, key), key))
+        size = float(np.linalg.norm(axis))
+        if size == 0.0:
+            raise self._fault(f"the {key} is zero", "Give a direction")
+        axis /= size
+        object.__setattr__(self, key, (float(axis[0]), float(axis[1]), float(axis[2])))
+
+    def _take_numbers(self, key: str, given: Any, count: int) -> tuple[float, ...]:
+        try:
+            return finite_numbers(given, count, key, f"Give {count} finite number(s)")
+        except InputError as error:
+            error.element = f"loop {self.name!r}"
+            raise
+
+    def _take_length(self) -> None:
+        (length,) = self._take_numbers("length", (self.length,), 1)
+        if length == 0.0:
+            raise self._fault(
+                "a distance of 0 has no direction",
+                'Use type = "point", which makes the two origins coincide',
+            )
+        if length < 0.0:
+            raise self._fault(f"the length {length:g} m is negative", "Give a length > 0")
+        object.__setattr__(self, "length", length)
+
+    def _take_joints(self, given: Sequence[str]) -> None:
+        joints = tuple(given) if not isinstance(given, str) else (given,)
+        if not joints or not all(isinstance(name, str) for name in joints):
+            raise self._fault(
+                f"joints = {given!r} is no list of names", 'Give "joints = [first, second]"'
+            )
+        for name in joints:
+            if joints.count(name) > 1:
+                raise self._fault(
+                    f"the joint {name!r} stands there twice", "Keep one, with the sum of both"
+                )
+        if (self.ratio is None) == (self.coefficients is None):
+            raise self._fault(
+                "a coupling needs a ratio or coefficients"
+                if self.ratio is None
+                else "a coupling takes either a ratio or coefficients",
+                'Give "ratio = ..." (q_a = ratio q_b + offset) for two joints, or '
+                '"coefficients = [...]" (sum c_i q_i = offset)',
+            )
+        if self.ratio is not None:
+            if len(joints) != 2:
+                raise self._fault(
+                    f"a ratio relates two joints, not {len(joints)}",
+                    "Name two joints, or give coefficients",
+                )
+            (ratio,) = self._take_numbers("ratio", (self.ratio,), 1)
+            object.__setattr__(self, "ratio", ratio)
+            numbers: tuple[float, ...] = (ratio,)
+        else:
+            numbers = self._take_numbers("coefficients", self.coefficients, len(joints))
+            object.__setattr__(self, "coefficients", numbers)
+        if 0.0 in numbers:
+            raise self._fault(
+                "a ratio or coefficient is zero",
+                "Remove that joint from the coupling; to hold a joint, name it in lock",
+            )
+        offset = 0.0 if self.offset is None else self.offset
+        object.__setattr__(self, "offset", self._take_numbers("offset", (offset,), 1)[0])
+        object.__setattr__(self, "joints", joints)
+
+    @property
+    def anchors(self) -> tuple[Anchor, ...]:
+        """(a, b), or () for a coupling of joints."""
+        return tuple(anchor for anchor in (self.a, self.b) if anchor is not None)
+
+    @cached_property
+    def rows(self) -> RowSet:
+        """The scalar rows of this closure, in its anchors.
+
+        Raises
+        ------
+        InputError
+            If its length is not yet known: it belongs to no mechanism.
+        """
+        if self.type == "distance" and self.length is None:
+            raise self._fault(
+                "its length is known only when it is part of a mechanism",
+                "Read it from mechanism.loops, or give a length",
+            )
+        given: dict[str, Any] = {
+            key: np.array(getattr(self, key))
+            for key in ("axis", "axis_a", "axis_b")
+            if getattr(self, key) is not None
+        }
+        if self.length is not None:
+            given["length"] = self.length
+        if self.joints is not None:
+            coefficients = self.coefficients or (1.0, -float(self.ratio or 0.0))
+            given["joint_row"] = JointRow(self.joints, coefficients, float(self.offset or 0.0))
+        return CLOSURE_TYPES[self.type].rows(ClosureValues(**given))
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """``loop.row`` for every row."""
+        return tuple(f"{self.name}.{label}" for label in self.rows.labels)
+
+    def resolve(self, model: pin.Model) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
+        """Joint and placement in it of both anchors, as :meth:`Anchor.resolve` gives them.
+
+        Only for closures that have anchors.
+        """
+        a, b = self.anchors
+        return a.resolve(model), b.resolve(model)
+
+    def check(self, model: pin.Model) -> None:
+        """Refuse anchors or joints that ``model`` does not have, or that cannot be tied.
+
+        Raises
+        ------
+        InputError
+            Naming the loop and the remedy.
+        """
+        if self.anchors:
+            a, b = self.anchors
+            resolve_apart(model, a, b, f"loop {self.name!r}")
+        names = list(model.names)[1:]
+        for name in self.joints or ():
+            if name not in names:
+                raise self._fault(
+                    f"there is no moving joint {name!r}", f"Known: {', '.join(names) or 'none'}"
+                )
+            joint = model.joints[model.getJointId(name)]
+            if joint.nv != 1:
+                raise self._fault(
+                    f"the joint {name!r} has {joint.nv} degrees of freedom",
+                    "Couple joints with one degree of freedom",
+                )
+            if joint.nq != 1:
+                raise self._fault(
+                    f"the joint {name!r} is stored as (cos, sin), which does not count turns",
+                    "Build it as a revolute joint without limits (nq = 1); srm.load does that for "
+                    "the continuous joints of a URDF",
+                )
+
+    def measured(self, model: pin.Model, q: FloatArray) -> LoopClosure:
+        """The same closure with a length that was not given taken from the configuration q (nq,).
+
+        Raises
+        ------
+        InputError
+            If the two points coincide there.
+        """
+        if self.type != "distance" or self.length is not None:
+            return self
+        data = model.createData()
+        pin.forwardKinematics(model, data, q)
+        a, b = (data.oMi[joint].act(inside.translation) for joint, inside in self.resolve(model))
+        length = float(np.linalg.norm(a - b))
+        if length <= _COINCIDENT * max(np.linalg.norm(a), np.linalg.norm(b)):
+            raise self._fault(
+                "its two points coincide in the guess: a distance of 0 has no direction",
+                'Use type = "point" if they are to coincide, or give a length or another guess',
+            )
+        return replace(self, length=length)

@@ -34,7 +34,7 @@ def terms(mechanism: srm.Mechanism, q: np.ndarray, v: np.ndarray):
     M = np.triu(M) + np.triu(M, 1).T
     nle = np.array(pin.nonLinearEffects(model, data, q, v))
     rows = LoopKinematics(model, mechanism.loops, keep=mechanism.structure.kept)
-    rows.update(data)
+    rows.update(data, q)
     return M, nle, rows.G.copy()
 
 

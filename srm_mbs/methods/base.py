@@ -161,6 +161,8 @@ class StepResult:
         ``"redone"``.
     quiet
         Whether the whole step is so far from singular configurations that nothing needs a look.
+    slope
+        Of a quiet step: |d sigma / dt| (1/s), the largest over the step and to its middle stage.
     gap
         Largest closure error before a full correction, in row units, rows that are not in use
         included; 0 if the correction is partial.
@@ -189,6 +191,7 @@ class StepResult:
     restarted: bool = False
     placement: str = ""
     quiet: bool = False
+    slope: float = 0.0
     gap: float = 0.0
     held: bool = False
     normals: FloatArray | None = None

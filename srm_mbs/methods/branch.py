@@ -125,10 +125,12 @@ class BranchStages:
             Abscissa of the stage.
         """
         moved: FloatArray | None = None
+        if not (self.near and c > 0.0):
+            return terms, x, moved
         change = max(self.sigma_change, abs(terms.sigma - self.memory.sigma) / c)
         for _ in range(PROJECTIONS):
             sigma = terms.sigma
-            if terms.weak or not sigma > 0.0 or not self.near:
+            if terms.weak or not sigma > 0.0:
                 break
             error = terms.correction()
             if self.system.size(error) > AMBIGUOUS * sigma:

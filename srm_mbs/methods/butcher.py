@@ -236,6 +236,13 @@ class ButcherTableau(_Record):
         gaps = [((a + b) / 2, (b - a) / 2) for a, b in pairwise(nodes)]
         return tuple(sorted(gaps, key=lambda gap: -gap[1]))
 
+    @cached_property
+    def middle(self) -> tuple[int, float]:
+        """Index and abscissa > 0 of the stage nearest to the middle of the step; the end (s, 1)
+        where none lies inside."""
+        inside = [(i, c) for i, c in enumerate(self.c.tolist()) if 0.0 < c < 1.0]
+        return min(inside, key=lambda node: abs(node[1] - 0.5), default=(self.n_stages, 1.0))
+
 
 def _freeze(record: _Record, owner: str, **shapes: tuple[int, ...]) -> None:
     """Replace fields by read-only copies; refuse other shapes (-1: any length), NaN, infinity."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class MultiplierHistory:
         """History with one node."""
         return cls(np.array([t]), value[None].copy())
 
-    @property
+    @cached_property
     def begun(self) -> bool:
         """Whether there is a node."""
         return len(self.times) > 0

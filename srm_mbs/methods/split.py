@@ -30,7 +30,6 @@ from srm_mbs.systems.base import System
 
 FAR = 8.0
 """Steps from a singular configuration from which a step prepares nothing for one."""
-ALL_ROWS = np.iinfo(np.int64).max
 GAP_EVERY = 16
 """Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
 
@@ -69,76 +68,66 @@ def split_step(
     """
     s = scheme.n_stages
     all_weights, fractions = later_stages(scheme)
-    history = memory.history
+    history, start = memory.history, memory.sigma
     sigma_change = h * memory.sigma_slope
     branch: BranchStages | None = None
     zone = None
-    if history is not None and memory.sigma < WATCHED + FAR * sigma_change:
+    if history is not None and start < WATCHED + FAR * sigma_change:
         weights = norm.weights(memory.magnitude)
         branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
         zone = branch.zone
     # Zeros, because each stage weighs all s rates: those still to come with 0.
     rates = np.zeros((s + 1, system.tangent_size))
     weighed = rates[:s]
-    all_sigmas = [memory.sigma]
+    all_sigmas = [start]
     rates[0] = memory.rate
-    weak_stages: list[int] = []
-    rank = ALL_ROWS
-    moved: FloatArray | None = None
-    held = False
+    weak: list[tuple[int, int, bool]] = []
     for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
         delta = stage_weights.dot(weighed)
         x = system.retract(state, delta)
-        time = t + fraction * h
-        terms = system.evaluate(time, x, zone)
+        terms = system.evaluate(t + fraction * h, x, zone)
         all_sigmas.append(terms.sigma)
-        if branch is not None and branch.near and fraction > 0.0:
-            terms, x, moved = branch(terms, time, fraction, x)
+        if branch is not None:
+            terms, x, moved = branch(terms, t + fraction * h, fraction, x)
         rate = terms.rate()
         rates[j] = system.chart_rate(delta, rate)
         if terms.weak:
-            rank = min(rank, terms.rank)
-            weak_stages.append(j)
-            held = held or terms.held
-    sigmas = np.array(all_sigmas)
+            weak.append((j, terms.rank, terms.held))
+    sigma = terms.sigma
+    change = abs(sigma - start)
+    quiet = branch is None and sigma > WATCHED + FAR * change
     magnitude = system.magnitudes(x)
-    normals: FloatArray | None = None
-    if history is not None:
+    multiplier = normals = None
+    if history is None:
+        correction = np.zeros(0)
+        new_state, end_rate = x, rate.copy()
+    else:
         correction = terms.correction()
         if theta != 1.0:
             correction = theta * correction
         new_state = system.retract(x, -correction)
         end_rate = rate - system.rate_change(correction)
-        multiplier = None
-        if not terms.weak and (branch is not None or terms.sigma < WATCHED):
+        if not (quiet or terms.weak) and (branch is not None or sigma < WATCHED):
             multiplier = terms.multiplier()
-            if terms.sigma < WATCHED:
+            if sigma < WATCHED:
                 normals = terms.normals()
-        if moved is not None:
+        if branch is not None and moved is not None:
             correction = correction + moved
-    else:
-        correction = np.zeros(0)
-        new_state, end_rate, multiplier = x, rate.copy(), None
-    sigma = terms.sigma
-    quiet = branch is None and sigma > WATCHED + FAR * abs(sigma - memory.sigma)
-    gap = 0.0
-    due = memory.steps % GAP_EVERY == 0 or memory.steps < GAP_EVERY
-    if due and history is not None and theta == 1.0:
-        gap = terms.gap()
+    sigmas = np.array(all_sigmas)
     error_ratio = 0.0
     if scheme.error is not None:
         error = h * (scheme.error @ rates)
         weights = norm.weights(np.maximum(memory.magnitude, magnitude))
-        if history is not None and branch is not None:
-            if weak_stages and sigma_change > COUNT_UNCERTAINTY_ABOVE:
+        if branch is not None and history is not None:
+            if weak and sigma_change > COUNT_UNCERTAINTY_ABOVE:
                 error = np.abs(error)
-                for j in weak_stages:
+                for j, *_ in weak:
                     if j < s:
                         uncertainty = history.uncertainty(t + scheme.c[j] * h)
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
             weights = branch.widened(weights, scheme, sigmas)
         error_ratio = norm(error, weights)
-    return StepResult(
+    result = StepResult(
         t=t,
         h=h,
         state=new_state,
@@ -147,16 +136,27 @@ def split_step(
         correction=correction,
         error_ratio=error_ratio,
         sigmas=sigmas,
-        rank=min(rank, terms.rank) if weak_stages else terms.rank,
-        zone=zone if weak_stages else None,
-        history=history if weak_stages else None,
+        rank=terms.rank,
+        zone=None,
+        history=None,
         multiplier=multiplier,
         magnitude=magnitude,
-        quiet=quiet,
-        gap=gap,
-        held=held,
-        normals=normals,
     )
+    steps = memory.steps
+    if (steps < GAP_EVERY or steps % GAP_EVERY == 0) and history is not None and theta == 1.0:
+        result.gap = terms.gap()
+    if quiet:
+        middle, c = scheme.middle
+        halfway = abs(all_sigmas[middle] - start) / c
+        result.quiet = True
+        result.slope = (change if change > halfway else halfway) / h
+        return result
+    result.normals = normals
+    if weak:
+        result.rank = min(rank for _, rank, _ in weak)
+        result.held = any(held for *_, held in weak)
+        result.zone, result.history = zone, history
+    return result
 
 
 def split_resume(system: System, t: float, state: FloatArray, memory: Memory) -> Memory:

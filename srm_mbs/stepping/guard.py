@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from srm_mbs.methods.base import Memory, StepResult
-from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
+from srm_mbs.stepping.stepsize import Proposal, Propose, StepSizeControl, Verdict
 from srm_mbs.stepping.turning import TURNED, AmbiguousPassages
 from srm_mbs.systems.base import System
 
@@ -54,7 +54,12 @@ class BranchGuard:
         0; how many steps were redone.
     suspects
         Times (s) of the steps that were kept although the velocity turned.
+    propose
+        The inner proposal, halved after a passage that has to be redone; almost always the inner
+        control's own method, which saves a call per step.
     """
+
+    propose: Propose
 
     placed = 0
 
@@ -67,16 +72,19 @@ class BranchGuard:
         self._limit = np.inf
         self._tries = 0
         self._passages = AmbiguousPassages(system)
+        self.propose = inner.propose
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
-        """The inner proposal, halved after a passage that has to be redone."""
-        return self._inner.propose(t, limit if limit < self._limit else self._limit, memory)
+    def _shorter(self, t: float, limit: float, memory: Memory) -> Proposal:
+        return self._inner.propose(t, min(limit, self._limit), memory)
 
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a step whose velocity turned; otherwise the inner control's verdict."""
+        if result is not None and result.quiet and not self._tries:
+            return self._inner.judge(proposal, result)
         suspect = result is not None and not result.quiet and self.suspect(result)
         if suspect and self._tries < MAX_REDONE:
             self._limit = 0.5 * proposal.h
+            self.propose = self._shorter
             self._tries += 1
             self.replaced += 1
             return Verdict.REPLACED
@@ -87,6 +95,7 @@ class BranchGuard:
             if suspect:
                 self.suspects.append(proposal.t_new)
             self._limit = np.inf
+            self.propose = self._inner.propose
             self._tries = 0
         return verdict
 

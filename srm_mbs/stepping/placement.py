@@ -102,12 +102,11 @@ class SingularityPlacement:
         self._inner = inner
         self._t_end = t_end
         self._gaps = Gaps(scheme)
-        c = self._abscissae = np.append(scheme.c, 1.0)
+        self._abscissae = [*scheme.c.tolist(), 1.0]
         self._inverse = inverse_abscissae(scheme)
-        self._later_stages = np.flatnonzero(c > 0.0).tolist()
-        self._inner_stages = np.flatnonzero((c > 0.0) & (c < 1.0)).tolist()
-        middle = int(np.argmin(np.abs(c - 0.5)))
-        self._middle = middle, float(c[middle])
+        self._later_stages = [j for j, c in enumerate(self._abscissae) if c > 0.0]
+        self._inner_stages = [j for j in self._later_stages if self._abscissae[j] < 1.0]
+        self._middle = scheme.middle
         self.adaptive = inner.adaptive
         self.placed = 0
         self.replaced = 0
@@ -161,22 +160,20 @@ class SingularityPlacement:
         movable = self._inner_stages if last else self._later_stages
         if not min((values[i] for i in movable), default=np.inf) < min(reach, 0.5 * values[0]):
             return None
-        zero = zero_within(self._abscissae, sigmas)
+        zero = zero_within(np.array(self._abscissae), sigmas)
         if zero is None or not zero > 0.0:
             return None
         return self._gaps.longest_step(zero * h, 0.98 * h)
 
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Redo a badly placed step; otherwise the inner control's verdict."""
-        h = proposal.h
+        slope = 0.0
         if result is None:
-            slope = 0.0
-        elif result.quiet:
-            sigmas, (k, c) = result.sigmas, self._middle
-            start = sigmas.item(0)
-            middle = abs(sigmas.item(k) - start) / c if c else 0.0
-            slope = max(abs(sigmas.item(-1) - start), middle) / h
+            pass
+        elif result.quiet:  # no zero is near: only the slope goes on
+            slope = result.slope
         else:
+            h = proposal.h
             slope = sigma_slope(self._inverse, result.sigmas, h)
             if self._redone < MAX_REDONE:
                 last = proposal.t_new >= self._t_end
@@ -192,6 +189,8 @@ class SingularityPlacement:
         if verdict is Verdict.ACCEPTED and result is not None:
             slowest = 0.5 * self._slope
             self._slope = slope if slope > slowest else slowest
-            ahead = None if result.quiet else zero_ahead(*self._middle, result.sigmas)
-            self._zero = None if ahead is None else result.t + h * ahead
+            self._zero = None
+            if not result.quiet:
+                ahead = zero_ahead(*self._middle, result.sigmas)
+                self._zero = None if ahead is None else result.t + proposal.h * ahead
         return verdict

@@ -50,6 +50,12 @@ class Proposal:
     placed: bool = False
 
 
+class Propose(Protocol):
+    """:meth:`StepSizeControl.propose`."""
+
+    def __call__(self, t: float, limit: float, memory: Memory) -> Proposal: ...
+
+
 class StepSizeControl(Protocol):
     """Decides on step lengths."""
 

@@ -39,7 +39,7 @@ Controller = Callable[[float, FloatArray, FloatArray], Any]
 """(t, q, v) -> generalised forces tau (nv,), N and N m."""
 
 _WORLD = pin.Convention.WORLD
-_sum_of_sizes = blas.dasum
+_sum_of_sizes, _largest = blas.dasum, blas.idamax
 _NO_ROWS = np.zeros(0)
 _OVERFLOW = 1e100
 """Size of a state from which products of its rates may overflow."""
@@ -405,7 +405,8 @@ class _ClosedTerms:
         return self._p.project(w)
 
     def gap(self) -> float:
-        return float(np.abs(self._loops.g * self._gap_scale).max())
+        gaps = self._loops.g * self._gap_scale
+        return abs(float(gaps.item(_largest(gaps))))
 
     def correction(self) -> FloatArray:
         p = self._p

@@ -13,9 +13,11 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from srm_mbs.analysis.energy_balance import EnergyBalance
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
+    from srm_mbs.analysis.following import FollowedPath, follow
     from srm_mbs.analysis.inverse_dynamics import InverseDynamics, inverse_dynamics
     from srm_mbs.analysis.linearisation import Linearisation, linearise
     from srm_mbs.analysis.mobility import MobilityMap, mobility_map
+    from srm_mbs.analysis.modes import AssemblyMode, assembly_modes
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
     from srm_mbs.dae import DaeSolution, solve_dae
@@ -53,6 +55,7 @@ _HOME = {
     "Anchor": "mechanism",
     "Assembly": "assembly",
     "AssemblyError": "errors",
+    "AssemblyMode": "analysis.modes",
     "Bushing": "forces",
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
@@ -60,6 +63,7 @@ _HOME = {
     "EnergyBalance": "analysis.energy_balance",
     "Equilibrium": "analysis.equilibrium",
     "FORCE_TYPES": "forces",
+    "FollowedPath": "analysis.following",
     "ForceElement": "mechanism",
     "InputError": "errors",
     "InverseDynamics": "analysis.inverse_dynamics",
@@ -81,9 +85,11 @@ _HOME = {
     "TorsionSpring": "forces",
     "Wrench": "forces",
     "assemble": "assembly",
+    "assembly_modes": "analysis.modes",
     "backend": "kernel",
     "bundled_models": "loading",
     "equilibrium": "analysis.equilibrium",
+    "follow": "analysis.following",
     "inverse_dynamics": "analysis.inverse_dynamics",
     "linearise": "analysis.linearisation",
     "load": "loading",
@@ -104,11 +110,13 @@ __all__ = [
     "Anchor",
     "Assembly",
     "AssemblyError",
+    "AssemblyMode",
     "Bushing",
     "ButcherTableau",
     "DaeSolution",
     "EnergyBalance",
     "Equilibrium",
+    "FollowedPath",
     "ForceElement",
     "InputError",
     "InverseDynamics",
@@ -127,9 +135,11 @@ __all__ = [
     "TorsionSpring",
     "Wrench",
     "assemble",
+    "assembly_modes",
     "backend",
     "bundled_models",
     "equilibrium",
+    "follow",
     "inverse_dynamics",
     "linearise",
     "load",

@@ -16,8 +16,10 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.closing import ClosureProblem, close_loops
+from srm_mbs.closing_failure import cannot_close, free_coordinates, limits_in_the_way, quoted
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, InputError
+from srm_mbs.joint_limits import beyond_limits, close_within_limits
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
 from srm_mbs.systems.singular import (
@@ -65,65 +67,23 @@ class Assembly:
     singular: bool
 
 
-def _describe(gaps: Mapping[str, tuple[float | None, float | None]]) -> str:
-    parts = []
-    for name, (gap, angle) in gaps.items():
-        values = [] if gap is None else [f"{gap:.3g} m"]
-        values += [] if angle is None else [f"{angle:.3g} rad"]
-        parts.append(f"{name}: {', '.join(values)}")
-    return "; ".join(parts)
-
-
-def free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:
-    """Velocity indices of the joints that are not held."""
-    free = np.ones(mechanism.model.nv, dtype=bool)
-    for name in held:
-        joint = mechanism.joint(name)
-        free[joint.idx_v : joint.idx_v + joint.nv] = False
-    return np.flatnonzero(free)
-
-
-def _quoted(names: Iterable[str]) -> str:
-    return ", ".join(repr(name) for name in names)
-
-
 def _positions(
-    mechanism: Mechanism, problem: ClosureProblem, start: FloatArray, held: tuple[str, ...]
+    mechanism: Mechanism,
+    problem: ClosureProblem,
+    start: FloatArray,
+    held: tuple[str, ...],
+    limits: bool,
 ) -> FloatArray:
-    q = close_loops(problem, start, free_coordinates(mechanism, held))
-    if problem.closed(q):
+    free = free_coordinates(mechanism, held)
+    q = close_loops(problem, start, free)
+    if not problem.closed(q):
+        raise cannot_close(mechanism, problem, start, held, q)
+    if not limits or not beyond_limits(mechanism, q):
         return q
-    gaps = problem.gaps(q)
-    remaining = f"remaining gaps: {_describe(gaps)}"
-    guilty = [
-        name
-        for name in held
-        if problem.closed(
-            close_loops(problem, start, free_coordinates(mechanism, [h for h in held if h != name]))
-        )
-    ]
-    if not guilty and len(held) > 1:
-        everything_free = close_loops(problem, start, free_coordinates(mechanism, ()))
-        guilty = list(held) if problem.closed(everything_free) else []
-    if guilty:
-        raise AssemblyError(
-            f"the loops cannot close with the held values of {_quoted(held)}; {remaining}",
-            residuals=gaps,
-            q=q,
-            held=tuple(guilty),
-            element="initial.q",
-            remedy=f"Change or free one of {_quoted(guilty)}: with it free, the loops close"
-            if len(guilty) < len(held) or len(held) == 1
-            else "Free some of them: put them into guess instead of q",
-        )
-    raise AssemblyError(
-        f"the loops cannot be closed from this guess; {remaining}",
-        residuals=gaps,
-        q=q,
-        element="initial.guess",
-        remedy="Check the anchors and link lengths, or give a guess closer to a closed "
-        "configuration; the closest one found is in the error's q",
-    )
+    within = close_within_limits(problem, start, free)
+    if within is None:
+        raise limits_in_the_way(mechanism, problem, held, q)
+    return within
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,12 +173,12 @@ def _rates(
         name for name in held if consistent(*solve([h for h in held if h != name])[1:])
     ] or list(held)
     if error > tolerance:
-        what = f"the held rates of {_quoted(held)} contradict the closures (G v = {error:.2e})"
+        what = f"the held rates of {quoted(held)} contradict the closures (G v = {error:.2e})"
     elif held:
-        what = f"no motion through this singular configuration has the rates of {_quoted(held)}"
+        what = f"no motion through this singular configuration has the rates of {quoted(held)}"
     else:
         what = "no motion through this singular configuration has rates close to these"
-    remedy = f"Change or free one of {_quoted(guilty)}" if guilty else "Give other rates"
+    remedy = f"Change or free one of {quoted(guilty)}" if guilty else "Give other rates"
     if np.any((singular > 1e-13) & (singular < 10.0 * SINGULAR)):
         remedy += (
             "; the held positions lie so close to a singular configuration that the rates are not "
@@ -290,6 +250,7 @@ def assemble(
     *,
     guess: Mapping[str, Any] | None = None,
     hold: Iterable[str] | None = None,
+    limits: bool = False,
 ) -> Assembly:
     """Close the loops and make the rates consistent.
 
@@ -311,6 +272,8 @@ def assemble(
     hold
         Names of the joints whose position is held; by default those named in ``q``.  If given,
         the other positions in ``q`` are guesses.
+    limits
+        Stay within the position limits of the joints.
 
     Returns
     -------
@@ -322,8 +285,9 @@ def assemble(
     Raises
     ------
     AssemblyError
-        If the loops cannot close (with each loop's gap and the closest configuration), or if held
-        values or rates contradict each other (naming them).
+        If the loops cannot close (with each loop's gap, the closest configuration, the held joints
+        or limits in the way, and the nearest values of held joints that close), or if held values
+        or rates contradict each other (naming them).
     InputError
         For unknown joints or malformed values.
     """
@@ -366,7 +330,7 @@ def assemble(
     if not mechanism.loops:
         return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
     problem = ClosureProblem(mechanism, start)
-    closed = _positions(mechanism, problem, start, held)
+    closed = _positions(mechanism, problem, start, held, limits)
     for name in held:  # moving a quaternion by nothing rounds it
         joint = mechanism.joint(name)
         own = slice(joint.idx_q, joint.idx_q + joint.nq)

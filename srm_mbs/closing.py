@@ -8,6 +8,9 @@ are looked for and the nearest is taken.
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 
@@ -105,17 +108,30 @@ class ClosureProblem(ClosureGeometry):
         """From the start to q: the norm of the joint motions in units."""
         return float(np.linalg.norm(self.difference(self.start, q)))
 
+    @cached_property
+    def _hinges(self) -> list[Any]:
+        """The joints with an angle of which whole turns do not matter: coupled ones do."""
+        coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
+        return [
+            joint
+            for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:])
+            if joint.nq == joint.nv == 1
+            and joint.shortname().startswith("JointModelR")
+            and name not in coupled
+        ]
+
+    @property
+    def hinges(self) -> IndexArray:
+        """Velocity indices of the hinges of which whole turns do not matter."""
+        return np.array([joint.idx_v for joint in self._hinges], dtype=int)
+
     def unwound(self, q: FloatArray) -> FloatArray:
         """q without full turns of its hinges away from the start, except of coupled ones."""
         q = q.copy()
-        coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
-        for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
-            if name in coupled:
-                continue
-            if joint.nq == joint.nv == 1 and joint.shortname().startswith("JointModelR"):
-                turns = np.round((q[joint.idx_q] - self.start[joint.idx_q]) / (2.0 * np.pi))
-                if turns:
-                    q[joint.idx_q] -= 2.0 * np.pi * turns
+        for joint in self._hinges:
+            turns = np.round((q[joint.idx_q] - self.start[joint.idx_q]) / (2.0 * np.pi))
+            if turns:
+                q[joint.idx_q] -= 2.0 * np.pi * turns
         return q
 
     def closed(self, q: FloatArray) -> bool:
@@ -124,7 +140,13 @@ class ClosureProblem(ClosureGeometry):
         return float(np.abs(g).max()) <= CLOSED and float(np.abs(self.mismatch(q)).max()) < 1e-6
 
 
-def _search(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
+def _search(
+    problem: ClosureProblem,
+    q: FloatArray,
+    free: IndexArray,
+    steps: int,
+    bounds: tuple[Any, Any],
+) -> FloatArray:
     """Least-squares solve of the closing residual over the free coordinates, from q.
 
     To round-off: next to closings that are not isolated, or where G loses rank, convergence is
@@ -148,7 +170,8 @@ def _search(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
         xtol=1e-15,
         ftol=1e-15,
         gtol=1e-15,
-        max_nfev=SEARCH_STEPS,
+        max_nfev=steps,
+        bounds=bounds,
     )
     return problem.move(q, found.x, free)
 
@@ -170,7 +193,7 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
     return best
 
 
-def _onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
+def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Sharpen a double root of g; q itself where this does not help."""
     singular = np.linalg.svd(problem.normalised(q)[:, free], compute_uv=False)
     if not np.any((singular > 1e-13) & (singular < NEARLY_SINGULAR)):
@@ -182,21 +205,32 @@ def _onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArra
     return q if found is None else found
 
 
+def close_from(
+    problem: ClosureProblem,
+    q: FloatArray,
+    free: IndexArray,
+    steps: int = SEARCH_STEPS,
+    bounds: tuple[Any, Any] = (-np.inf, np.inf),
+) -> FloatArray:
+    """Where closing leads from q (nq,) while the ``free`` coordinates move; closed or not.
+
+    ``bounds`` are the least and largest motions of these, in units.
+    """
+    if np.linalg.norm(problem.mismatch(q)) > CLOSED:
+        q = _search(problem, q, free, steps, bounds)
+    return problem.unwound(_polish(problem, q, free))
+
+
 def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) -> FloatArray:
     """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
     if not len(free):
         return start
     rng = np.random.default_rng(0)
 
-    def attempt(q: FloatArray) -> FloatArray:
-        if np.linalg.norm(problem.mismatch(q)) > CLOSED:
-            q = _search(problem, q, free)
-        return problem.unwound(_polish(problem, q, free))
-
     best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
     for size in (0.0, *PERTURBATIONS):
         spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
-        q = attempt(problem.move(start, spread, free))
+        q = close_from(problem, problem.move(start, spread, free), free)
         if problem.closed(q):
             break
         gap = float(np.linalg.norm(problem.mismatch(q)))
@@ -211,7 +245,7 @@ def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) ->
         others = [-0.5 * away, -away]
         others += list(rng.uniform(-far, far, (OTHER_STARTS, len(free))))
         for other in others:
-            candidate = attempt(problem.move(start, other, free))
+            candidate = close_from(problem, problem.move(start, other, free), free)
             if problem.distance(candidate) < problem.distance(q) and problem.closed(candidate):
                 q = candidate
-    return _onto_singular_point(problem, q, free)
+    return onto_singular_point(problem, q, free)

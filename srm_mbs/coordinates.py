@@ -100,3 +100,10 @@ def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
             raise InputError(f"joint {name!r} is named twice", remedy="Name it once")
         indices += range(joint.idx_v, joint.idx_v + joint.nv)
     return np.array(indices, dtype=int)
+
+
+def position_of(mechanism: Mechanism, q: FloatArray, name: str) -> float:
+    """Position (rad or m) of the one-degree joint ``name`` in q (nq,)."""
+    joint = mechanism.joint(name)
+    own = q[joint.idx_q : joint.idx_q + joint.nq]
+    return float(own[0] if joint.nq == 1 else np.arctan2(own[1], own[0]))

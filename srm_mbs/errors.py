@@ -70,6 +70,11 @@ class AssemblyError(InputError):
         The closest configuration found, shape (nq,).
     held
         Names of the held joints that are to blame, where that could be found out.
+    nearest
+        Positions (rad, m) of such joints that close the loops, the others as they are: nearest to
+        the given ones on the branch that was found.
+    limits
+        Names of the joints whose limits are in the way.
     """
 
     def __init__(
@@ -79,12 +84,16 @@ class AssemblyError(InputError):
         residuals: Mapping[str, tuple[float | None, float | None]],
         q: Any,
         held: tuple[str, ...] = (),
+        nearest: Mapping[str, float] | None = None,
+        limits: tuple[str, ...] = (),
         **where: Any,
     ) -> None:
         super().__init__(problem, **where)
         self.residuals = dict(residuals)
         self.q = q
         self.held = held
+        self.nearest = dict(nearest or {})
+        self.limits = limits
 
 
 class AnalysisError(SrmError, RuntimeError):

@@ -23,6 +23,7 @@ LAYERS = (
     ("methods",),
     ("stepping",),
     ("closing", "kernel"),
+    ("closing_failure", "continuation", "joint_limits"),
     ("assembly", "motion", "solution"),
     ("loading",),
     ("storage",),

@@ -17,7 +17,8 @@ from typing import Any, Literal
 import numpy as np
 
 from srm_mbs.arrays import FloatArray, IndexArray
-from srm_mbs.assembly import assemble, free_coordinates
+from srm_mbs.assembly import assemble
+from srm_mbs.closing_failure import free_coordinates
 from srm_mbs.coordinates import joint_coordinates
 from srm_mbs.errors import AnalysisError, InputError
 from srm_mbs.mechanism import Mechanism

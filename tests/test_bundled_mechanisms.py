@@ -9,15 +9,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.special import ellipj, ellipk
 
 import srm_mbs as srm
 from tests import reduced
-from tools.models.planar import PLANAR
-from tools.models.spatial import SPATIAL
+from tools.models import made
 
 ROOT = Path(__file__).parents[1]
-MADE = PLANAR | SPATIAL
+MADE = made()
 DEGREES = {
     "watt_six_bar": 1,
     "stephenson_six_bar": 1,
@@ -28,6 +28,7 @@ DEGREES = {
     "spatial_slider_crank": 1,
     "stewart_platform": 6,
     "delta_robot": 3,
+    "differential": 2,
 }
 ONE_DEGREE = {
     "watt_six_bar": ("crank", 0.4),
@@ -175,3 +176,51 @@ def test_the_stewart_platform_comes_to_rest_under_its_weight() -> None:
     assert np.abs(solution.v[-1]).max() < 1e-5
     energy = solution.energy
     assert energy[-1] < energy[0]
+
+
+def test_the_differential_solves_its_linear_equations() -> None:
+    """Two coordinates, constant inertia and damping: y' = A y + b by the matrix exponential."""
+    mechanism = srm.load("differential")
+    model = mechanism.model
+    names = mechanism.joint_names
+    # Rates of all joints by those of the left and the right shaft.
+    rates = {
+        "pinion": (1.5, 1.5),
+        "carrier": (0.5, 0.5),
+        "upper_spider": (1.0 / 1.5, -1.0 / 1.5),
+        "lower_spider": (-1.0 / 1.5, 1.0 / 1.5),
+        "left_shaft": (1.0, 0.0),
+        "right_shaft": (0.0, 1.0),
+    }
+    T = np.array([rates[name] for name in names])
+    M = T.T @ pin.crba(model, model.createData(), mechanism.q0) @ T
+    M = np.triu(M) + np.triu(M, 1).T
+    D = T.T @ np.diag(model.damping) @ T
+    torque = np.array([0.5 if name == "pinion" else 0.0 for name in names])
+    A = np.zeros((5, 5))
+    A[:2, 2:4] = np.eye(2)
+    A[2:4, 2:4] = -np.linalg.solve(M, D)
+    A[2:4, 4] = np.linalg.solve(M, T.T @ torque)
+    for t in (1.0, 5.0):
+        expected = expm(t * A)[:, 4]
+        q, v = run("differential", 5.0)(t)
+        order = [
+            model.joints[model.getJointId(f"{side}_shaft")].idx_q for side in ("left", "right")
+        ]
+        np.testing.assert_allclose(q[order], expected[:2], rtol=1e-8)
+        np.testing.assert_allclose(v[order], expected[2:4], rtol=1e-8)
+        np.testing.assert_allclose(v, T @ expected[2:4], rtol=1e-8)
+
+
+def test_the_differential_gives_both_wheels_the_same_torque() -> None:
+    """At steady speed each wheel takes 3/2 of the motor's torque, whatever its speed."""
+    solution = run("differential", 200.0, 1e-6)
+    for side, damping in (("left", 0.1), ("right", 0.4)):
+        rate = solution.joint(f"{side}_shaft")[1][-1]
+        assert damping * rate == pytest.approx(1.5 * 0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_the_energy_balance_closes(name: str) -> None:
+    balance = run(name, 1.0, 1e-10).energy_balance
+    assert np.abs(balance.residual).max() < 1e-8 * balance.scale

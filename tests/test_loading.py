@@ -23,8 +23,7 @@ from srm_mbs.loading.generated import n_four_bar as n_four_bar_texts
 from srm_mbs.simulation import simulate
 from srm_mbs.systems.forces import friction_time
 from srm_mbs.systems.loops import LoopKinematics
-from tools.models.planar import PLANAR
-from tools.models.spatial import SPATIAL
+from tools.models import made
 
 load = cache(srm.load)
 PI = np.pi
@@ -512,7 +511,7 @@ CRANKS = {
     "slider_crank_slider": [("crank", 2.0, 0.0)],
     "slider_crank_whirl": [("crank", 2.0, 0.0)],
 }
-OTHERS = {"spatial_four_bar", "spatial_dead_point", "squeezing_mechanism", *PLANAR, *SPATIAL}
+OTHERS = {"spatial_four_bar", "spatial_dead_point", "squeezing_mechanism", *made()}
 """Tested elsewhere."""
 
 

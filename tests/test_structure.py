@@ -32,6 +32,7 @@ JANSEN = tuple(
 KNOWN = {
     "bricard": (5, 4, ()),
     "delta_robot": (21, 18, ()),
+    "differential": (6, 4, ()),
     "five_bar": (4, 2, ("pin.y",)),
     "flyball_governor": (4, 0, ()),
     "four_bar": (3, 2, ("pin.y",)),

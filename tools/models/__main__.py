@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tools.models.planar import PLANAR
-from tools.models.spatial import SPATIAL
+from tools.models import made
 
 ROOT = Path(__file__).parents[2]
 
 if __name__ == "__main__":
-    for name, make in (PLANAR | SPATIAL).items():
+    for name, make in made().items():
         urdf, description = make()
         (ROOT / "urdf" / f"{name}.urdf").write_text(urdf, encoding="utf-8")
         (ROOT / "models" / f"{name}.toml").write_text(description, encoding="utf-8")

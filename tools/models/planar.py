@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
-from textwrap import fill
 
 import numpy as np
 
+from tools.models.description import header
 from tools.models.urdf_text import Mass, Shape, Urdf, Vector, bar, tube, vector
 
 AXIS = vector(0.0, -1.0, 0.0)
@@ -100,15 +100,6 @@ class Linkage:
             x, y, z = (f"{float(v):.17g}" for v in self.at(point, link))
             rows.append(f'{side} = {{ link = "{link}", xyz = [{x}, {y}, {z}] }}')
         self.loops.append("\n".join(rows))
-
-
-def header(name: str, text: str, gravity: str = "[0.0, 0.0, -9.81]") -> str:
-    """First lines of a description; ``text`` becomes its comment."""
-    comment = fill(text, 99, initial_indent="# ", subsequent_indent="# ")
-    return (
-        f'{comment}\n# Written by tools.models.\nformat = 1\nname = "{name}"\n'
-        f'urdf = "../urdf/{name}.urdf"\nbase = "fixed"\ngravity = {gravity}\n'
-    )
 
 
 def description(linkage: Linkage, text: str, rest: str) -> str:

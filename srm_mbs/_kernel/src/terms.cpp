@@ -1,5 +1,7 @@
 #include "terms.hpp"
 
+#include <type_traits>
+
 #include <pinocchio/algorithm/crba.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
@@ -18,6 +20,27 @@ using pinocchio::Model;
 using CrbaBackward =
     pinocchio::impl::CrbaWorldConventionBackwardStep<double, 0, pinocchio::JointCollectionDefaultTpl>;
 
+template <typename Joint, typename... Kinds>
+constexpr bool is_one_of = (std::is_same_v<Joint, Kinds> || ...);
+
+using Joints = pinocchio::JointCollectionDefault;
+
+template <typename Joint>
+constexpr bool usual =
+    is_one_of<Joint, Joints::JointModelRX, Joints::JointModelRY, Joints::JointModelRZ,
+              Joints::JointModelRevoluteUnaligned, Joints::JointModelRUBX, Joints::JointModelRUBY,
+              Joints::JointModelRUBZ, Joints::JointModelRevoluteUnboundedUnaligned,
+              Joints::JointModelPX, Joints::JointModelPY, Joints::JointModelPZ,
+              Joints::JointModelPrismaticUnaligned, Joints::JointModelSpherical,
+              Joints::JointModelPlanar, Joints::JointModelFreeFlyer>;
+
+struct IsUsual : boost::static_visitor<bool> {
+    template <typename Joint>
+    bool operator()(const Joint&) const {
+        return usual<Joint>;
+    }
+};
+
 // CrbaWorldConventionForwardStep and NLEForwardStep.
 struct Forward : pinocchio::fusion::JointUnaryVisitorBase<Forward> {
     using ArgsType = boost::fusion::vector<const Model&, Data&, const Argument&, const Argument&>;
@@ -26,21 +49,23 @@ struct Forward : pinocchio::fusion::JointUnaryVisitorBase<Forward> {
     static void algo(const JointModelBase<JointModel>& jmodel,
                      JointDataBase<typename JointModel::JointDataDerived>& jdata,
                      const Model& model, Data& data, const Argument& q, const Argument& v) {
-        const JointIndex i = jmodel.id(), parent = model.parents[i];
-        jmodel.calc(jdata.derived(), q, v);
-        data.liMi[i] = model.jointPlacements[i] * jdata.M();
-        data.v[i] = jdata.v();
-        if (parent > 0) {
-            data.oMi[i] = data.oMi[parent] * data.liMi[i];
-            data.v[i] += data.liMi[i].actInv(data.v[parent]);
-        } else {
-            data.oMi[i] = data.liMi[i];
+        if constexpr (usual<JointModel>) {
+            const JointIndex i = jmodel.id(), parent = model.parents[i];
+            jmodel.calc(jdata.derived(), q, v);
+            data.liMi[i] = model.jointPlacements[i] * jdata.M();
+            data.v[i] = jdata.v();
+            if (parent > 0) {
+                data.oMi[i] = data.oMi[parent] * data.liMi[i];
+                data.v[i] += data.liMi[i].actInv(data.v[parent]);
+            } else {
+                data.oMi[i] = data.liMi[i];
+            }
+            jmodel.jointExtendedModelCols(data.J) = data.oMi[i].act(jdata.S());
+            data.oYcrb[i] = data.oMi[i].act(model.inertias[i]);
+            data.a_gf[i] = jdata.c() + (data.v[i] ^ jdata.v());
+            data.a_gf[i] += data.liMi[i].actInv(data.a_gf[parent]);
+            data.f[i] = model.inertias[i] * data.a_gf[i] + model.inertias[i].vxiv(data.v[i]);
         }
-        jmodel.jointExtendedModelCols(data.J) = data.oMi[i].act(jdata.S());
-        data.oYcrb[i] = data.oMi[i].act(model.inertias[i]);
-        data.a_gf[i] = jdata.c() + (data.v[i] ^ jdata.v());
-        data.a_gf[i] += data.liMi[i].actInv(data.a_gf[parent]);
-        data.f[i] = model.inertias[i] * data.a_gf[i] + model.inertias[i].vxiv(data.v[i]);
     }
 };
 
@@ -52,20 +77,28 @@ struct Backward : pinocchio::fusion::JointUnaryVisitorBase<Backward> {
     static void algo(const JointModelBase<JointModel>& jmodel,
                      JointDataBase<typename JointModel::JointDataDerived>& jdata,
                      const Model& model, Data& data) {
-        CrbaBackward::algo(jmodel, model, data);
-        const JointIndex i = jmodel.id(), parent = model.parents[i];
-        jmodel.JointMappedVelocitySelector(data.nle) += jdata.S().transpose() * data.f[i];
-        if (parent > 0) data.f[parent] += data.liMi[i].act(data.f[i]);
+        if constexpr (usual<JointModel>) {
+            CrbaBackward::algo(jmodel, model, data);
+            const JointIndex i = jmodel.id(), parent = model.parents[i];
+            jmodel.JointMappedVelocitySelector(data.nle) += jdata.S().transpose() * data.f[i];
+            if (parent > 0) data.f[parent] += data.liMi[i].act(data.f[i]);
+        }
     }
 };
 
 }  // namespace
 
+bool has_usual_joints(const Model& model) {
+    for (std::size_t i = 1; i < model.joints.size(); ++i)
+        if (!boost::apply_visitor(IsUsual(), model.joints[i].toVariant())) return false;
+    return true;
+}
+
 void compute_terms(Workspace& work) {
     const Model& model = work.model;
     Data& data = work.data;
     const Argument q(work.q), v(work.v);
-    if (!model.mimicking_joints.empty()) {
+    if (!work.one_pass) {
         pinocchio::crba(model, data, q, pinocchio::Convention::WORLD);
         pinocchio::nonLinearEffects(model, data, q, v);
         return;

@@ -166,8 +166,14 @@ def rescaled(
             rest_length=element.rest_length * length,  # type: ignore[operator]
         )
 
-    loops = tuple(replace(loop, a=moved(loop.a), b=moved(loop.b)) for loop in mechanism.loops)
+    loops = tuple(
+        loop
+        if loop.a is None or loop.b is None
+        else replace(loop, a=moved(loop.a), b=moved(loop.b))
+        for loop in mechanism.loops  # bundled couplings join hinges
+    )
     translation = mechanism.structure.units.coordinate != 1.0
+    model.damping = model.damping * np.where(translation, 1.0, length**2) * (mass / time)
     unit = np.where(translation, length, 1.0)
     q0 = np.array(mechanism.q0)
     for joint in list(model.joints)[1:]:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     )
     from srm_mbs.kernel import backend
     from srm_mbs.loading import bundled_models, load, n_four_bar
+    from srm_mbs.loading.converting import convert
     from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure, Mechanism
     from srm_mbs.methods.butcher import ButcherTableau
     from srm_mbs.methods.psrm import PSRM
@@ -88,6 +89,7 @@ _HOME = {
     "assembly_modes": "analysis.modes",
     "backend": "kernel",
     "bundled_models": "loading",
+    "convert": "loading.converting",
     "equilibrium": "analysis.equilibrium",
     "follow": "analysis.following",
     "inverse_dynamics": "analysis.inverse_dynamics",
@@ -138,6 +140,7 @@ __all__ = [
     "assembly_modes",
     "backend",
     "bundled_models",
+    "convert",
     "equilibrium",
     "follow",
     "inverse_dynamics",

@@ -46,8 +46,8 @@ Model = Annotated[
     str,
     typer.Argument(
         metavar="MODEL",
-        help="A bundled mechanism (see 'srm-mbs models'), a .toml description, or a .urdf "
-        "without loops.",
+        help="A bundled mechanism (see 'srm-mbs models'), or a file: a .toml description, or "
+        "another format, found out by its content (docs/formats.md).",
     ),
 ]
 Run = Annotated[
@@ -321,6 +321,29 @@ def _check_pictures(image: Path | None, video: Path | None) -> None:
 def _first(*values: float | None) -> float:
     """The first value that is given."""
     return next(value for value in values if value is not None)
+
+
+@app.command()
+@_reported()
+def convert(
+    model: Model,
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT.toml", help="The description; its URDF goes beside it.")
+    ],
+    cut: Annotated[
+        list[str] | None,
+        typer.Option(metavar="JOINT", help="Cut a loop at this joint; may be given several times."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
+) -> None:
+    """Write a file of any format as a TOML description and a URDF."""
+    from srm_mbs.loading.converting import convert as write
+
+    *written, notes = write(model, out, cut=cut or (), force=force)
+    for path in written:
+        typer.echo(f"written: {path}")
+    for note in notes:
+        typer.echo(f"note: {note}")
 
 
 @app.command()

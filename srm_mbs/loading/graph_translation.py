@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
+from srm_mbs.loading.cut_joints import CLOSURE_OF, bushing
 from srm_mbs.loading.joint_graph import (
     Body,
     Joint,
@@ -21,14 +21,6 @@ from srm_mbs.loading.translation import Translation
 from srm_mbs.loading.urdf_writer import anchor, is_identity, urdf_text
 from srm_mbs.mechanism import WORLD
 
-CLOSURES = {
-    "fixed": "frame",
-    "revolute": "revolute",
-    "prismatic": "prismatic",
-    "universal": "universal",
-    "spherical": "point",
-}
-"""Type of the closure that stands for a joint that is cut."""
 MODEL_FRAME = "__model__"
 """Massless root link of a floating robot: the frame in which the file places its bodies."""
 
@@ -139,7 +131,7 @@ class GraphTranslator:
                 raise self._refuse_cut(joint, why)
         entry: dict[str, Any] = {
             "name": joint.name,
-            "type": CLOSURES[joint.type],
+            "type": CLOSURE_OF[joint.type],
             "a": anchor(joint.child, joint.in_child),
             "b": anchor(joint.parent, joint.in_parent),
         }
@@ -155,30 +147,18 @@ class GraphTranslator:
             return []
         if joint.type not in ("revolute", "prismatic"):
             raise self._refuse_cut(joint, "damping or a spring")
-        # x of both anchors along the axis; b moves on to where the spring is relaxed.
-        turn = pin.SE3(
-            pin.Quaternion.FromTwoVectors(np.array([1.0, 0.0, 0.0]), np.array(joint.axis)).matrix(),
-            np.zeros(3),
-        )
-        relaxed = pin.SE3.Identity()
-        direction = 0
-        if joint.type == "prismatic":
-            relaxed.translation = np.array([joint.rest, 0.0, 0.0])
-        else:
-            relaxed.rotation = pin.rpy.rpyToMatrix(joint.rest, 0.0, 0.0)
-            direction = 3
-        along = [0.0] * 6
-        entry: dict[str, Any] = {
-            "type": "bushing",
-            "name": f"{joint.name}::spring",
-            "a": anchor(joint.child, joint.in_child * turn),
-            "b": anchor(joint.parent, joint.in_parent * turn * relaxed),
-        }
-        for key in ("stiffness", "damping"):
-            if value := getattr(joint, key):
-                entry[key] = [*along]
-                entry[key][direction] = value
-        return [entry]
+        return [
+            bushing(
+                f"{joint.name}::spring",
+                joint.type,
+                (joint.parent, joint.in_parent),
+                (joint.child, joint.in_child),
+                joint.axis,
+                stiffness=joint.stiffness,
+                damping=joint.damping,
+                rest=joint.rest,
+            )
+        ]
 
     def _spring(self, joint: Joint) -> list[dict[str, Any]]:
         """The spring of a joint of the tree; its damping is in the URDF."""

@@ -121,7 +121,7 @@ def _reading(
     source = Source(
         description=own,
         urdf=translation.urdf,
-        urdf_path=str(model_path),
+        urdf_path=translation.urdf_file or str(model_path),
         path=file,
         base=base,
         gravity=_gravity(description.gravity if gravity is None else gravity),

@@ -32,13 +32,27 @@ def parse_urdf(text: str, file: str) -> Element:
     try:
         return SafeTree.fromstring(text)  # type: ignore[no-any-return]
     except ParseError as error:
-        hint = "Correct the file there"
-        if "unbound prefix" in str(error):
-            hint = "An element with a namespace prefix, such as <drake:...>, is not read"
-        raise InputError(f"this is not well-formed XML: {error}", file=file, remedy=hint) from error
+        # Drake's own reader takes <drake:...> without a declaration; expat does not.
+        declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
+        if declared != text:
+            return parse_urdf(declared, file)
+        raise InputError(
+            f"this is not well-formed XML: {error}", file=file, remedy="Correct the file there"
+        ) from error
     except DefusedXmlException as error:
         raise InputError(
             f"the XML uses entities or external references: {error}",
             file=file,
             remedy="Remove them; they are refused for safety",
         ) from error
+
+
+def _with_prefixes(text: str) -> str:
+    """``text`` with every namespace prefix that it uses and does not declare declared."""
+    root = _PROLOG.match(text)
+    if root is None:
+        return text
+    used = set(re.findall(r"[<\s/]([A-Za-z_][\w.-]*):[A-Za-z_]", text))
+    missing = used - set(re.findall(r"\sxmlns:([\w.-]+)\s*=", text)) - {"xml", "xmlns"}
+    declarations = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(missing))
+    return text[: root.end()] + declarations + text[root.end() :]

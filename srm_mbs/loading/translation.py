@@ -41,11 +41,14 @@ class Translation:
         and ``urdf``.
     notes
         Sentences about what was approximated or ignored, and why.
+    urdf_file
+        The file that the URDF came from, if it is another one than that translated.
     """
 
     urdf: str
     entries: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    urdf_file: str = ""
 
 
 LISTS = ("lock", "loop", "force", "drive")

@@ -154,7 +154,7 @@ def build_urdf(
         ``fixed``, ``floating`` (root joint ``root_joint``, a free flyer) or ``planar`` (motion in
         the x-y plane of the world).
     locked
-        Joints that will be locked: ``<mimic>`` does not matter there.
+        Joints that will be locked: their damping does not matter.
     counting_turns
         Joints whose angle must count turns: ``continuous`` ones among them are built as revolute
         joints without limits, because Pinocchio stores the others as (cos, sin).

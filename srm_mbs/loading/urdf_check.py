@@ -33,12 +33,11 @@ class UrdfChecker(JointChecker):
         self.root(root)
         for block in root.findall("gazebo"):
             for joint in block.iter("joint"):
-                if joint.find("child") is not None or joint in list(block):
+                if joint.find("child") is not None:
                     raise self.fault(
                         f"<gazebo><joint> {joint.get('name', '')!r}",
-                        "joints inside <gazebo> close loops and are not read by this version",
-                        "Describe the loop as [[loop]] in a TOML description and remove the "
-                        "element",
+                        "a joint deep inside <gazebo> is not read",
+                        "Move it up, directly into <gazebo>",
                     )
         self.children(root, "")
         links, joints = self.named(root, "link"), self.named(root, "joint")
@@ -49,8 +48,7 @@ class UrdfChecker(JointChecker):
         self.tree(links, joints, base)
         for name, joint in joints.items():
             self.joint(name, joint, base, name in locked)
-        for what, count in self.ignored.items():
-            self.notes.append(f"{count} {what}(s) do not act and are ignored")
+        self.notes += self.ignored_notes()
 
     def root(self, root: Element) -> None:
         """The root element and its attributes, of which the name is kept."""

@@ -39,12 +39,13 @@ class ElementChecker:
         # Limits do not act, and exporters write the largest double there.
         largest = sys.float_info.max if node.tag == "limit" else LARGEST
         if len(values) != count or not all(abs(value) <= largest for value in values):
+            tag = node.tag.rsplit("}", 1)[-1]
             wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
             raise self.fault(
                 where,
-                f"<{node.tag}> has no {key!r}"
+                f"<{tag}> has no {key!r}"
                 if text is None
-                else f"<{node.tag} {key}={text!r}> is not {wanted}",
+                else f"<{tag} {key}={text!r}> is not {wanted}",
                 f"Write {wanted}",
             )
         node.set(key, " ".join(map(repr, values)))
@@ -66,6 +67,12 @@ class ElementChecker:
 
     def ignore(self, what: str) -> None:
         self.ignored[what] = self.ignored.get(what, 0) + 1
+
+    def ignored_notes(self) -> tuple[str, ...]:
+        """What was ignored, one sentence for each kind."""
+        return tuple(
+            f"{count} {what}(s) do not act and are ignored" for what, count in self.ignored.items()
+        )
 
     def children(self, node: Element, where: str) -> None:
         """Refuse unknown elements of ``node``; count and remove those that are ignored."""

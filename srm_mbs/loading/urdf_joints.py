@@ -41,15 +41,6 @@ class JointChecker(ElementChecker):
                 where, f"unknown joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
             )
         self.origin(joint, where)
-        mimic = joint.find("mimic")
-        if mimic is not None and not locked and kind != "fixed":
-            raise self.fault(
-                where,
-                "<mimic> (a coupling of two joints) is not read by this version",
-                "Remove it, or name the joint in lock in a TOML description",
-            )
-        if mimic is not None:
-            joint.remove(mimic)
         self.axis(joint, kind, where)
         self.only_of(joint, kind, where)
         self.limit(joint, kind, where)

@@ -17,7 +17,7 @@ IGNORED = {
         "kinematic",
         "gravity",
     ),
-    "joint": ("safety_controller", "calibration"),
+    "joint": ("safety_controller", "calibration", "joint_properties"),
 }
 READ = {
     "robot": ("link", "joint"),
@@ -32,7 +32,6 @@ READ = {
         "thread_pitch",
         "limit",
         "dynamics",
-        "mimic",
     ),
 }
 ATTRIBUTES = {

@@ -1,0 +1,91 @@
+"""``convert``: a file of any format as our description with its URDF beside it."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import tomli_w
+
+from srm_mbs.errors import InputError
+from srm_mbs.loading.assembling import unassembled
+from srm_mbs.loading.reading import Overrides, read
+from srm_mbs.loading.safe_xml import parse_urdf
+
+
+def convert(
+    path: str | Path, out: str | Path, *, cut: Sequence[str] = (), force: bool = False
+) -> tuple[Path, Path, tuple[str, ...]]:
+    """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
+
+    What is written is the translation that :func:`srm_mbs.load` makes, not the assembled state.
+
+    Parameters
+    ----------
+    path, cut
+        As for :func:`srm_mbs.load`.
+    out
+        The description to write, ``.toml``; the URDF gets the same name with ``.urdf``.
+    force
+        Whether files that exist are overwritten.
+
+    Returns
+    -------
+    description, urdf, notes
+        The paths written, and sentences about what was approximated or ignored.
+
+    Raises
+    ------
+    InputError
+        For input that cannot be read, or output that exists or cannot be written.
+    """
+    description = Path(out)
+    if description.suffix.lower() != ".toml":
+        raise InputError(
+            f"the suffix {description.suffix!r} is not .toml", file=str(out), remedy="Use .toml"
+        )
+    urdf = description.with_suffix(".urdf")
+    reading = read(path, Overrides(cut=tuple(cut)))
+    source = reading.source
+    try:
+        mechanism, _, _ = unassembled(reading.description, source, reading.notes)
+    except InputError as error:
+        raise error.located(source.path) from error.__cause__
+    inputs = {Path(name).resolve() for name in (path, source.path, source.urdf_path)}
+    for target in (description, urdf):
+        if target.resolve() in inputs:
+            raise InputError(
+                "it is an input of the conversion", file=str(target), remedy="Give another name"
+            )
+        if target.exists() and not force:
+            raise InputError(
+                "the file exists", file=str(target), remedy="Give another name, or --force"
+            )
+    entries = tomllib.loads(source.description) | {"urdf": urdf.name}
+    tree = _with_meshes_from(source.urdf, Path(source.urdf_path), urdf)
+    try:
+        urdf.write_text(tree, encoding="utf-8")
+        description.write_text(tomli_w.dumps(entries), encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"it cannot be written: {error.strerror}", file=str(error.filename or out)
+        ) from error
+    return description, urdf, mechanism.notes
+
+
+def _with_meshes_from(text: str, original: Path, written: Path) -> str:
+    """The URDF ``text`` with the relative paths of its mesh files as seen from ``written``."""
+    root = parse_urdf(text, str(original))
+    changed = False
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if not name or urlsplit(name).scheme or Path(name).is_absolute():
+            continue
+        target = (original.parent / name).resolve()
+        mesh.set("filename", Path(os.path.relpath(target, written.parent.resolve())).as_posix())
+        changed = True
+    return ET.tostring(root, encoding="unicode") + "\n" if changed else text

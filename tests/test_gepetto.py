@@ -49,7 +49,7 @@ def test_joints_take_the_types_of_the_yaml(tmp_path: Path) -> None:
         "joint_name: [hip, wheel, track]\njoint_type: [SPHERICAL, UJOINT_ZX, FIXED]\n"
         "closed_loop: []\ntype: []\n"
     )
-    mechanism = srm.load(write(tmp_path, yaml))
+    mechanism = srm.load(write(tmp_path, yaml, tree().replace('"continuous"', '"revolute"')))
     assert mechanism.joint_names == ("hip", "knee", "wheel")
     model = pin.Model()
     at = {"base": (0, pin.SE3.Identity())}
@@ -58,7 +58,7 @@ def test_joints_take_the_types_of_the_yaml(tmp_path: Path) -> None:
         here = offset * placement(xyz.split(), rpy.split())
         kinds = {
             "hip": [pin.JointModelSpherical()],
-            "knee": [pin.JointModelRevoluteUnboundedUnaligned(np.array([2.0, 1.0, 2.0]) / 3.0)],
+            "knee": [pin.JointModelRevoluteUnaligned(np.array([2.0, 1.0, 2.0]) / 3.0)],
             "track": [],
             "wheel": [pin.JointModelRZ(), pin.JointModelRX()],
         }[name]

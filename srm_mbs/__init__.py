@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from srm_mbs.motion import JointMotion
     from srm_mbs.semi_explicit import SemiExplicitDAE
     from srm_mbs.simulation import simulate
+    from srm_mbs.simulator import Simulator
     from srm_mbs.solution import Solution
     from srm_mbs.storage import load_solution
 
@@ -78,6 +79,7 @@ _HOME = {
     "SRM": "methods.srm",
     "SemiExplicitDAE": "semi_explicit",
     "SimulationError": "errors",
+    "Simulator": "simulator",
     "Solution": "solution",
     "SpringDamper": "forces",
     "SrmError": "errors",
@@ -130,6 +132,7 @@ __all__ = [
     "MobilityMap",
     "SemiExplicitDAE",
     "SimulationError",
+    "Simulator",
     "Solution",
     "SpringDamper",
     "SrmError",

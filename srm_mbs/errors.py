@@ -121,9 +121,12 @@ class EventError(SrmError):
 
 
 class SimulationError(SrmError, RuntimeError):
-    """A run failed and the caller asked for an exception; ``solution`` holds what was computed."""
+    """A run failed and the caller asked for an exception; ``solution`` holds what was computed.
 
-    def __init__(self, message: str, solution: Solution | DaeSolution) -> None:
+    None of a :class:`srm_mbs.Simulator`, which records nothing.
+    """
+
+    def __init__(self, message: str, solution: Solution | DaeSolution | None) -> None:
         super().__init__(message)
         self.solution = solution
 

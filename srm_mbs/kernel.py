@@ -108,6 +108,7 @@ CONSTANTS = {
     "watched_steps": loop.WATCHED_STEPS,
     "look": starting.LOOK,
     "closer": breakpoints.CLOSER,
+    "allowed": breakpoints.ALLOWED,
 }
 """Every number of the algorithm, from the module of the reference that has it."""
 
@@ -345,7 +346,26 @@ class CompiledRun:
         else:
             passing.enter(self._run.piece, t, state)
         if not known:
-            self._run.remember(_memory(passing.resolved(t, state, before)))
+            self.remember(passing.resolved(t, state, before))
+
+    def remember(self, memory: Memory) -> None:
+        """Carry ``memory`` to the next step."""
+        self._run.remember(_memory(memory))
+
+    def begin(self, t: float, state: FloatArray, memory: Memory, first_step: float) -> None:
+        """Start again, from ``state`` at ``t`` (s); what was counted stays."""
+        fresh = {"h": first_step, "xi_old": 1.0, "just_rejected": False, "index": 1, "slope": 0.0,
+                 "zero": np.nan, "redo": 0.0, "redone": 0, "limit": np.inf, "tries": 0}  # fmt: skip
+        self._run.restore(
+            {
+                "t": t,
+                "state": np.ascontiguousarray(state),
+                "memory": _memory(memory),
+                "control": fresh,
+                "seen": loop.OPEN,
+                "near": starting.LOOK,
+            }
+        )
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._run, name)
@@ -429,7 +449,7 @@ def integrate(
                 run.pass_breakpoint(passing)
                 continue
             if reason not in (CHUNK_FULL, FINISHED):
-                trouble = _trouble(reason, system, run)
+                trouble = why_stopped(reason, system, run)
                 loop.fail(record, run.t, run.h, run.memory().sigma, trouble, run.adaptive)
                 break
             if not one_by_one or run.count == made:
@@ -456,7 +476,7 @@ def integrate(
     return record
 
 
-def _trouble(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> str:
+def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> str:
     """Why the kernel stopped, in the words of the reference, which repeats what failed."""
     attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
     if reason == STANDSTILL:

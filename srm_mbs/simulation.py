@@ -67,7 +67,7 @@ ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
 
 
-def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
+def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
     nv = mechanism.model.nv
     units = mechanism.structure.units
@@ -84,7 +84,7 @@ def _absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatAr
     return np.broadcast_to(array, (2 * nv,)).copy()
 
 
-def _checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
+def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
     checked = checked_method(method, tableau)
     if getattr(checked, "T", "identity") != "identity":
         raise InputError(
@@ -117,7 +117,7 @@ def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, F
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def _check_consistent(mechanism: Mechanism) -> bool:
+def check_consistent(mechanism: Mechanism) -> bool:
     """Refuse a start that violates the closures or their rates; True for any other."""
     v0 = mechanism.v0
     g, c = mechanism.initial_errors
@@ -151,7 +151,7 @@ def _sampler(
     return sample
 
 
-def _control(
+def placed_control(
     system: OpenSystem | ClosedSystem,
     method: Method,
     step: float | None,
@@ -292,22 +292,22 @@ def simulate(
         )
     placement = checked_placement(placement)
     avoided = checked_singular_times(singular_times, 0.0, t_end)
-    method = _checked_method(method, tableau)
+    method = mechanism_method(method, tableau)
     rtol = checked_rtol(rtol)
     times = checked_times(t_eval, 0.0, t_end)
     samples = checked_samples(sample_time, controller, t_end)
     kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(0.0, t_end)])
     pieces = pieces_between(kinks, samples, 0.0, t_end)
     check_avoidable(avoided, pieces.ends, t_end)
-    on_kernel = _uses_kernel(backend, method, placement, avoided)
+    on_kernel = uses_kernel(backend, method, placement, avoided)
     mechanism, state = _initial_state(mechanism, q0, v0)
     norm = ErrorNorm(
-        _absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
+        absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
     )
     held = None if sample_time is None else HeldForce()
     system = make_system(mechanism, controller if held is None else held)
     if mechanism.loops:
-        mechanism.at_start("consistent", lambda: _check_consistent(mechanism))
+        mechanism.at_start("consistent", lambda: check_consistent(mechanism))
 
     watch = _event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()
@@ -347,7 +347,7 @@ def simulate(
                 )
                 record = kernel.integrate(system, run, tick=tick, events=watch, passing=passing)
             else:
-                control, wrappers = _control(
+                control, wrappers = placed_control(
                     system, method, step, chosen_first_step, t_end, placement, avoided
                 )
                 record = integrate(
@@ -388,7 +388,7 @@ def simulate(
     return solution
 
 
-def _uses_kernel(backend: str, method: Method, placement: str, singular_times: FloatArray) -> bool:
+def uses_kernel(backend: str, method: Method, placement: str, singular_times: FloatArray) -> bool:
     """Whether a run is made by the compiled kernel.
 
     Raises

@@ -114,7 +114,7 @@ def compare(
     pieces = pieces_between(np.array(breakpoints), np.zeros(0), 0.0, t_end)
     twin = kernel.compiled(system)
     norm = ErrorNorm(
-        simulation._absolute_tolerance(mechanism, None, rtol),
+        simulation.absolute_tolerance(mechanism, None, rtol),
         rtol,
         NEGLIGIBLE if step is None else 0.0,
     )

@@ -29,6 +29,7 @@ LAYERS = (
     ("storage",),
     ("options", "progress"),
     ("dae", "simulation"),
+    ("simulator", "stepwise"),
     ("analysis",),
     ("plots", "visuals", "scene", "playback", "rendering", "summary", "export"),
     ("cli",),

@@ -17,6 +17,8 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method
+from srm_mbs.methods.branch import ROUNDING
+from srm_mbs.methods.zone import ZONE_LARGEST
 from srm_mbs.stepping.starting import LOOK, start
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 
@@ -27,6 +29,8 @@ BESIDE = 8.0
 taken, so that ``t < 0.3``, ``t <= 0.3`` and ``floor(t / 0.1)`` all mean the side they should."""
 CLOSER = 0.5
 """A singular configuration is looked for again when sigma has fallen by this factor."""
+ALLOWED = 0.1
+"""Part of the tolerance that rounding in the first stage of a piece may take."""
 
 
 _UNBOUNDED = np.array([np.inf])
@@ -97,6 +101,67 @@ def pieces_between(times: FloatArray, marked: FloatArray, t0: float, t_end: floa
     )
 
 
+def direct_from(memory: Memory, norm: ErrorNorm, span: float, nv: int) -> float:
+    """sigma from which the first stage of a piece of length ``span`` (s) can be evaluated directly.
+
+    Rounding in a direct solve grows with 1/sigma^2; over a short piece it is harmless.  At most,
+    and without a tolerance (fixed steps), it is where the zone ends.
+    """
+    if norm.negligible == 0.0:
+        return ZONE_LARGEST
+    error = np.zeros(2 * nv)
+    turning = 3.0 * memory.sigma_slope**2 * norm.one[:nv]
+    error[nv:] = span * ROUNDING * (np.abs(memory.rate[nv:]) + turning)
+    weighed = norm(error, norm.weights(memory.magnitude))
+    return min(ZONE_LARGEST, float(np.sqrt(weighed / ALLOWED)))
+
+
+class Nearness:
+    """When the singular configuration next to the first stage of a piece is worth looking for.
+
+    Attributes
+    ----------
+    looked
+        Half the sigma at which that was done last; LOOK far away.
+    """
+
+    def __init__(self) -> None:
+        self.looked = LOOK
+
+    def matters(self, fresh: Memory, norm: ErrorNorm, span: float, nv: int) -> bool:
+        """Whether for ``fresh``, at the start of a piece of length ``span`` (s)."""
+        if fresh.sigma >= LOOK:
+            self.looked = LOOK
+        if not fresh.sigma < self.looked or not fresh.sigma < direct_from(fresh, norm, span, nv):
+            return False
+        self.looked = CLOSER * fresh.sigma
+        return True
+
+
+def beside_singular(
+    system: OpenSystem | ClosedSystem,
+    method: Method,
+    t: float,
+    state: FloatArray,
+    norm: ErrorNorm,
+    end: float,
+    evaluator: Any,
+    fresh: Memory,
+) -> Memory:
+    """``fresh``, of the first stage of a piece up to ``end``, made accurate next to a singular
+    configuration; the parameters are those of :func:`~srm_mbs.stepping.starting.start`.
+
+    Raises
+    ------
+    EvaluationError
+        If the motion on from there is not determined.
+    """
+    try:
+        return start(system, method, t, state, norm, end, evaluator, fresh)
+    except InputError as error:
+        raise EvaluationError(f"at the breakpoint {error}") from error
+
+
 class Passing:
     """What happens at the breakpoints of a run; used by the drivers.
 
@@ -130,7 +195,7 @@ class Passing:
         self._evaluator = system if evaluator is None else evaluator
         self.sample: Callable[[float, FloatArray], None] | None = None
         self._index = 0
-        self._looked = LOOK
+        self._nearness = Nearness()
         self._evaluate_within(0)
 
     @property
@@ -167,12 +232,9 @@ class Passing:
         """
         self.enter(self._index + 1, t, state)
         fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
-        if fresh.sigma >= LOOK:
-            self._looked = LOOK
-        if not fresh.sigma < self._looked:
-            return fresh
-        self._looked = CLOSER * fresh.sigma
-        return self._resolved(t, state, fresh)
+        if self._nearness.matters(fresh, self._norm, self.end - t, self._system.nv):
+            return self._resolved(t, state, fresh)
+        return fresh
 
     def resolved(self, t: float, state: FloatArray, memory: Memory) -> Memory:
         """``memory`` with the first stage of the current piece, from where it starts, evaluated
@@ -187,12 +249,9 @@ class Passing:
         return self._resolved(t, state, fresh)
 
     def _resolved(self, t: float, state: FloatArray, fresh: Memory) -> Memory:
-        try:
-            return start(
-                self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
-            )
-        except InputError as error:
-            raise EvaluationError(f"at the breakpoint {error}") from error
+        return beside_singular(
+            self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
+        )
 
     def done(self) -> None:
         """The run is over: the system may be evaluated at any time."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from srm_mbs.methods.base import Memory, StepResult
-from srm_mbs.stepping.stepsize import Proposal, Propose, StepSizeControl, Verdict
+from srm_mbs.stepping.stepsize import Grid, Proposal, Propose, StepSizeControl, Verdict
 from srm_mbs.stepping.turning import TURNED, AmbiguousPassages
 from srm_mbs.systems.base import System
 
@@ -99,9 +99,9 @@ class BranchGuard:
             self._tries = 0
         return verdict
 
-    def aim(self, end: float) -> None:
+    def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
-        self._inner.aim(end)
+        self._inner.aim(end, grid)
 
     def told(self) -> list[float]:
         """Times (s) up to which the motion may have changed its branch: the suspects, and the ends

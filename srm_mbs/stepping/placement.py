@@ -18,7 +18,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import Memory, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.kinks import zero_ahead, zero_within
-from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
+from srm_mbs.stepping.stepsize import Grid, Proposal, StepSizeControl, Verdict
 
 SIGMA_CHANGE = 0.5
 """Largest change of sigma in one step, by the slope of the last steps."""
@@ -132,10 +132,10 @@ class SingularityPlacement:
                 return Proposal(h, t + h, placed=True)
         return proposal
 
-    def aim(self, end: float) -> None:
+    def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
         self._t_end = end
-        self._inner.aim(end)
+        self._inner.aim(end, grid)
 
     def _placed(self, distance: float, h: float, t: float) -> float:
         if t + h >= self._t_end and self._gaps.ends_on(distance, h):

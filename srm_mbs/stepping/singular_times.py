@@ -28,7 +28,7 @@ from srm_mbs.stepping.placement import (
     inverse_abscissae,
     sigma_slope,
 )
-from srm_mbs.stepping.stepsize import Proposal, StepSizeControl, Verdict
+from srm_mbs.stepping.stepsize import Grid, Proposal, StepSizeControl, Verdict
 
 PLACEMENTS = ("automatic", "halved", "off")
 """What is done around singular configurations that sigma shows."""
@@ -102,10 +102,10 @@ class AvoidTimes:
         """The inner control's verdict."""
         return self._inner.judge(proposal, result)
 
-    def aim(self, end: float) -> None:
+    def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
         self._t_end = end
-        self._inner.aim(end)
+        self._inner.aim(end, grid)
 
     def _clear(self, h: float, distances: FloatArray) -> bool:
         """Whether a step of length ``h`` stays clear of times at ``distances`` (s)."""
@@ -159,9 +159,9 @@ class SlopeOfSigma:
             self._slope = max(slope, 0.5 * self._slope)
         return verdict
 
-    def aim(self, end: float) -> None:
+    def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
-        self._inner.aim(end)
+        self._inner.aim(end, grid)
 
 
 class HalvedStep(SlopeOfSigma):
@@ -216,10 +216,10 @@ class HalvedStep(SlopeOfSigma):
         self._plan = self._plan[1:] if verdict is Verdict.ACCEPTED else ()
         return verdict
 
-    def aim(self, end: float) -> None:
+    def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
         self._t_end = end
-        super().aim(end)
+        super().aim(end, grid)
 
     def _ends_on_a_singular_point(self, h: float, result: StepResult) -> bool:
         sigmas = result.sigmas

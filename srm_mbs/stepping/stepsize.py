@@ -29,6 +29,10 @@ FAILED_EVALUATION = 1e6
 """Error ratio of a step whose stages could not be evaluated or are not finite."""
 
 
+Grid = tuple[float, float]
+"""Where a grid of fixed steps begins, and its spacing (s)."""
+
+
 class Verdict(Enum):
     """What becomes of a proposed step."""
 
@@ -67,8 +71,11 @@ class StepSizeControl(Protocol):
     def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
         """Judge a step; ``result`` is None if a stage could not be evaluated."""
 
-    def aim(self, end: float) -> None:
-        """A step ends on ``end`` (s): a breakpoint, or the end of the run."""
+    def aim(self, end: float, grid: Grid | None = None) -> None:
+        """A step ends on ``end`` (s): a breakpoint, or the end of the run.
+
+        With ``grid`` fixed steps are counted anew; others have none.
+        """
 
 
 def _until(t: float, h: float, end: float) -> Proposal:
@@ -130,7 +137,7 @@ class PIControl:
         self._just_rejected = False
         return Verdict.ACCEPTED
 
-    def aim(self, end: float) -> None:
+    def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`StepSizeControl`."""
         self._t_end = end
 
@@ -173,9 +180,11 @@ class FixedStep:
         """Distance (s) before a grid point that is not worth a step."""
         return max(1e-9, 1e-14 * self._index) * self._step
 
-    def aim(self, end: float) -> None:
-        """See :class:`StepSizeControl`; the grid stays."""
+    def aim(self, end: float, grid: Grid | None = None) -> None:
+        """See :class:`StepSizeControl`; without a new grid the old one stays."""
         self._t_end = end
+        if grid is not None:
+            (self._t0, self._step), self._index = grid, 1
 
 
 def initial_step(

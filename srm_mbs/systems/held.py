@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 
 from srm_mbs.arrays import FloatArray
@@ -22,6 +23,10 @@ class HeldForce:
         """``force`` (nv,), N and N m, acts from ``t`` (s) on, which is later than all before."""
         self.times.append(t)
         self.values.append(force)
+
+    def only(self, force: FloatArray) -> None:
+        """``force`` (nv,) acts at all times."""
+        self.times, self.values = [-math.inf], [force]
 
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """The force (nv,) at ``t``."""

@@ -43,6 +43,10 @@ class Control {
 public:
     virtual ~Control() = default;
     virtual void resume(const ControlState& state) = 0;
+    // What `resume` goes on from.
+    virtual void save(ControlState& state) const = 0;
+    // A grid of fixed steps starts anew.
+    virtual void grid(double, double) {}
     virtual Proposal propose(double t, double limit, Memory& memory) = 0;
     // `result` is null if a stage could not be evaluated.
     virtual Verdict judge(const Proposal& proposal, const StepResult* result) = 0;
@@ -64,6 +68,11 @@ public:
         xi_old_ = s.xi_old;
         just_rejected_ = s.just_rejected;
     }
+    void save(ControlState& s) const override {
+        s.h = h_;
+        s.xi_old = xi_old_;
+        s.just_rejected = just_rejected_;
+    }
 
 private:
     double t_end_, h_;
@@ -81,7 +90,13 @@ public:
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
     void aim(double end) override { t_end_ = end; }
+    void grid(double t0, double step) override {
+        t0_ = t0;
+        step_ = step;
+        index_ = 1;
+    }
     void resume(const ControlState& s) override { index_ = s.index; }
+    void save(ControlState& s) const override { s.index = index_; }
 
 private:
     double sliver() const { return std::max(1e-9, 1e-14 * static_cast<double>(index_)) * step_; }
@@ -120,6 +135,14 @@ public:
         redo_ = s.redo;
         redone_ = s.redone;
     }
+    void save(ControlState& s) const override {
+        inner_->save(s);
+        s.slope = slope_;
+        s.zero = zero_;
+        s.redo = redo_;
+        s.redone = redone_;
+    }
+    void grid(double t0, double step) override { inner_->grid(t0, step); }
 
 private:
     double placed_step(double distance, double h, double t) const;
@@ -146,6 +169,11 @@ public:
         inner_->resume(s);
         slope_ = s.slope;
     }
+    void save(ControlState& s) const override {
+        inner_->save(s);
+        s.slope = slope_;
+    }
+    void grid(double t0, double step) override { inner_->grid(t0, step); }
 
 private:
     std::unique_ptr<Control> inner_;
@@ -165,6 +193,12 @@ public:
         limit_ = s.limit;
         tries_ = s.tries;
     }
+    void save(ControlState& s) const override {
+        inner_->save(s);
+        s.limit = limit_;
+        s.tries = tries_;
+    }
+    void grid(double t0, double step) override { inner_->grid(t0, step); }
     std::vector<double> suspects;
 
 private:

@@ -6,6 +6,7 @@
 
 #include "dense.hpp"
 #include "errors.hpp"
+#include "linear.hpp"
 #include "model.hpp"
 #include "run.hpp"
 
@@ -68,7 +69,7 @@ ControlConstants control_constants_of(const nb::dict& d) {
 LoopConstants loop_constants_of(const nb::dict& d) {
     return {number(d, "smallest_step"), number(d, "standstill"), number(d, "large_correction"),
             number(d, "open"),          number(d, "lost"),       whole(d, "watched_steps"),
-            number(d, "look"),          number(d, "closer")};
+            number(d, "look"),          number(d, "closer"),        number(d, "allowed")};
 }
 
 ErrorNorm norm_of(const nb::dict& d) {
@@ -127,6 +128,36 @@ nb::dict dict_of(const Memory& m) {
     out["sigma_slope"] = m.sigma_slope;
     out["steps"] = m.steps;
     out["history"] = m.has_history ? nb::object(dict_of(m.history)) : nb::none();
+    return out;
+}
+
+ControlState control_of(const nb::dict& d) {
+    ControlState c;
+    c.h = number(d, "h");
+    c.xi_old = number(d, "xi_old");
+    c.just_rejected = nb::cast<bool>(d["just_rejected"]);
+    c.index = nb::cast<long>(d["index"]);
+    c.slope = number(d, "slope");
+    c.zero = number(d, "zero");
+    c.redo = number(d, "redo");
+    c.redone = whole(d, "redone");
+    c.limit = number(d, "limit");
+    c.tries = whole(d, "tries");
+    return c;
+}
+
+nb::dict dict_of(const ControlState& c) {
+    nb::dict out;
+    out["h"] = c.h;
+    out["xi_old"] = c.xi_old;
+    out["just_rejected"] = c.just_rejected;
+    out["index"] = c.index;
+    out["slope"] = c.slope;
+    out["zero"] = c.zero;
+    out["redo"] = c.redo;
+    out["redone"] = c.redone;
+    out["limit"] = c.limit;
+    out["tries"] = c.tries;
     return out;
 }
 
@@ -318,21 +349,58 @@ struct PyRun {
     // One attempt from where the reference stands: (stop, verdict), verdict -1 if none was made.
     nb::tuple attempt_from(double t, const Array& state, const nb::dict& memory,
                            const nb::dict& control) {
-        ControlState c;
-        c.h = number(control, "h");
-        c.xi_old = number(control, "xi_old");
-        c.just_rejected = nb::cast<bool>(control["just_rejected"]);
-        c.index = nb::cast<long>(control["index"]);
-        c.slope = number(control, "slope");
-        c.zero = number(control, "zero");
-        c.redo = number(control, "redo");
-        c.redone = whole(control, "redone");
-        c.limit = number(control, "limit");
-        c.tries = whole(control, "tries");
+        const ControlState c = control_of(control);
         run->resume(t, state.data(), memory_of(memory, s.nv), c);
         Verdict verdict = static_cast<Verdict>(-1);
         const Stop stop = run->attempt(verdict);
         return nb::make_tuple(static_cast<int>(stop), static_cast<int>(verdict));
+    }
+
+    // Goes on to `end`; `force` (nv,) acts from here, or what acted before.  See Run::go_on.
+    int go_on(double end, double first, double last, nb::handle force, bool anew, double grid,
+              double seconds) {
+        if (!force.is_none()) {
+            const Array array = nb::cast<Array>(force);
+            if (static_cast<int>(array.size()) != s.nv || array.ndim() != 1 ||
+                !finite(array.data(), s.nv))
+                throw nb::value_error("not nv finite forces");
+            if (!s.holds(array.data())) {
+                s.hold(run->t(), array.data(), false);
+                anew = true;
+            }
+        }
+        nb::gil_scoped_release released;
+        return static_cast<int>(run->go_on(end, first, last, anew, grid, seconds));
+    }
+
+    // Everything that the next step depends on.
+    nb::dict snapshot() {
+        nb::dict out;
+        ControlState control;
+        run->control->save(control);
+        out["t"] = run->t();
+        out["state"] = owned(run->state, {run->state.size()});
+        out["memory"] = dict_of(run->memory);
+        out["control"] = dict_of(control);
+        out["seen"] = run->seen();
+        out["near"] = run->near();
+        return out;
+    }
+
+    void restore(const nb::dict& d) {
+        const Array state = nb::cast<Array>(d["state"]);
+        run->resume(number(d, "t"), state.data(), memory_of(nb::cast<nb::dict>(d["memory"]), s.nv),
+                    control_of(nb::cast<nb::dict>(d["control"])));
+        run->adopt(number(d, "seen"), number(d, "near"));
+    }
+
+    // Accepted, rejected and zone steps since the start.
+    nb::tuple totals() {
+        long rejected = run->rejected_before;
+        for (const Attempt& a : run->attempts)
+            rejected += a.verdict == static_cast<int>(Verdict::rejected);
+        return nb::make_tuple(run->steps_before + run->count(), rejected,
+                              run->zones_before + static_cast<long>(run->zones.size()));
     }
 
     // The records since the start, which are handed over.
@@ -514,6 +582,11 @@ NB_MODULE(_core, m) {
         .def("last", &PyRun::last)
         .def("attempts", &PyRun::attempts)
         .def("suspects", &PyRun::suspects)
+        .def("go_on", &PyRun::go_on, nb::arg("end"), nb::arg("first"), nb::arg("last"),
+             nb::arg("force").none(), nb::arg("anew"), nb::arg("grid"), nb::arg("seconds"))
+        .def("snapshot", &PyRun::snapshot)
+        .def("restore", &PyRun::restore)
+        .def("totals", &PyRun::totals)
         .def("enter", [](PyRun& r) { return r.run->enter(); })
         .def("remember", [](PyRun& r, const nb::dict& memory) {
             r.run->memory = memory_of(memory, r.s.nv);

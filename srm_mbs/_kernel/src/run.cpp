@@ -46,6 +46,27 @@ bool Run::enter() {
     evaluate_within();
     breaks.push_back(static_cast<double>(count()));
     break_rates.insert(break_rates.end(), end_rate.begin(), end_rate.end());
+    return renew();
+}
+
+// sigma from which rounding in the first stage is harmless over the piece.
+double Run::direct_from() const {
+    const double largest = step.constants.zone_largest;
+    if (step.norm.negligible == 0.0) return largest;
+    const double span = pieces_.ends[piece_] - t_, turning = 3.0 * memory.sigma_slope * memory.sigma_slope;
+    const int nv = system.nv;
+    double sum = 0.0;
+    for (int i = 0; i < nv; ++i) {
+        const double error = span * step.constants.rounding *
+                             (std::abs(memory.rate[nv + i]) + turning * step.norm.one[i]);
+        const double scaled = error / step.norm.weight(nv + i, memory.magnitude[nv + i]);
+        sum += scaled * scaled;
+    }
+    return std::min(largest, std::sqrt(std::sqrt(sum / (2 * nv)) / constants_.allowed));
+}
+
+// The first stage of a piece; whether it is accurate.
+bool Run::renew() {
     system.evaluate(t_, state.data(), System::ZoneView{});
     system.rate(memory.rate.data());
     memory.sigma = system.sigma();
@@ -56,7 +77,7 @@ bool Run::enter() {
     system.multiplier(multiplier.data());
     memory.history.extend(t_, multiplier.data(), {}, 0);
     if (memory.sigma >= constants_.look) near_ = constants_.look;
-    if (!(memory.sigma < near_)) return true;
+    if (!(memory.sigma < near_) || !(memory.sigma < direct_from())) return true;
     near_ = constants_.closer * memory.sigma;
     return false;
 }
@@ -141,13 +162,47 @@ Stop Run::attempt(Verdict& verdict) {
     return t_ < t_end() ? Stop::chunk : Stop::finished;
 }
 
+void Run::forget() {
+    steps_before += count();
+    zones_before += static_cast<long>(zones.size());
+    for (const Attempt& a : attempts)
+        rejected_before += a.verdict == static_cast<int>(Verdict::rejected);
+    for (auto* records : {&times, &states, &rates, &corrections, &sigmas, &ranks, &error_ratios,
+                          &placements, &held, &breaks, &break_rates})
+        records->clear();
+    zones.clear();
+    attempts.clear();
+}
+
+Stop Run::go_on(double end, double first, double last, bool anew, double grid, double seconds) {
+    forget();
+    t0_ = t_;
+    smallest_ = constants_.smallest_step * std::abs(end - t_);
+    pieces_.ends.assign(1, end);
+    pieces_.first.assign(1, first);
+    pieces_.last.assign(1, last);
+    pieces_.given.clear();
+    piece_ = 0;
+    trouble = false;
+    evaluate_within();
+    if (grid > 0.0) control->grid(t_, grid);
+    if (anew) {
+        try {
+            if (!renew()) return Stop::breakpoint;
+        } catch (const EvaluationError&) {
+            return Stop::breakpoint;
+        }
+    }
+    return advance(0, seconds);
+}
+
 Stop Run::advance(long steps, double seconds) {
     using clock = std::chrono::steady_clock;
     const auto started = clock::now();
     const long last = steps > 0 ? count() + steps : std::numeric_limits<long>::max();
     Verdict verdict;
     for (long attempted = 1;; ++attempted) {
-        if (t_ >= pieces_.ends[piece_]) {
+        if (at_breakpoint()) {
             if (pieces_.given[piece_]) return Stop::breakpoint;
             try {
                 if (!enter()) return Stop::breakpoint;

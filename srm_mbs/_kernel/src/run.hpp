@@ -22,7 +22,7 @@ enum class Stop {
 struct LoopConstants {
     double smallest_step, standstill, large_correction, open, lost;
     int watched_steps;
-    double look, closer;  // breakpoints.py
+    double look, closer, allowed;  // breakpoints.py
 };
 
 // The pieces of a run between breakpoints; see srm_mbs/stepping/breakpoints.py.
@@ -63,12 +63,23 @@ public:
     // Goes on to the next piece; whether its first stage is accurate as it was evaluated: a
     // singular configuration may be so near that it is not.
     bool enter();
+    // Goes on to `end` as a run of its own, evaluated within [first, last]; the records of the
+    // steps before are dropped.  `anew`: forces may have jumped.  With `grid` > 0, fixed steps of
+    // that length are counted from here.
+    Stop go_on(double end, double first, double last, bool anew, double grid, double seconds);
 
     double t() const { return t_; }
     double last_h() const { return h_; }
     double t_end() const { return pieces_.ends.back(); }
     // Whether the next piece has still to be entered.
     bool at_breakpoint() const { return t_ >= pieces_.ends[piece_] && t_ < t_end(); }
+    double seen() const { return seen_; }
+    double near() const { return near_; }
+    // Goes on as another run would that has seen and is looking for this.
+    void adopt(double seen, double near) {
+        seen_ = seen;
+        near_ = near;
+    }
     long piece() const { return static_cast<long>(piece_); }
     long count() const { return static_cast<long>(times.size()); }
 
@@ -85,12 +96,17 @@ public:
     std::vector<double> breaks, break_rates;  // numbers of the steps before breakpoints; rates there
     std::vector<ZoneRecord> zones;
     std::vector<Attempt> attempts;
+    // Of the steps whose records were dropped.
+    long steps_before = 0, rejected_before = 0, zones_before = 0;
     bool trouble = false;  // the last attempt could not be evaluated
 
 private:
     bool opens(const StepResult& result);
     void record(const StepResult& result, double t_new, int placement);
     void evaluate_within();
+    void forget();
+    bool renew();
+    double direct_from() const;
 
     LoopConstants constants_;
     Regularisation eps_;

@@ -186,6 +186,11 @@ void System::hold(double t, const double* force, bool keep) {
     held_.insert(held_.end(), force, force + nv);
 }
 
+bool System::holds(const double* force) const {
+    return held_.size() >= static_cast<std::size_t>(nv) &&
+           std::equal(force, force + nv, held_.end() - nv);
+}
+
 const double* System::held_force(double t) const {
     if (held_from_.empty()) return nullptr;
     std::size_t k = held_from_.size() - 1;

@@ -84,6 +84,8 @@ public:
     // From t on a constant force (nv,) acts, beside all others; with `keep` those before stay in
     // force at earlier times.
     void hold(double t, const double* force, bool keep);
+    // Whether `force` (nv,) is what acts now.
+    bool holds(const double* force) const;
 
     // Terms of the stage evaluated last.
     bool constrained() const { return closed_; }

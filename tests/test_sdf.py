@@ -497,35 +497,3 @@ def test_every_cassie_file_is_posed_and_weighs_what_it_says(name: str) -> None:
                 for anchor in (entry["a"], entry["b"])
             )
             same(a, b)
-
-
-def test_cassie_floats_with_twelve_rows_of_which_ten_are_independent() -> None:
-    mechanism = srm.load(cassie("cassie_v2"))
-    assert mechanism.model.names[1] == "root_joint"
-    assert mechanism.model.nv == 28
-    assert sum(loop.rows.count for loop in mechanism.loops) == 12
-    assert mechanism.structure.rank == 10
-    assert mechanism.degrees_of_freedom == 18
-    assert np.abs(mechanism.initial_errors[0]).max() < 1e-14
-    # By Pinocchio, away from the pose: the rank of the Jacobian of the gaps between the points.
-    model = mechanism.model.copy()
-    rng = np.random.default_rng(3)
-    start = pin.integrate(model, mechanism.q0, rng.uniform(-0.03, 0.03, model.nv))
-    q = srm.assemble(mechanism.with_state(start, mechanism.v0)).q
-    assert np.abs(pin.difference(model, mechanism.q0, q)).max() > 0.01
-    rows = []
-    for loop in mechanism.loops:
-        ends = [side.resolve(model) for side in (loop.a, loop.b)]
-        frames = [
-            model.addFrame(pin.Frame(f"{loop.name}{i}", joint, place, pin.FrameType.OP_FRAME))
-            for i, (joint, place) in enumerate(ends)
-        ]
-        data = model.createData()
-        pin.computeJointJacobians(model, data, q)
-        pin.updateFramePlacements(model, data)
-        world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        one, other = (pin.getFrameJacobian(model, data, frame, world)[:3] for frame in frames)
-        rows.append(one - other)
-    values = np.linalg.svd(np.vstack(rows), compute_uv=False)
-    assert values[9] > 1e-4
-    assert values[10] < 1e-10

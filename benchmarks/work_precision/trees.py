@@ -51,6 +51,15 @@ class Spring:
     rest: float
 
 
+@dataclass(frozen=True)
+class TorsionSpring:
+    """Spring on the coordinate of a hinge: N m/rad, and the angle (rad) where it is relaxed."""
+
+    joint: int
+    stiffness: float
+    rest: float
+
+
 @dataclass(frozen=True, eq=False)
 class Tree:
     """A mechanism as the peers get it; ``torque`` (nv,) acts on the joints, constant."""
@@ -61,6 +70,7 @@ class Tree:
     v0: Array
     torque: Array = None
     springs: tuple[Spring, ...] = ()
+    torsion: tuple[TorsionSpring, ...] = ()
 
     @property
     def flat(self) -> bool:
@@ -162,17 +172,25 @@ class Equations:
         self._zero = np.zeros(model.nv)
         self._damping = model.damping.copy() if np.any(model.damping) else None
         self.constant = self._zero if tree.torque is None else tree.torque
-        self.passive = tree.torque is None and not tree.springs and self._damping is None
+        joints = [model.joints[spring.joint] for spring in tree.torsion]
+        self._twisted = np.array([joint.idx_q for joint in joints], dtype=int)
+        self._turning = np.array([joint.idx_v for joint in joints], dtype=int)
+        self._stiffness = np.array([spring.stiffness for spring in tree.torsion])
+        self._relaxed = np.array([spring.rest for spring in tree.torsion])
+        self.passive = (
+            tree.torque is None and not tree.springs and not tree.torsion and self._damping is None
+        )
 
     def applied(self, q: Array, v: Array) -> Array:
         """Joint torques of motors, springs and damping (nv,)."""
         if self.passive:
             return self._zero
         tau = self.constant if self._damping is None else self.constant - self._damping * v
-        if self._springs:
+        if self._springs or self.tree.torsion:
             tau = tau.copy()
             for spring in self._springs:
                 tau[spring.index] += spring.torque(q)
+            tau[self._turning] -= self._stiffness * (q[self._twisted] - self._relaxed)
         return tau
 
     def position_rate(self, q: Array, v: Array) -> Array:
@@ -296,6 +314,7 @@ class Equations:
                 point = self.data.oMi[spring.joint].act(np.array(spring.at))
                 stretch = np.linalg.norm(point - np.array(spring.ground)) - spring.rest
                 out[i] += 0.5 * spring.stiffness * stretch**2
+            out[i] += 0.5 * self._stiffness @ (x[self._twisted] - self._relaxed) ** 2
             if self.tree.torque is not None:
                 out[i] -= self.tree.torque @ x  # one-degree joints only
         return out

@@ -45,7 +45,8 @@ def _numbers(values: Any) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _joint(model: pin.Model, index: int) -> str:
+def _joint(tree: Tree, index: int) -> str:
+    model = tree.model
     joint = model.joints[index]
     kind = joint.shortname().removeprefix("JointModel")
     name = model.names[index]
@@ -59,9 +60,14 @@ def _joint(model: pin.Model, index: int) -> str:
         raise NotApplicableError(f"no translation of a {kind} joint to MuJoCo")
     sort = "hinge" if letter == "R" else "slide"
     damping = float(model.damping[joint.idx_v])
+    springs = "".join(
+        f'stiffness="{spring.stiffness!r}" springref="{spring.rest!r}" '
+        for spring in tree.torsion
+        if spring.joint == index
+    )
     return (
         f'<joint name="{name}" type="{sort}" axis="{_numbers(axis)}" damping="{damping!r}" '
-        'limited="false"/>'
+        f'{springs}limited="false"/>'
     )
 
 
@@ -90,7 +96,7 @@ def _body(tree: Tree, index: int, sites: dict[int, list[str]]) -> str:
         [
             f'<body name="{model.names[index]}" pos="{_numbers(placement.translation)}" '
             f'quat="{_numbers((w, x, y, z))}">',
-            _joint(model, index),
+            _joint(tree, index),
             f'<inertial pos="{_numbers(inertia.lever)}" mass="{mass!r}" '
             f'fullinertia="{_numbers(full)}"/>',
             *sites.get(index, []),

@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from benchmarks.work_precision.problems.andrews import squeezing_mechanism
 from benchmarks.work_precision.problems.base import Problem
+from benchmarks.work_precision.problems.cassie import cassie
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.problems.pendulum_chain import pendulum_chain
 from benchmarks.work_precision.problems.slider_cranks import regular, whirl
@@ -22,6 +23,7 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
         "squeezing_mechanism": squeezing_mechanism,
         "spatial_four_bar": spatial_four_bar,
         "walking_robot": walking_robot,
+        "cassie": cassie,
         "pendulum_chain": pendulum_chain,
     }
 )

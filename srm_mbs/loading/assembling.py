@@ -227,8 +227,10 @@ def assembled(description: Description, source: Source, notes: Sequence[str] = (
     mechanism, q, v = unassembled(description, source, notes)
     try:
         state = assemble(mechanism, q, v)
-        # A fresh mechanism: its structure is analysed from the assembled state.
-        mechanism = replace(mechanism, q0=state.q, v0=state.v)
+        if np.array_equal(state.q, mechanism.q0):  # closed as it was: so is what was analysed
+            mechanism = mechanism.with_state(state.q, state.v)
+        else:  # a fresh mechanism: its structure is analysed from the assembled state
+            mechanism = replace(mechanism, q0=state.q, v0=state.v)
         _ = mechanism.structure
     except AssemblyError as error:
         if description.lock:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from srm_mbs.errors import InputError
-from srm_mbs.loading import gepetto, sdf, urdf_loops
+from srm_mbs.loading import gepetto, mjcf, sdf, urdf_loops
 from srm_mbs.loading.safe_xml import root_tag
 from srm_mbs.loading.translation import Options, Translation
 
@@ -68,6 +68,7 @@ FORMATS: tuple[Format, ...] = (
     DESCRIPTION,
     Format("URDF", (".urdf",), _rooted("robot"), urdf_loops.translate, key="urdf"),
     Format("SDF", (".sdf", ".world"), _rooted("sdf"), sdf.translate, key="sdf"),
+    Format("MJCF", (".mjcf",), _rooted("mujoco"), mjcf.translate, key="mjcf"),
     Format("Gepetto YAML", (".yaml", ".yml"), gepetto.recognises, gepetto.translate),
 )
 

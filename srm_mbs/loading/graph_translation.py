@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import pinocchio as pin
@@ -40,6 +41,8 @@ class GraphTranslator:
         Between them.
     root
         The body that floats if nothing connects it with the ground.
+    free
+        Names for the joints by which bodies move freely beside others.
     """
 
     def __init__(
@@ -50,11 +53,12 @@ class GraphTranslator:
         placements: Mapping[str, pin.SE3],
         joints: Sequence[Joint],
         root: str,
+        free: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.file, self.name = file, name
         self.bodies, self.placements = dict(bodies), placements
         self.joints = list(joints)
-        self.root = root
+        self.root, self.free = root, free
         self.notes: list[str] = []
 
     def translate(self, cut: Sequence[str] = ()) -> Translation:
@@ -103,12 +107,15 @@ class GraphTranslator:
             )
             return "floating", MODEL_FRAME
         for part in free:
-            body = self.root if self.root in part else part[0]
-            name = f"{body}::free"
+            known = next((body for body in part if body in self.free), None)
+            body = known or (self.root if self.root in part else part[0])
+            name = self.free.get(body, f"{body}::free")
             self.joints.append(Joint(name, "floating", WORLD, body, self.placements[body]))
-            self.notes.append(
-                f"nothing connects {body!r} with the ground: it moves freely by the joint {name!r}"
-            )
+            if known is None:
+                self.notes.append(
+                    f"nothing connects {body!r} with the ground: it moves freely by the joint "
+                    f"{name!r}"
+                )
         return "fixed", WORLD
 
     def _refuse_cut(self, joint: Joint, why: str) -> InputError:

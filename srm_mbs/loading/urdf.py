@@ -168,6 +168,7 @@ def build_urdf(
     root = parse_urdf(text, file)
     checker.check(root, base, locked)
     unlimited = _without_limits(root, set(counting_turns) - set(locked))
+    armature = _armature(root)
     extended = take_extended(root)
     text = tostring(root, encoding="unicode")
     root_joint = ROOT_JOINTS[base]
@@ -186,7 +187,21 @@ def build_urdf(
             model.effortLimit[joint.idx_v] = model.velocityLimit[joint.idx_v] = np.inf
     for note in checker.notes:
         log.info("%s: %s", file, note)
-    return UrdfModel(with_joints(model, extended), tuple(checker.notes))
+    model = with_joints(model, extended)
+    for name, value in armature.items():
+        joint = model.joints[model.getJointId(name)]
+        model.armature[joint.idx_v : joint.idx_v + joint.nv] = value
+    return UrdfModel(model, tuple(checker.notes))
+
+
+def _armature(root: Element) -> dict[str, float]:
+    """Inertias of motors by joint: an attribute of <dynamics> that URDF does not have."""
+    return {
+        joint.get("name", ""): float(dynamics.attrib.pop("armature"))
+        for joint in root.findall("joint")
+        for dynamics in joint.findall("dynamics")
+        if "armature" in dynamics.attrib and joint.get("type") != "fixed"
+    }
 
 
 def _without_limits(root: Element, names: Collection[str]) -> dict[str, bool]:

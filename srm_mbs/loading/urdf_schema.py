@@ -46,7 +46,7 @@ ATTRIBUTES = {
     "axis2": ("xyz",),
     "thread_pitch": ("value",),
     "limit": ("lower", "upper", "effort", "velocity"),
-    "dynamics": ("damping", "friction"),
+    "dynamics": ("damping", "friction", "armature"),
 }
 INFORMATIVE = {
     "joint": ("independent",),

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import pinocchio as pin
+
+from srm_mbs.loading.mjcf import translate
+from srm_mbs.loading.translation import Options, Translation
+from srm_mbs.loading.urdf import build_urdf
+
 TREE = """<mujoco model="tree">
   <compiler angle="degree" eulerseq="zyx"/>
   <option gravity="0.5 -1 -9.7"/>
@@ -57,7 +63,7 @@ FOUR_BAR = """<mujoco model="four_bar">
     <body name="crank"><joint name="a"/><geom fromto="0 0 0 0 0 0.5"/>
       <body name="coupler" pos="0 0 0.5"><joint name="b"/><geom fromto="0 0 0 1 0 0.3"/></body>
     </body>
-    <body name="rocker" pos="1 0 0"><joint name="d"/><geom fromto="0 0 0 0 0 0.8"/></body>
+    <body name="rocker" pos="1.2 0 0"><joint name="d"/><geom fromto="0 0 0 0 0 0.8"/></body>
   </worldbody>
   <equality>
     <connect name="pin" body1="coupler" body2="rocker" anchor="1 0 0.3"/>
@@ -98,3 +104,20 @@ TWO_LOOPS = """<mujoco model="two_loops">
   </equality>
 </mujoco>
 """
+BODY = '<body name="{}"><joint name="{}"/><geom type="sphere" size="0.1" pos="0.2 0 0"/></body>'
+TWO = "".join(BODY.format(*names) for names in (("one", "j"), ("two", "k")))
+
+
+def file(world: str = TWO, more: str = "") -> str:
+    """A file with two hinged bodies by default, and further sections."""
+    return f"<mujoco>{more}<worldbody>{world}</worldbody></mujoco>"
+
+
+def model_of(text: str) -> pin.Model:
+    """Pinocchio's model of the translated tree."""
+    made = translated(text)
+    return build_urdf(made.urdf, "x.urdf", made.entries.get("base", "fixed")).model
+
+
+def translated(text: str) -> Translation:
+    return translate(text, "robot.xml", Options())

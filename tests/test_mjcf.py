@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,23 +10,19 @@ import pinocchio as pin
 import pytest
 import tomli_w
 
+import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.description import parse_description
-from srm_mbs.loading.mjcf import translate
-from srm_mbs.loading.translation import Options, Translation
 from srm_mbs.loading.urdf import build_urdf
 from srm_mbs.mechanism import Anchor
 from srm_mbs.systems.forces import ForceKinematics
-from tests.mjcf_files import FOUR_BAR, TREE, TWO_LOOPS
+from tests.lockstep import compare
+from tests.mjcf_files import BODY, FOUR_BAR, TREE, TWO, TWO_LOOPS, file, model_of, translated
+from tests.test_kernel import agree
 
 mujoco = pytest.importorskip("mujoco")
 
 FILES = {"tree": TREE, "four_bar": FOUR_BAR, "two_loops": TWO_LOOPS}
-ORDER = {"free": 6, "ball": 3}
-
-
-def translated(text: str) -> Translation:
-    return translate(text, "robot.xml", Options())
 
 
 class Twins:
@@ -161,3 +158,54 @@ def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> Non
         assert at == rows.size
         for ours, other in zip(twins.residuals(), expected, strict=True):
             np.testing.assert_allclose(ours, other, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_file_loads_closes_and_runs_alike_on_both_backends(name: str, tmp_path: Path) -> None:
+    """With armatures and dampers, which both must see."""
+    path = tmp_path / "robot.xml"
+    path.write_text(FILES[name].replace('axis="0 1 0"', 'axis="0 1 0" armature="0.2" damping="1"'))
+    mechanism = srm.load(path)
+    assert mechanism.model.armature.any()
+    agree(compare(mechanism, 0.5, rtol=1e-10))
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        '<compiler settotalmass="7"/>',
+        '<compiler boundmass="20" boundinertia="0.5"/>',
+        '<compiler inertiagrouprange="1 2"/><default><geom group="1"/></default>',
+        '<compiler inertiafromgeom="true" angle="radian"/>',
+    ],
+)
+def test_masses_are_those_of_mujocos_compiler(more: str) -> None:
+    text = file(TWO.replace("<geom", '<inertial pos="0 0 0.1" mass="3" diaginertia="1 1 1"/><geom'))
+    text = text.replace("<worldbody>", more + "<worldbody>")
+    ours, theirs = model_of(text), mujoco.MjModel.from_xml_string(text)
+    for i, joint in ((1, "j"), (2, "k")):
+        inertia = ours.inertias[ours.getJointId(joint)]
+        np.testing.assert_allclose(inertia.mass, theirs.body_mass[i], rtol=1e-12)
+        np.testing.assert_allclose(inertia.lever, theirs.body_ipos[i], atol=1e-12)
+        np.testing.assert_allclose(
+            np.linalg.eigvalsh(inertia.inertia), np.sort(theirs.body_inertia[i]), rtol=1e-12
+        )
+
+
+def test_one_free_body_is_a_floating_robot_at_its_pose(tmp_path: Path) -> None:
+    body = BODY.format("base", "x").replace('<joint name="x"/>', "<freejoint/>")
+    body = body.replace('name="base"', 'name="base" pos="1 2 3" euler="10 20 30"')
+    arm = BODY.format("arm", "j")
+    path = tmp_path / "robot.xml"
+    path.write_text(file(body.replace("</body>", arm + "</body>")))
+    mechanism = srm.load(path)
+    assert mechanism.joint_names == ("root_joint", "j")
+    theirs = mujoco.MjModel.from_xml_string(path.read_text())
+    state = mujoco.MjData(theirs)
+    mujoco.mj_forward(theirs, state)
+    data = mechanism.model.createData()
+    pin.framesForwardKinematics(mechanism.model, data, mechanism.q0)
+    for i, name in ((1, "base"), (2, "arm")):
+        found = data.oMf[mechanism.model.getFrameId(name, pin.FrameType.BODY)]
+        np.testing.assert_allclose(found.translation, state.xpos[i], atol=1e-14)
+        np.testing.assert_allclose(found.rotation.ravel(), state.xmat[i], atol=1e-14)

@@ -131,13 +131,16 @@ class EqualityReader:
             return
         first = self._body(given, "body1", where)
         second = self._body(given, "body2", where, WORLD)
-        relative = self.tree.placements[first].actInv(self.tree.placements[second])
+        at = pin.SE3(np.eye(3), self.values.get(given, "anchor", 3, "0 0 0", where))
         pose = self.values.get(given, "relpose", 7, "0 1 0 0 0 0 0", where)
         if pose[3:].any():
+            # MuJoCo holds the anchor, not body2's origin, at the position of relpose.
             w, x, y, z = self.values.direction(pose[3:], where, "the quaternion of relpose")
-            relative = pin.SE3(pin.Quaternion(w, x, y, z).matrix(), pose[:3])
-        at = pin.SE3(np.eye(3), self.values.get(given, "anchor", 3, "0 0 0", where))
-        self._close(name, "frame", (first, relative * at), (second, at), where)
+            in_first = pin.SE3(pin.Quaternion(w, x, y, z).matrix(), pose[:3])
+        else:
+            placements = self.tree.placements
+            in_first = placements[first].actInv(placements[second]) * at
+        self._close(name, "frame", (first, in_first), (second, at), where)
 
     def _joint(self, name: str, given: dict[str, str], where: str) -> None:
         """q_1 - ref_1 = a_0 + a_1 (q_2 - ref_2) + ...; ours count from the references."""

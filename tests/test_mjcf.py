@@ -25,6 +25,12 @@ mujoco = pytest.importorskip("mujoco")
 FILES = {"tree": TREE, "four_bar": FOUR_BAR, "two_loops": TWO_LOOPS}
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo writes its warnings to a file where it runs."""
+    monkeypatch.chdir(tmp_path)
+
+
 class Twins:
     """The translated file and MuJoCo's model, in the same state."""
 

@@ -110,9 +110,8 @@ def test_workspaces_of_large_trees_hold_no_second_derivatives() -> None:
         parent = model.addJoint(parent, pin.JointModelRY(), along_x(1.0 if i else 0.0), f"j{i}")
         model.appendBodyToJoint(parent, rod(), pin.SE3.Identity())
     system = make_system(srm.Mechanism(model))
-    # What a workspace gives back stays with the process until the next one takes it.
-    kept = [kernel.compiled(system) for _ in range(3)]
     before = _resident()
-    kept += [kernel.compiled(system) for _ in range(4)]
-    assert _resident() - before < 40.0
+    kept = [kernel.compiled(system) for _ in range(6)]
+    # What one gives back may stay with the process until the next one takes it: once, not six times.
+    assert _resident() - before < 2.5 * 86.0
     assert np.isfinite(kept[0].terms(0.0, np.zeros(2 * model.nv))["rate"]).all()

@@ -120,11 +120,11 @@ class _LoopRows:
         return {
             "joint_a": self.joint_a,
             "joint_b": self.joint_b,
-            "in_a": placement_numbers(self.in_a),
-            "in_b": placement_numbers(self.in_b),
-            "directions": np.ascontiguousarray(self.directions, dtype=float).ravel(),
+            "at_a": np.array(self._at_a),
+            "at_b": np.array(self._at_b),
+            "directions": np.array(self._d, dtype=float).ravel(),
             "distances": np.array(self._distances, dtype=float).ravel(),
-            "alignments": np.array([np.concatenate(pair) for pair in self.alignments]).ravel(),
+            "alignments": np.array(self._un, dtype=float).ravel(),
             "support": self.support,
             "first_row": self.first_row,
         }

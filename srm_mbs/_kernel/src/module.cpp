@@ -210,9 +210,9 @@ struct PySystem {
             LoopRows rows;
             rows.joint_a = whole(loop, "joint_a");
             rows.joint_b = whole(loop, "joint_b");
-            const std::vector<double> a = vector_of(loop["in_a"]), b = vector_of(loop["in_b"]);
-            std::copy_n(a.begin(), 12, rows.in_a);
-            std::copy_n(b.begin(), 12, rows.in_b);
+            const std::vector<double> a = vector_of(loop["at_a"]), b = vector_of(loop["at_b"]);
+            std::copy_n(a.begin(), 3, rows.at_a);
+            std::copy_n(b.begin(), 3, rows.at_b);
             rows.directions = vector_of(loop["directions"]);
             rows.distances = vector_of(loop["distances"]);
             rows.alignments = vector_of(loop["alignments"]);

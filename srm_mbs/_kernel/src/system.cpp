@@ -18,14 +18,29 @@
 
 namespace srm {
 
-using pinocchio::Motion;
-using pinocchio::SE3;
 using pinocchio_model::Argument;
-using pinocchio_model::placement;
 
 namespace {
 
 constexpr double overflow = 1e100;
+
+// Where a joint is in the world; its velocity and bias acceleration (with -gravity) in its own axes.
+struct Body {
+    Body(const pinocchio::Data& data, int joint)
+        : rotation(data.oMi[joint].rotation().data()),
+          origin_(data.oMi[joint].translation().data()),
+          velocity_(data.v[joint].toVector().data()),
+          bias_(data.a_gf[joint].toVector().data()) {}
+    Vec origin() const { return vec(origin_); }
+    Vec velocity() const { return vec(velocity_); }
+    Vec spin() const { return vec(velocity_ + 3); }
+    Vec bias() const { return vec(bias_); }
+    Vec spin_bias() const { return vec(bias_ + 3); }
+    const double* const rotation;
+
+private:
+    const double *const origin_, *const velocity_, *const bias_;
+};
 
 double distance(const double* x, int n) {
     double sum = 0.0;
@@ -83,7 +98,10 @@ bool System::held() const { return closed_ && projection_->held; }
 
 // All rows: g, Gdot v, and G into the columns of the projection.
 void System::update_loops(const double* q, bool with_bias) {
-    for (const LoopRows& loop : data_.loops) update_anchored(loop, with_bias);
+    for (const LoopRows& loop : data_.loops) {
+        if (!loop.directions.empty() || !loop.distances.empty()) update_positions(loop, with_bias);
+        if (!loop.alignments.empty()) update_alignments(loop, with_bias);
+    }
     for (const JointRow& joints : data_.joint_rows) {
         double* const out = projection_->column(joints.row);
         double g = -joints.offset;
@@ -96,84 +114,83 @@ void System::update_loops(const double* q, bool with_bias) {
     }
 }
 
-// The rows of a closure between anchors.
-void System::update_anchored(const LoopRows& loop, bool with_bias) {
-    const auto& data = work_->data;
-    const double* J = data.J.data();
-    const int ja = loop.joint_a, jb = loop.joint_b;
-    const SE3 in_a = placement(loop.in_a), in_b = placement(loop.in_b);
-    const SE3 Ta = ja ? data.oMi[ja] * in_a : in_a;
-    const SE3 Tb = jb ? data.oMi[jb] * in_b : in_b;
-    const SE3 H(Tb.rotation(), Ta.translation());
-    Motion W, B;
+// A row of G = (force, moment) J.
+void System::fill(const LoopRows& loop, int row, const Vec& force, const Vec& moment) {
+    const double* J = work_->data.J.data();
+    double* const out = projection_->column(row);
+    for (std::size_t k = 0; k < loop.columns.size(); ++k) {
+        const int j = loop.columns[k];
+        const double* column = J + 6 * j;
+        out[j] = loop.signs[k] * (dot(force, vec(column)) + dot(moment, vec(column + 3)));
+    }
+}
+
+// Twin of _LoopRows._positions.
+void System::update_positions(const LoopRows& loop, bool with_bias) {
+    const Body a(work_->data, loop.joint_a), b(work_->data, loop.joint_b);
+    const bool ground = loop.joint_b == 0;
+    const Vec at_a = vec(loop.at_a);
+    const Vec x = to_world(a.rotation, at_a) + a.origin();
+    const Vec at_b = ground ? x : from_world(b.rotation, x - b.origin());
+    Vec r{}, bias{};
     if (with_bias) {
-        // a_gf carries -gravity on every body and on the ground: it cancels here.
-        if (jb == 0) {
-            W = H.actInv(data.oMi[ja].act(data.v[ja]));
-            B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.a_gf[0]);
+        const Vec speed = a.velocity() + cross(a.spin(), at_a);
+        bias = a.bias() + cross(a.spin_bias(), at_a) + cross(a.spin(), speed);
+        bias = to_world(a.rotation, bias);
+        r = to_world(a.rotation, speed);
+        if (ground) {
+            bias = bias - b.bias();  // the ground's is -gravity, as in every body's
         } else {
-            const Motion Va = data.oMi[ja].act(data.v[ja]), Vb = data.oMi[jb].act(data.v[jb]);
-            W = H.actInv(Va - Vb);
-            B = H.actInv(data.oMi[ja].act(data.a_gf[ja]) - data.oMi[jb].act(data.a_gf[jb]) -
-                         Vb.cross(Va));
+            const Vec seen = from_world(b.rotation, r);
+            const Vec carried = b.velocity() + cross(b.spin(), at_b);
+            // omega_b x (carried + 2 r), r = seen - carried
+            const Vec twice = 2.0 * seen - carried;
+            r = seen - carried;
+            bias = from_world(b.rotation, bias) -
+                   (b.bias() + cross(b.spin_bias(), at_b) + cross(b.spin(), twice));
         }
     }
+    const Vec p = at_b - vec(loop.at_b);
     int row = loop.first_row;
-    const auto fill = [&](int row, const double* a) {
-        double* const out = projection_->column(row);
-        for (std::size_t k = 0; k < loop.columns.size(); ++k) {
-            const int j = loop.columns[k];
-            const double* column = J + 6 * j;
-            out[j] = loop.signs[k] *
-                     (a[0] * column[0] + a[1] * column[1] + a[2] * column[2] +
-                      a[3] * column[3] + a[4] * column[4] + a[5] * column[5]);
-        }
+    const auto along = [&](const Vec& d, double g, double rate) {
+        const Vec e = ground ? d : to_world(b.rotation, d);
+        fill(loop, row, e, cross(x, e));
+        g_[row] = g;
+        if (with_bias) bias_[row] = rate;
+        ++row;
     };
-    // A row whose rate is d times the velocity of a's origin, d in b's axes.
-    const auto fill_along = [&](int row, const Eigen::Vector3d& d) {
-        Eigen::Matrix<double, 6, 1> a;
-        a.head<3>() = H.rotation() * d;
-        a.tail<3>() = H.translation().cross(a.head<3>());
-        fill(row, a.data());
-    };
-    if (!loop.directions.empty() || !loop.distances.empty()) {
-        const Eigen::Vector3d p = Tb.actInv(Ta.translation());
-        Eigen::Vector3d acceleration = Eigen::Vector3d::Zero();
-        if (with_bias) acceleration = B.linear() + W.angular().cross(W.linear());
-        for (std::size_t k = 0; k < loop.directions.size(); k += 3, ++row) {
-            const Eigen::Map<const Eigen::Vector3d> d(&loop.directions[k]);
-            g_[row] = d.dot(p);
-            if (with_bias) bias_[row] = d.dot(acceleration);
-            fill_along(row, d);
-        }
-        for (std::size_t k = 0; k < loop.distances.size(); k += 2, ++row) {
-            const double length = loop.distances[k], factor = loop.distances[k + 1];
-            const double apart = p.norm();
-            if (apart < data_.coincident * length) throw EvaluationError{Failure::coincident};
-            const Eigen::Vector3d d = p / apart;
-            g_[row] = factor * (apart - length);
-            if (with_bias)
-                bias_[row] = factor * (d.dot(acceleration) +
-                                       d.cross(W.linear()).squaredNorm() / apart);
-            fill_along(row, factor * d);
-        }
+    for (std::size_t k = 0; k < loop.directions.size(); k += 3) {
+        const Vec d = vec(&loop.directions[k]);
+        along(d, dot(d, p), dot(d, bias));
     }
-    if (!loop.alignments.empty()) {
-        const Eigen::Matrix3d R = Tb.rotation().transpose() * Ta.rotation();
-        for (std::size_t k = 0; k < loop.alignments.size(); k += 6, ++row) {
-            const Eigen::Map<const Eigen::Vector3d> u(&loop.alignments[k]);
-            const Eigen::Map<const Eigen::Vector3d> n(&loop.alignments[k + 3]);
-            const Eigen::Vector3d m = R * u;
-            g_[row] = n.dot(m);
-            if (with_bias) {
-                const Eigen::Vector3d w = W.angular();
-                bias_[row] = n.dot(B.angular().cross(m) + w.cross(w.cross(m)));
-            }
-            Eigen::Matrix<double, 6, 1> a;
-            a.head<3>().setZero();
-            a.tail<3>() = H.rotation() * m.cross(n);
-            fill(row, a.data());
-        }
+    for (std::size_t k = 0; k < loop.distances.size(); k += 2) {
+        const double length = loop.distances[k], factor = loop.distances[k + 1];
+        const double apart = std::sqrt(dot(p, p));
+        if (apart < data_.coincident * length) throw EvaluationError{Failure::coincident};
+        const double by = factor / apart;
+        const Vec d = by * p, across = cross(d, r);
+        along(d, factor * (apart - length),
+              dot(d, bias) + dot(across, across) / (by * (apart * apart)));
+    }
+}
+
+// Twin of _LoopRows._alignments.
+void System::update_alignments(const LoopRows& loop, bool with_bias) {
+    const Body a(work_->data, loop.joint_a), b(work_->data, loop.joint_b);
+    const auto seen = [&](const Vec& v) { return from_world(b.rotation, to_world(a.rotation, v)); };
+    Vec w{}, bias{};
+    if (with_bias) {
+        const Vec carried = b.spin(), spin = seen(a.spin());
+        w = spin - carried;
+        bias = seen(a.spin_bias()) - b.spin_bias() - cross(carried, spin);
+    }
+    const std::size_t before = loop.directions.size() / 3 + loop.distances.size() / 2;
+    int row = loop.first_row + static_cast<int>(before);
+    for (std::size_t k = 0; k < loop.alignments.size(); k += 6, ++row) {
+        const Vec m = seen(vec(&loop.alignments[k])), n = vec(&loop.alignments[k + 3]);
+        fill(loop, row, Vec{}, to_world(b.rotation, cross(m, n)));
+        g_[row] = dot(n, m);
+        if (with_bias) bias_[row] = dot(n, cross(bias, m) + cross(w, cross(w, m)));
     }
 }
 

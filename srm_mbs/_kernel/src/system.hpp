@@ -16,13 +16,14 @@
 #include "forces.hpp"
 #include "history.hpp"
 #include "projection.hpp"
+#include "vectors.hpp"
 
 namespace srm {
 
 // Kept, scaled rows of one closure.
 struct LoopRows {
     int joint_a, joint_b;
-    double in_a[12], in_b[12];  // placements: rotation (3, 3) row-major, translation
+    double at_a[3], at_b[3];              // the anchors' origins, like all in the axes of the joints
     std::vector<double> directions;       // (k, 3)
     std::vector<double> distances;        // (l, 2): length, factor of the row
     std::vector<double> alignments;       // (l, 6): u in a, n in b
@@ -116,7 +117,9 @@ public:
 private:
     Pattern pattern() const;
     void update_loops(const double* q, bool with_bias);
-    void update_anchored(const LoopRows& loop, bool with_bias);
+    void update_positions(const LoopRows& loop, bool with_bias);
+    void update_alignments(const LoopRows& loop, bool with_bias);
+    void fill(const LoopRows& loop, int row, const Vec& force, const Vec& moment);
     void completed(const double* white, double* out) const;
     const double* held_force(double t) const;
 

@@ -7,27 +7,34 @@ Exit status: 0; 1 when a run did not reach its end; 2 for bad input.
 from __future__ import annotations
 
 import logging
-import os
 import re
 import subprocess
 import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import srm_mbs
-from srm_mbs.errors import InputError, SrmError, SrmWarning
+from srm_mbs import cli_analysis
+from srm_mbs.cli_output import (
+    BAD_INPUT,
+    RUN_FAILED,
+    Lines,
+    Model,
+    check_output,
+    reported,
+    table,
+    write_files,
+)
+from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
     from srm_mbs.solution import Solution
 
-RUN_FAILED, BAD_INPUT = 1, 2
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
 
@@ -42,14 +49,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Model = Annotated[
-    str,
-    typer.Argument(
-        metavar="MODEL",
-        help="A bundled mechanism (see 'srm-mbs models'), or a file: a .toml description, or "
-        "another format, found out by its content (docs/formats.md).",
-    ),
-]
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
 ]
@@ -64,108 +63,6 @@ Video = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Write a film of the run; the suffix is .gif or .mp4."),
 ]
-
-
-# -- what is printed, and where ---------------------------------------------------------------
-
-
-def _say(kind: str, text: object) -> None:
-    """One unwrapped line on standard error."""
-    typer.echo(f"{kind}: {' '.join(str(text).split())}", err=True)
-
-
-class _Lines(logging.Handler):
-    """Log records as lines like those of errors and warnings."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        _say(record.levelname.lower(), record.getMessage())
-
-
-@contextmanager
-def _reported() -> Iterator[None]:
-    """Warnings and expected errors of a command as single lines, the latter with status 2."""
-
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        _say("warning", message)
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", SrmWarning)
-            warnings.showwarning = show
-            yield
-    except BrokenPipeError:
-        raise  # the reader of a pipe has gone: typer ends quietly
-    except SrmError as error:
-        _say("error", error)
-        raise typer.Exit(BAD_INPUT) from error
-    except OSError as error:
-        _say("error", _os_problem(error))
-        raise typer.Exit(BAD_INPUT) from error
-
-
-def _os_problem(error: OSError) -> str:
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}"
-
-
-def _table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
-    """Aligned columns on standard output; wrapped on a terminal, never in a pipe."""
-    from rich.console import Console
-    from rich.table import Table
-
-    names = tuple(header)
-    table = Table(*names, box=None, show_header=bool(names), pad_edge=False, padding=(0, 2, 0, 0))
-    for row in rows:
-        table.add_row(*row)
-    # No markup: "[0]" in a name is text.
-    width = None if sys.stdout.isatty() else 10_000
-    console = Console(width=width, markup=False, emoji=False, highlight=False)
-    with console.capture() as captured:
-        console.print(table)
-    # rich fills the last column with spaces
-    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
-
-
-# -- output files -----------------------------------------------------------------------------
-
-
-def _check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse, before a long run, a file that could not be written after it."""
-    problem = remedy = None
-    folder = path.parent
-    if path.suffix.lower() not in suffixes:
-        problem = f"the suffix {path.suffix!r} is not known here"
-        remedy = f"Use {' or '.join(suffixes)}"
-    elif not folder.is_dir():
-        problem, remedy = f"there is no folder {str(folder)!r}", "Make it first"
-    elif path.is_dir():
-        problem, remedy = "it is a folder", "Give a file name"
-    elif not os.access(path if path.exists() else folder, os.W_OK):
-        problem, remedy = "it cannot be written", "Check its permissions"
-    if problem:
-        raise InputError(problem, file=str(path), element=option, remedy=remedy)
-
-
-def _write(
-    files: Iterable[tuple[Path | None, Callable[[Path], object]]],
-) -> tuple[list[Path], bool]:
-    """Write each file that is asked for; one that fails does not keep the others from it."""
-    written, failed = [], False
-    for path, write in files:
-        if path is None:
-            continue
-        try:
-            write(path)
-        except (OSError, SrmError) as error:
-            text = _os_problem(error) if isinstance(error, OSError) else str(error)
-            _say("error", f"{path}: {text.removeprefix(f'{path}: ')}")
-            failed = True
-        else:
-            written.append(path)
-    return written, failed
-
-
-# -- commands ---------------------------------------------------------------------------------
 
 
 def _print_version(wanted: bool) -> None:
@@ -188,7 +85,7 @@ def _global_options(
     ] = False,
 ) -> None:
     logger = logging.getLogger("srm_mbs")
-    level, handler = logger.level, _Lines()
+    level, handler = logger.level, Lines()
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
 
@@ -200,7 +97,7 @@ def _global_options(
 
 
 @app.command()
-@_reported()
+@reported()
 def simulate(
     model: Model,
     t_end: Annotated[
@@ -255,6 +152,9 @@ def simulate(
     image: Image = None,
     at: At = None,
     video: Video = None,
+    balance: Annotated[
+        bool, typer.Option("--balance", help="Print the energy balance of the run.")
+    ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
@@ -265,15 +165,15 @@ def simulate(
     from srm_mbs.summary import run_rows
 
     if out is not None:
-        _check_output(out, "--out", (".npz",))
+        check_output(out, "--out", (".npz",))
     if plot is not None:
         from srm_mbs.plots import FORMATS
 
-        _check_output(plot, "--plot", FORMATS)
+        check_output(plot, "--plot", FORMATS)
     if csv is not None:
-        _check_output(csv, "--csv", (".csv",))
+        check_output(csv, "--csv", (".csv",))
     if html is not None:
-        _check_output(html, "--html", (".html", ".htm"))
+        check_output(html, "--html", (".html", ".htm"))
     _check_pictures(image, video)
 
     mechanism = srm_mbs.load(model)
@@ -289,7 +189,7 @@ def simulate(
         progress=True,
         backend=backend,
     )
-    written, failed = _write(
+    written, failed = write_files(
         [
             (out, solution.save),
             (plot, solution.plot),
@@ -299,7 +199,11 @@ def simulate(
             (video, solution.export_video),
         ]
     )
-    _table([*run_rows(solution), *(("written", str(path)) for path in written)])
+    table([*run_rows(solution), *(("written", str(path)) for path in written)])
+    if balance:
+        from srm_mbs.findings import balance_rows
+
+        table(balance_rows(solution.energy_balance))
     typer.echo(solution.message, err=not solution.success)
     if play:
         _play(solution)
@@ -313,9 +217,9 @@ def _check_pictures(image: Path | None, video: Path | None) -> None:
     from srm_mbs.rendering import FILMS
 
     if image is not None:
-        _check_output(image, "--image", (".png",))
+        check_output(image, "--image", (".png",))
     if video is not None:
-        _check_output(video, "--video", FILMS)
+        check_output(video, "--video", FILMS)
 
 
 def _first(*values: float | None) -> float:
@@ -324,7 +228,7 @@ def _first(*values: float | None) -> float:
 
 
 @app.command()
-@_reported()
+@reported()
 def convert(
     model: Model,
     out: Annotated[
@@ -347,7 +251,7 @@ def convert(
 
 
 @app.command()
-@_reported()
+@reported()
 def info(model: Model) -> None:
     """Print degrees of freedom, joints, loops and force elements of a mechanism.
 
@@ -356,15 +260,15 @@ def info(model: Model) -> None:
     from srm_mbs.summary import force_rows, joint_rows, loop_rows, mechanism_rows
 
     mechanism = srm_mbs.load(model)
-    _table(mechanism_rows(mechanism))
+    table(mechanism_rows(mechanism))
     typer.echo()
-    _table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
+    table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
     if mechanism.loops:
         typer.echo()
-        _table(loop_rows(mechanism), ("loop", "type", "a", "b", "gap at the start"))
+        table(loop_rows(mechanism), ("loop", "type", "a", "b", "gap at the start"))
     if mechanism.forces:
         typer.echo()
-        _table(force_rows(mechanism), ("force", "type", "acts on", "values"))
+        table(force_rows(mechanism), ("force", "type", "acts on", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
     from srm_mbs._kernel import missing
 
@@ -377,13 +281,13 @@ def info(model: Model) -> None:
 
 
 @app.command()
-@_reported()
+@reported()
 def models() -> None:
     """List the mechanisms that come with the package."""
     from srm_mbs.loading.bundled import models_folder
 
     folder = models_folder()
-    _table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
+    table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
     typer.echo("n_four_bar_<N> is made for any N up to 300.")
 
 
@@ -397,7 +301,7 @@ def _first_sentence(path: Path) -> str:
 
 
 @app.command()
-@_reported()
+@reported()
 def play(run: Run, image: Image = None, at: At = None, video: Video = None) -> None:
     """Play a saved run in the browser; with --image or --video, write these instead."""
     _check_pictures(image, video)
@@ -405,7 +309,7 @@ def play(run: Run, image: Image = None, at: At = None, video: Video = None) -> N
     if image is None and video is None:
         _play(solution)
         return
-    written, failed = _write(
+    written, failed = write_files(
         [(image, partial(solution.export_image, t=at)), (video, solution.export_video)]
     )
     for path in written:
@@ -423,7 +327,7 @@ def _play(solution: Solution) -> None:
 
 
 @app.command()
-@_reported()
+@reported()
 def plot(
     run: Run,
     out: Annotated[
@@ -439,7 +343,7 @@ def plot(
 
     solution = srm_mbs.load_solution(run)
     path = run.with_suffix(".png") if out is None else out
-    _check_output(path, "--out", FORMATS)
+    check_output(path, "--out", FORMATS)
     solution.plot(path)
     typer.echo(f"written: {path}")
 
@@ -449,7 +353,7 @@ def plot(
     options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...]",
     add_help_option=False,
 )
-@_reported()
+@reported()
 def benchmark(context: typer.Context) -> None:
     """Measure run time against error beside other simulators (in a checkout only).
 
@@ -471,6 +375,15 @@ def benchmark(context: typer.Context) -> None:
     status = subprocess.run(command, check=False).returncode
     if status:
         raise typer.Exit(status)
+
+
+for command in (
+    cli_analysis.modes,
+    cli_analysis.equilibrium,
+    cli_analysis.linearise,
+    cli_analysis.drag,
+):
+    app.command()(command)
 
 
 def main() -> None:

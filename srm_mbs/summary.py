@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
+from srm_mbs.arrays import FloatArray
+from srm_mbs.coordinates import position_of
 from srm_mbs.kernel import backend
 from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
 from srm_mbs.solution import Solution
@@ -77,16 +80,27 @@ def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
     """(name, type, initial position, initial rate) of each moving joint."""
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
-        short = joint.shortname().removeprefix("JointModel")
-        kind = JOINT_TYPES.get(short, short)
-        q = mechanism.q0[joint.idx_q : joint.idx_q + joint.nq]
+        kind = _kind(joint)
         v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
-        if joint.nv > 1:
-            yield name, kind, _vector(q), _vector(v)
-            continue
-        unit = "m" if kind.startswith("prismatic") else "rad"
-        position = q[0] if joint.nq == 1 else np.arctan2(q[1], q[0])
-        yield name, kind, f"{position:.6g} {unit}", f"{v[0]:.6g} {unit}/s"
+        rate = f"{v[0]:.6g} {_unit(kind)}/s" if joint.nv == 1 else _vector(v)
+        yield name, kind, position_text(mechanism, name, mechanism.q0), rate
+
+
+def position_text(mechanism: Mechanism, name: str, q: FloatArray) -> str:
+    """Position of the joint ``name`` in q (nq,), with its unit where it has one degree."""
+    joint = mechanism.joint(name)
+    if joint.nv > 1:
+        return _vector(q[joint.idx_q : joint.idx_q + joint.nq])
+    return f"{position_of(mechanism, q, name):.6g} {_unit(_kind(joint))}"
+
+
+def _kind(joint: Any) -> str:
+    short = str(joint.shortname()).removeprefix("JointModel")
+    return JOINT_TYPES.get(short, short)
+
+
+def _unit(kind: str) -> str:
+    return "m" if kind.startswith("prismatic") else "rad"
 
 
 def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:

@@ -32,6 +32,9 @@ LAYERS = (
     ("simulator", "stepwise"),
     ("analysis",),
     ("plots", "visuals", "scene", "playback", "rendering", "summary", "export"),
+    ("findings",),
+    ("cli_output",),
+    ("cli_analysis",),
     ("cli",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -149,9 +149,14 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
 
     singular = tuple(PathPoint(named(met.values), met.q, met.loops) for met in found.met)
     limit = None if found.complete else PathPoint(named(found.values[-1]), found.path[-1])
+    reached = found.q[1:].copy()
+    for k, name in enumerate(values):  # exactly as given
+        joint = mechanism.joint(name)
+        if joint.nq == 1:
+            reached[:, joint.idx_q] = wanted[: len(reached), k]
     return FollowedPath(
         mechanism,
-        found.q[1:],
+        reached,
         found.complete,
         limit,
         singular,

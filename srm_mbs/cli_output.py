@@ -1,0 +1,122 @@
+"""What commands print and where, the files they write, and their exit status."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from srm_mbs.errors import InputError, SrmError, SrmWarning
+
+RUN_FAILED, BAD_INPUT = 1, 2
+Model = Annotated[
+    str,
+    typer.Argument(
+        metavar="MODEL",
+        help="A bundled mechanism (see 'srm-mbs models'), or a file: a .toml description, or "
+        "another format, found out by its content (docs/formats.md).",
+    ),
+]
+
+
+def say(kind: str, text: object) -> None:
+    """One unwrapped line on standard error."""
+    typer.echo(f"{kind}: {' '.join(str(text).split())}", err=True)
+
+
+class Lines(logging.Handler):
+    """Log records as lines like those of errors and warnings."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(record.levelname.lower(), record.getMessage())
+
+
+@contextmanager
+def reported() -> Iterator[None]:
+    """Warnings and expected errors of a command as single lines, the latter with status 2."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        say("warning", message)
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", SrmWarning)
+            warnings.showwarning = show
+            yield
+    except BrokenPipeError:
+        raise  # the reader of a pipe has gone: typer ends quietly
+    except SrmError as error:
+        say("error", error)
+        raise typer.Exit(BAD_INPUT) from error
+    except OSError as error:
+        say("error", os_problem(error))
+        raise typer.Exit(BAD_INPUT) from error
+
+
+def os_problem(error: OSError) -> str:
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"
+
+
+def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
+    """Aligned columns on standard output; wrapped on a terminal, never in a pipe."""
+    from rich.console import Console
+    from rich.table import Table
+
+    names = tuple(header)
+    grid = Table(*names, box=None, show_header=bool(names), pad_edge=False, padding=(0, 2, 0, 0))
+    for row in rows:
+        grid.add_row(*row)
+    # No markup: "[0]" in a name is text.
+    width = None if sys.stdout.isatty() else 10_000
+    console = Console(width=width, markup=False, emoji=False, highlight=False)
+    with console.capture() as captured:
+        console.print(grid)
+    # rich fills the last column with spaces
+    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+# -- output files -----------------------------------------------------------------------------
+
+
+def check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
+    """Refuse, before a long run, a file that could not be written after it."""
+    problem = remedy = None
+    folder = path.parent
+    if path.suffix.lower() not in suffixes:
+        problem = f"the suffix {path.suffix!r} is not known here"
+        remedy = f"Use {' or '.join(suffixes)}"
+    elif not folder.is_dir():
+        problem, remedy = f"there is no folder {str(folder)!r}", "Make it first"
+    elif path.is_dir():
+        problem, remedy = "it is a folder", "Give a file name"
+    elif not os.access(path if path.exists() else folder, os.W_OK):
+        problem, remedy = "it cannot be written", "Check its permissions"
+    if problem:
+        raise InputError(problem, file=str(path), element=option, remedy=remedy)
+
+
+def write_files(
+    files: Iterable[tuple[Path | None, Callable[[Path], object]]],
+) -> tuple[list[Path], bool]:
+    """Write each file that is asked for; one that fails does not keep the others from it."""
+    written, failed = [], False
+    for path, write in files:
+        if path is None:
+            continue
+        try:
+            write(path)
+        except (OSError, SrmError) as error:
+            text = os_problem(error) if isinstance(error, OSError) else str(error)
+            say("error", f"{path}: {text.removeprefix(f'{path}: ')}")
+            failed = True
+        else:
+            written.append(path)
+    return written, failed

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
     from srm_mbs.dae import DaeSolution, solve_dae
+    from srm_mbs.drives import Drive
     from srm_mbs.errors import (
         AnalysisError,
         AssemblyError,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
         Wrench,
     )
     from srm_mbs.kernel import backend
+    from srm_mbs.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
     from srm_mbs.loading import bundled_models, load, n_four_bar
     from srm_mbs.loading.converting import convert
     from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure, Mechanism
@@ -61,7 +63,9 @@ _HOME = {
     "Bushing": "forces",
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
+    "ConstantSpeed": "laws",
     "DaeSolution": "dae",
+    "Drive": "drives",
     "EnergyBalance": "analysis.energy_balance",
     "Equilibrium": "analysis.equilibrium",
     "FORCE_TYPES": "forces",
@@ -71,20 +75,25 @@ _HOME = {
     "InverseDynamics": "analysis.inverse_dynamics",
     "JointMotion": "motion",
     "JointTorque": "forces",
+    "LAW_TYPES": "laws",
     "Linearisation": "analysis.linearisation",
     "LoopClosure": "mechanism",
     "Mechanism": "mechanism",
+    "MinimumJerk": "laws",
     "MobilityMap": "analysis.mobility",
     "PSRM": "methods.psrm",
+    "Polynomial": "laws",
     "SRM": "methods.srm",
     "SemiExplicitDAE": "semi_explicit",
     "SimulationError": "errors",
     "Simulator": "simulator",
+    "Sine": "laws",
     "Solution": "solution",
     "SpringDamper": "forces",
     "SrmError": "errors",
     "SrmWarning": "errors",
     "TABLEAUS": "methods.tableaus",
+    "Table": "laws",
     "TorsionSpring": "forces",
     "Wrench": "forces",
     "assemble": "assembly",
@@ -107,6 +116,7 @@ _HOME = {
 __all__ = [
     "CLOSURE_TYPES",
     "FORCE_TYPES",
+    "LAW_TYPES",
     "PSRM",
     "SRM",
     "TABLEAUS",
@@ -117,7 +127,9 @@ __all__ = [
     "AssemblyMode",
     "Bushing",
     "ButcherTableau",
+    "ConstantSpeed",
     "DaeSolution",
+    "Drive",
     "EnergyBalance",
     "Equilibrium",
     "FollowedPath",
@@ -129,14 +141,18 @@ __all__ = [
     "Linearisation",
     "LoopClosure",
     "Mechanism",
+    "MinimumJerk",
     "MobilityMap",
+    "Polynomial",
     "SemiExplicitDAE",
     "SimulationError",
     "Simulator",
+    "Sine",
     "Solution",
     "SpringDamper",
     "SrmError",
     "SrmWarning",
+    "Table",
     "TorsionSpring",
     "Wrench",
     "assemble",

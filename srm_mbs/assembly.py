@@ -1,14 +1,14 @@
 r"""Consistent initial states: close the loops, then make the rates fit.
 
-Positions come from :mod:`srm_mbs.closing`.  Rates solve G v = 0.  Where the configuration is
-singular, that is not enough: a motion through it also has u^T (Gdot v) = 0 for every left null
-vector u of G (the tangents of the branches).
+Positions come from :mod:`srm_mbs.closing`.  Rates solve G v = s', the rates of the drives, 0 in
+the rows of the loops.  Where the configuration is singular, that is not enough: a motion through it
+also has u^T (Gdot v - s'') = 0 for every left null vector u of G (the tangents of the branches).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from srm_mbs.errors import AssemblyError, InputError
 from srm_mbs.joint_limits import beyond_limits, close_within_limits
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
+from srm_mbs.systems.driven import DriveRows
 from srm_mbs.systems.singular import (
     SINGULAR,
     SingularConfiguration,
@@ -33,8 +34,12 @@ RATE_TOLERANCE = 1e-12
 ROUNDING, LOOSEST = 1e-14, 1e-8
 """Closure error of q, which over the distance from a singular configuration is an error of G v, and
 the largest such error: the square root of round-off."""
+AT_REST = 1e-14
+"""Part of the given rates up to which what remains of them is rounding."""
 EXACTLY, NEARLY = 1e-12, 1e-3
 """Singular values of G, rows over their usual size, between which rates come from the branch."""
+CONTRADICTS = 1e-9
+"""Difference (rad, m) between a held position and where a drive begins."""
 CURVATURE = 1e-7
 """Largest u^T (Gdot v) of consistent rates, over the square of the rates."""
 
@@ -48,13 +53,13 @@ class Assembly:
     q : (nq,), v : (nv,)
         Configuration and velocity with closed loops and consistent rates.
     residuals : (rows,)
-        Closure errors left at q, m and rad.
+        Closure errors left at q, m and rad; those of the drives last.
     rate_residuals : (rows,)
-        G v left, m/s and rad/s.
+        G v - s' left, m/s and rad/s.
     free_directions : (nv, k)
-        Basis of the velocities that keep the loops closed at q, orthonormal when divided by the
-        units of the coordinates (1 rad, the scene diagonal).  More columns than degrees of
-        freedom: q is singular.
+        Basis of the velocities that keep the loops closed and the drives still at q, orthonormal
+        when divided by the units of the coordinates (1 rad, the scene diagonal).  More columns
+        than degrees of freedom: q is singular.
     singular : bool
         Whether the closures have lost rank at q against the mechanism's structural rank.
     """
@@ -88,30 +93,47 @@ def _positions(
 
 @dataclass(frozen=True, eq=False)
 class _Conditions:
-    """What the rates u (nv,), in units, of a motion satisfy: rows u = 0 and curvature(u) = 0."""
+    """What the rates u (nv,) of a motion, in units, satisfy: rows u = right, curvature(u) = 0."""
 
     rows: FloatArray
+    right: FloatArray
     curvature: Callable[[FloatArray], FloatArray]
 
 
-def _on_branch(limit: BranchLimit, unit: FloatArray) -> _Conditions:
+def _with_drives(
+    rows: FloatArray, drives: DriveRows, curvature: Callable[[FloatArray], FloatArray]
+) -> _Conditions:
+    """Those of the closures, rows u = 0, and of the drives."""
+    right = np.concatenate([np.zeros(len(rows)), drives.rates])
+    return _Conditions(np.concatenate([rows, drives.rows]), right, curvature)
+
+
+def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Conditions:
     """Those on one branch next to a singular configuration: the normal part vanishes."""
-    return _Conditions(limit.projector * unit / unit[:, None], lambda u: np.zeros(0))
+    normal = limit.projector * unit / unit[:, None]
+    return _with_drives(normal, drives, lambda u: np.zeros(0))
 
 
 def _conditions(
-    mechanism: Mechanism, problem: ClosureProblem, q: FloatArray
+    mechanism: Mechanism, problem: ClosureProblem, q: FloatArray, drives: DriveRows
 ) -> tuple[_Conditions, SingularConfiguration | None]:
     """The conditions at q, and the singular configuration so close to q that rates choose the
     branch and not q."""
     normalised = problem.normalised(q)
-    left, singular, _ = np.linalg.svd(normalised)
+    left, singular, _ = np.linalg.svd(np.concatenate([normalised, drives.rows]))
     left = left[:, int(np.sum(singular > SINGULAR)) :]
-    here = _Conditions(normalised, lambda u: left.T @ problem.bias(q, u))
+
+    def curvature(u: FloatArray) -> FloatArray:
+        bias = np.concatenate([problem.bias(q, u), drives.bias(u)])
+        out: FloatArray = left.T @ bias
+        return out
+
+    here = _with_drives(normalised, drives, curvature)
+    singular = np.linalg.svd(normalised, compute_uv=False)
     if not np.any((singular > EXACTLY) & (singular < NEARLY)):
         return here, None
     # G determines the rates to round-off over the square of the distance: use the branch.
-    rank = mechanism.structure.rank
+    rank = mechanism.structure.loop_rank
     found = nearest_singular(problem, q, rank, reach=10.0 * NEARLY)
     if found is None:
         return here, None
@@ -119,8 +141,8 @@ def _conditions(
     away = problem.difference(found, q)
     if np.linalg.norm(away) > TELLS_THE_BRANCH:
         limit = branch_limit(close, q, away)
-        return (here if limit is None else _on_branch(limit, problem.unit)), None
-    return _Conditions(problem.normalised(found), close.curvature), close
+        return (here if limit is None else _on_branch(limit, problem.unit, drives)), None
+    return _with_drives(problem.normalised(found), drives, close.curvature), close
 
 
 def _rates(
@@ -130,9 +152,14 @@ def _rates(
     v: FloatArray,
     held: tuple[str, ...],
 ) -> FloatArray:
+    drives = DriveRows(mechanism, problem, q)
     _, G = problem.closure(q)
-    singular = np.linalg.svd(G / problem.row_size[:, None], compute_uv=False)
-    conditions, close = _conditions(mechanism, problem, q)
+    G = np.concatenate([G, drives.rows])
+    asked = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
+    normalised = np.concatenate([problem.normalised(q), drives.rows])
+    singular = np.linalg.svd(normalised, compute_uv=False)
+    conditions, close = _conditions(mechanism, problem, q, drives)
+    fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
 
     def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
         """The rates nearest to u that satisfy the conditions; None if there are none."""
@@ -141,7 +168,9 @@ def _rates(
         inverse = np.linalg.pinv(to.rows[:, free], rcond=SINGULAR / max(s[:1].sum(), SINGULAR))
         u = u.copy()
         for _ in range(2):  # the second pass removes the rounding of the first
-            u[free] -= inverse @ (to.rows @ u)
+            u[free] -= inverse @ (to.rows @ u - to.right)
+        if np.abs(u).max() <= AT_REST * fastest:
+            u[:] = 0.0  # what is left is rounding, which has no direction
         return _onto_tangent(u, free, right[rank:].T, to.curvature)
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
@@ -150,18 +179,19 @@ def _rates(
         u = fit(v / problem.unit, free, conditions)
         if u is not None and close is not None:
             limit = branch_limit(close, q, u)
-            u = u if limit is None else fit(u, free, _on_branch(limit, problem.unit))
+            u = u if limit is None else fit(u, free, _on_branch(limit, problem.unit, drives))
         if u is None:
             start = v / problem.unit
-            linear = _Conditions(conditions.rows, lambda u: np.zeros(0))
+            linear = replace(conditions, curvature=lambda u: np.zeros(0))
             nearest = fit(start, free, linear)
-            return start, float(np.abs(G @ (start if nearest is None else nearest)).max()), False
-        return u, float(np.abs(G @ u).max()), True
+            closest = start if nearest is None else nearest
+            return start, float(np.abs(G @ closest - asked).max()), False
+        return u, float(np.abs(G @ u - asked).max()), True
 
     # Next to a singular configuration q lies off its branch by round-off over the distance.
     smallest = float(singular[singular > EXACTLY].min(initial=1.0))
     tolerance = max(RATE_TOLERANCE, min(ROUNDING / smallest, LOOSEST))
-    tolerance *= max(1.0, float(np.abs(v / problem.unit).max()))
+    tolerance *= max(1.0, fastest)
 
     def consistent(error: float, moves: bool) -> bool:
         return error <= tolerance and moves
@@ -172,13 +202,22 @@ def _rates(
     guilty = [
         name for name in held if consistent(*solve([h for h in held if h != name])[1:])
     ] or list(held)
-    if error > tolerance:
-        what = f"the held rates of {quoted(held)} contradict the closures (G v = {error:.2e})"
+    driven = quoted(drive.name for drive in mechanism.drives)
+    if error > tolerance and not held:
+        what = (
+            f"the drives ({driven}) contradict the closures, or each other "
+            f"(by {error:.2e} in units per second)"
+        )
+    elif error > tolerance:
+        against = f"the closures or the drives ({driven})" if driven else "the closures"
+        what = f"the held rates of {quoted(held)} contradict {against} (G v = {error:.2e})"
     elif held:
         what = f"no motion through this singular configuration has the rates of {quoted(held)}"
     else:
         what = "no motion through this singular configuration has rates close to these"
     remedy = f"Change or free one of {quoted(guilty)}" if guilty else "Give other rates"
+    if driven and not held:
+        remedy = "Change or remove a drive, or start where the motion can follow it"
     if np.any((singular > 1e-13) & (singular < 10.0 * SINGULAR)):
         remedy += (
             "; the held positions lie so close to a singular configuration that the rates are not "
@@ -227,6 +266,44 @@ def _onto_tangent(
         if closer and np.abs(found.fun).max() <= CURVATURE:
             best = found.x
     return None if best is None else bent(best)
+
+
+def _with_absolute_drives(
+    mechanism: Mechanism, start: FloatArray, held: tuple[str, ...]
+) -> tuple[tuple[str, ...], Mechanism]:
+    """Put what absolute drives begin with: joints into ``start`` and ``held``, points into the
+    loops of the mechanism.
+
+    Raises
+    ------
+    AssemblyError
+        If a held position contradicts a drive.
+    """
+    loops = list(mechanism.loops)
+    for drive in mechanism.drives:
+        if not drive.absolute:
+            continue
+        value = drive.curve(0.0)(0.0)[0]
+        if drive.joint is None:
+            loops.append(drive.frozen(value))
+            continue
+        wanted = start.copy()
+        set_position(mechanism, wanted, drive.joint, value)
+        if drive.joint in held and np.abs(wanted - start).max() > CONTRADICTS:
+            raise AssemblyError(
+                f"the held position of {drive.joint!r} contradicts the drive {drive.name!r}, "
+                f"which begins at {value:.6g}",
+                residuals={},
+                q=start,
+                held=(drive.joint,),
+                element="initial.q",
+                remedy="Free it, or remove absolute from the drive: its law then begins there",
+            )
+        start[:] = wanted
+        held = (*held, *(() if drive.joint in held else (drive.joint,)))
+    if len(loops) == len(mechanism.loops):
+        return held, mechanism
+    return held, replace(mechanism, loops=tuple(loops), drives=())
 
 
 def _vector(values: Any, size: int, what: str) -> FloatArray:
@@ -327,17 +404,23 @@ def assemble(
         held_rates = tuple(v)
     elif v is not None:
         rates = _vector(v, model.nv, "v")
-    if not mechanism.loops:
+    if not mechanism.constrained:
         return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
-    problem = ClosureProblem(mechanism, start)
-    closed = _positions(mechanism, problem, start, held, limits)
+    held, to_close = _with_absolute_drives(mechanism, start, held)
+    problem = ClosureProblem(to_close, start)
+    closed = start.copy()
+    if to_close.loops:
+        closed = _positions(to_close, problem, start, held, limits)
+    if to_close is not mechanism:
+        problem = ClosureProblem(mechanism, start)
     for name in held:  # moving a quaternion by nothing rounds it
         joint = mechanism.joint(name)
         own = slice(joint.idx_q, joint.idx_q + joint.nq)
         closed[own] = start[own]
     consistent = _rates(mechanism, problem, closed, rates, held_rates)
-    _, singular, right = np.linalg.svd(problem.normalised(closed))
-    residuals, rate_residuals = problem.rows.g.copy(), problem.rows.G @ consistent
+    drives = DriveRows(mechanism, problem, closed)
+    _, singular, right = np.linalg.svd(np.concatenate([problem.normalised(closed), drives.rows]))
+    residuals, rate_residuals = mechanism.with_state(closed, consistent).initial_errors
     rank = int(np.sum(singular > SINGULAR))
     return Assembly(
         closed,

@@ -257,7 +257,7 @@ def info(model: Model) -> None:
 
     With the rank of its closure rows, the rows that are redundant, and the start.
     """
-    from srm_mbs.summary import force_rows, joint_rows, loop_rows, mechanism_rows
+    from srm_mbs.summary import drive_rows, force_rows, joint_rows, loop_rows, mechanism_rows
 
     mechanism = srm_mbs.load(model)
     table(mechanism_rows(mechanism))
@@ -269,6 +269,9 @@ def info(model: Model) -> None:
     if mechanism.forces:
         typer.echo()
         table(force_rows(mechanism), ("force", "type", "acts on", "values"))
+    if mechanism.drives:
+        typer.echo()
+        table(drive_rows(mechanism), ("drive", "law", "moves", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
     from srm_mbs._kernel import missing
 

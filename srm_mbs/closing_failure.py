@@ -107,7 +107,7 @@ def _nearest(
         return None
     here = position_of(mechanism, closed, name)
     columns = joint_coordinates(mechanism, (name, *(other for other in held if other != name)))
-    rank = mechanism.structure.rank
+    rank = mechanism.structure.loop_rank
     if smallest_singular_value(problem, closed, rank) < CLOSE:
         return None
     basis, _ = tangent_basis(problem, closed, np.arange(problem.model.nv))

@@ -89,7 +89,7 @@ def _columns(solution: Solution) -> dict[str, FloatArray]:
         for i, component in enumerate(v_names):
             rates[f"{name}.{component}"] = solution.v[:, joint.idx_v + i]
     columns = {"t (s)": solution.t, **positions, **rates}
-    if mechanism.loops:
+    if mechanism.constrained:
         lengths, speeds = _drift_units(mechanism)
         columns[f"||g|| ({lengths})"], columns[f"||G v|| ({speeds})"] = solution.drift.T
     columns["energy (J)"] = solution.energy

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,6 +22,8 @@ from srm_mbs.errors import InputError
 from srm_mbs.loop_closure import LoopClosure
 
 if TYPE_CHECKING:
+    from srm_mbs.drives import Drive
+    from srm_mbs.laws import Curve
     from srm_mbs.systems.structure import Structure
 
 __all__ = [
@@ -155,6 +157,8 @@ class Mechanism:
         assembles it; from a ``pin.Model`` in hand use :func:`srm_mbs.assemble`.
     forces
         Force elements (:mod:`srm_mbs.forces`); names must be unique.
+    drives
+        Prescribed motions (:class:`srm_mbs.Drive`); names must be unique.
     friction_speed
         Speed (rad/s, m/s) over which joint friction changes its sign: it is 76 % of F there.  A
         joint held by friction creeps below it; small values make the equations stiff.
@@ -167,9 +171,9 @@ class Mechanism:
     Raises
     ------
     InputError
-        If names repeat, an anchor or the joint of a force or coupling is unknown or cannot take it,
-        a shape does not fit, the joints of the model are not in depth-first order, joint friction
-        is negative, or it has mimic joints, which this version does not simulate.
+        If names repeat, an anchor or the joint of a force, drive or coupling is unknown or cannot
+        take it, a shape does not fit, the joints of the model are not in depth-first order, joint
+        friction is negative, or it has mimic joints, which this version does not simulate.
     """
 
     model: pin.Model
@@ -177,6 +181,7 @@ class Mechanism:
     q0: FloatArray = None  # type: ignore[assignment]
     v0: FloatArray = None  # type: ignore[assignment]
     forces: tuple[ForceElement, ...] = ()
+    drives: tuple[Drive, ...] = ()
     friction_speed: float = FRICTION_SPEED
     name: str = ""
     source: Source | None = None
@@ -207,6 +212,10 @@ class Mechanism:
         _check_names("force", [force.name for force in self.forces])
         for force in self.forces:
             force.check(model)
+        set_(self, "drives", tuple(self.drives))
+        _check_names("drive", [drive.name for drive in self.drives])
+        for drive in self.drives:
+            drive.check(model)
         if not (np.isfinite(model.friction).all() and np.all(model.friction >= 0.0)):
             raise InputError(
                 "joint friction is negative or not finite",
@@ -222,15 +231,10 @@ class Mechanism:
             )
         set_(self, "friction_speed", speed)
 
-    def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
-        """Times (s) from ``t0`` to ``t_end`` at which a part of it that depends on time is not
-        smooth: knots of tables, switches of drives.  Runs take no step across them."""
-        return ()
-
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
         changed = copy(self)
-        for kept in ("initial_errors", "_of_start", "structure"):
+        for kept in ("initial_errors", "drive_curves", "_of_start", "structure"):
             changed.__dict__.pop(kept, None)
         changed._take_start(q0, v0)
         if "structure" in self.__dict__:
@@ -286,15 +290,71 @@ class Mechanism:
 
     @cached_property
     def initial_errors(self) -> tuple[FloatArray, FloatArray]:
-        """Closure errors g and G v (rows,) at the initial state, in m and rad, and per second."""
-        from srm_mbs.systems.loops import all_rows, closure_errors
+        """g - s and G v - s' (rows,) at the initial state, in m and rad, and per second."""
+        from srm_mbs.systems.driven import constraint_errors
 
-        g, c = closure_errors(self.model, self.loops, self.q0[None], self.v0[None], all_rows(self))
+        g, c = constraint_errors(self, np.zeros(1), self.q0[None], self.v0[None])
         return g[0], c[0]
 
     @property
+    def constrained(self) -> bool:
+        """Whether it has loops or drives."""
+        return bool(self.loops or self.drives)
+
+    @property
+    def undriven(self) -> Mechanism:
+        """The same mechanism without its drives."""
+        return replace(self, drives=()) if self.drives else self
+
+    def refuse_drives(self, what: str) -> None:
+        """Refuse ``what`` of a mechanism whose motion drives prescribe.
+
+        Raises
+        ------
+        InputError
+            If there are any.
+        """
+        if self.drives:
+            raise InputError(
+                f"drives prescribe the motion: {what} would need them at rest",
+                element="drives",
+                remedy="Take mechanism.undriven, and hold or actuate its joints instead",
+            )
+
+    @cached_property
+    def drive_curves(self) -> dict[str, Curve]:
+        """The driven coordinate (rad, m) of each drive over time, from where q0 has it."""
+        from srm_mbs.drives import positions
+
+        starts = positions(self.model, self.drives, self.q0)
+        return {drive.name: drive.curve(starts[drive.name]) for drive in self.drives}
+
+    def check_covers(self, t_end: float) -> None:
+        """Refuse a run to ``t_end`` (s) that is longer than a table.
+
+        Raises
+        ------
+        InputError
+            Naming what has the table.
+        """
+        for drive in self.drives:
+            last = drive.law.span[1]
+            if last < t_end:
+                raise InputError(
+                    f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
+                    element=f"drive {drive.name!r}",
+                    remedy="Continue the table, or end the run earlier",
+                )
+
+    def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
+        """Times (s) between ``t0`` and ``t_end`` at which a part of it that depends on time is not
+        smooth: knots of tables, switches of drives.  Runs take no step across them."""
+        times = {knot for drive in self.drives for knot in drive.law.knots}
+        return tuple(sorted(knot for knot in times if t0 < knot < t_end))
+
+    @property
     def degrees_of_freedom(self) -> int:
-        """nv minus the structural rank of the closures."""
+        """nv minus the structural rank of closures and drives."""
         return int(self.model.nv) - self.structure.rank
 
     @property
@@ -325,5 +385,6 @@ class Mechanism:
         return (
             f"Mechanism({self.name!r}, joints={list(self.joint_names)}, "
             f"loops={[loop.name for loop in self.loops]}, "
-            f"forces={[force.name for force in self.forces]})"
+            f"forces={[force.name for force in self.forces]}, "
+            f"drives={[drive.name for drive in self.drives]})"
         )

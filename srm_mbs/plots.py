@@ -84,7 +84,7 @@ def plot_run(solution: Solution, path: Path | None = None) -> Figure:
     if path is not None:
         check_suffix(path)
     draws = [_energy, _step_sizes]
-    if solution.mechanism.loops:
+    if solution.mechanism.constrained:
         draws = [_drift, _energy, _sigma, _step_sizes]
     figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * len(draws)), layout="constrained")
     panels = figure.subplots(len(draws), sharex=True, squeeze=False)[:, 0]

@@ -52,7 +52,7 @@ from srm_mbs.stepping.stepsize import (
 )
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, called, make_system
-from srm_mbs.systems.units import row_units
+from srm_mbs.systems.units import constraint_units
 
 log = logging.getLogger(__name__)
 
@@ -118,18 +118,19 @@ def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, F
 
 
 def check_consistent(mechanism: Mechanism) -> bool:
-    """Refuse a start that violates the closures or their rates; True for any other."""
+    """Refuse a start that violates the closures, the drives or their rates; True for any other."""
     v0 = mechanism.v0
     g, c = mechanism.initial_errors
     units = mechanism.structure.units
-    unit = row_units(mechanism, units)
+    unit = constraint_units(mechanism, units)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
         worst = int(np.argmax(errors))
         if errors[worst] > limit:
+            kind = "drives" if worst >= len(g) - len(mechanism.drives) else "closures"
             raise InputError(
-                f"the initial state violates the closures: row "
+                f"the initial state violates the {kind}: row "
                 f"{mechanism.structure.row_names[worst]} by {values[worst]:.1e}",
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
@@ -306,7 +307,8 @@ def simulate(
     )
     held = None if sample_time is None else HeldForce()
     system = make_system(mechanism, controller if held is None else held)
-    if mechanism.loops:
+    mechanism.check_covers(t_end)
+    if mechanism.constrained:
         mechanism.at_start("consistent", lambda: check_consistent(mechanism))
 
     watch = _event_watch(events, system, method, state)

@@ -18,10 +18,10 @@ from srm_mbs.records import Settings, Statistics
 from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.held import HeldForce
-from srm_mbs.systems.loops import all_rows, closure_errors
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
-from srm_mbs.systems.reactions import reactions_at
+from srm_mbs.systems.reactions import drive_forces_at, reactions_at
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -230,10 +230,9 @@ class Solution:
 
     @cached_property
     def drift(self) -> FloatArray:
-        """Closure errors (n, 2): ||g|| (m, rad) and ||G v|| (m/s, rad/s), all rows, unscaled."""
-        mechanism = self.mechanism
-        rows = all_rows(mechanism)
-        g, c = closure_errors(mechanism.model, mechanism.loops, self.q, self.v, rows)
+        """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
+        the drives; all rows, unscaled."""
+        g, c = constraint_errors(self.mechanism, self.t, self.q, self.v)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
 
     @cached_property
@@ -304,6 +303,20 @@ class Solution:
     def reaction_multipliers(self) -> Mapping[str, FloatArray]:
         """Per loop (n, rows): the multipliers lam of M v' = f - G^T lam, rows unscaled."""
         return self._reactions[1]
+
+    @cached_property
+    def drive_forces(self) -> Mapping[str, FloatArray]:
+        """Per drive (n,): the force (N) or torque (N m) that it exerts on its coordinate, in the
+        positive sense, and the opposite one on what carries it: what an actuator has to give.
+        Where drives and closures are redundant: the values of least norm."""
+        self._need_controller("drive forces")
+        return drive_forces_at(self._system, self.t, self.q, self.v)
+
+    @cached_property
+    def drive_rates(self) -> Mapping[str, FloatArray]:
+        """Per drive (n,): the prescribed rate s'(t) (rad/s, m/s); times the force its power."""
+        curves = self.mechanism.drive_curves
+        return {name: np.array([curve(t)[1] for t in self.t]) for name, curve in curves.items()}
 
     def to_csv(self, path: str | Path, t: Any = None) -> None:
         """Write the motion as a table; see :func:`srm_mbs.export.write_csv`.

@@ -15,9 +15,11 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
 from srm_mbs.kernel import dense_output
+from srm_mbs.laws import LAW_TYPES
 from srm_mbs.loading import rebuild
 from srm_mbs.mechanism import (
     Anchor,
@@ -34,7 +36,7 @@ from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import make_system
-from srm_mbs.systems.structure import Structure
+from srm_mbs.systems.structure import Structure, row_names
 from srm_mbs.systems.units import Units
 
 FORMAT = 4
@@ -82,12 +84,14 @@ def save_solution(solution: Solution, path: Path) -> None:
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
             "loops": [asdict(loop) for loop in mechanism.loops],
             "forces": [_force_entry(force) for force in mechanism.forces],
+            "drives": [_drive_entry(drive) for drive in mechanism.drives],
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
             "notes": mechanism.notes,
         },
         "structure": {
             "rank": structure.rank,
+            "loop_rank": structure.loop_rank,
             "sigma_ref": structure.sigma_ref,
             "samples": structure.samples,
             "notes": structure.notes,
@@ -144,6 +148,19 @@ def _force(entry: dict[str, Any]) -> ForceElement:
     return FORCE_TYPES[entry["type"]](**values)
 
 
+def _drive_entry(drive: Drive) -> dict[str, Any]:
+    law = {"type": drive.law.type} | asdict(drive.law)  # type: ignore[call-overload]
+    return asdict(drive) | {"law": law}
+
+
+def _drive(entry: dict[str, Any]) -> Drive:
+    law = dict(entry["law"])
+    values = entry | {"law": LAW_TYPES[law.pop("type")](**law)}
+    for side in "ab":
+        values[side] = None if entry[side] is None else Anchor(**entry[side])
+    return Drive(**values)
+
+
 def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:
     if entry["source"] is not None:
         source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
@@ -158,6 +175,7 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         q0=arrays["q0"],
         v0=arrays["v0"],
         forces=tuple(_force(force) for force in entry["forces"]),
+        drives=tuple(_drive(drive) for drive in entry["drives"]),
         friction_speed=entry["friction_speed"],
         name=entry["name"],
         source=source,
@@ -243,10 +261,11 @@ def load_solution(path: str | Path) -> Solution:
         structure = meta["structure"]
         # The analysis of the run itself, so that the dense output is the same to the last bit.
         mechanism.__dict__["structure"] = Structure(
-            tuple(name for loop in mechanism.loops for name in loop.row_names),
+            row_names(mechanism),
             arrays["row_scale"],
             arrays["kept"],
             structure["rank"],
+            structure["loop_rank"],
             structure["sigma_ref"],
             Units(structure["length"], arrays["coordinate_unit"], structure["rate"]),
             structure["samples"],

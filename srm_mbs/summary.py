@@ -30,6 +30,8 @@ JOINT_TYPES = {
     "HelicalUnaligned": "screw",
 }
 """Pinocchio's joint types as URDF calls them."""
+MANY = 8
+"""Numbers of a list from which only the ends are shown."""
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
@@ -46,7 +48,7 @@ def run_rows(solution: Solution) -> list[tuple[str, str]]:
         ("rejected steps", f"{stats.rejected}"),
         ("evaluations", f"{stats.evaluations}"),
     ]
-    if solution.mechanism.loops:
+    if solution.mechanism.constrained:
         position, rate = solution.drift.max(axis=0)
         rows += [
             ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
@@ -68,7 +70,8 @@ def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
     return [
         ("mechanism", mechanism.name),
         ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
-        ("closure rows", f"{len(structure.row_names)}"),
+        ("closure rows", f"{len(structure.row_names) - len(mechanism.drives)}"),
+        *([("drives", f"{len(mechanism.drives)}")] if mechanism.drives else []),
         ("rank", f"{structure.rank}"),
         ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
         ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
@@ -146,6 +149,25 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
                 text = _vector(value) if isinstance(value, tuple) else text
                 values.append(f"{key.name} {text} {key.metadata.get('unit', '')}".rstrip())
         yield force.name, force.type, ", ".join(places), ", ".join(values)
+
+
+def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, law, what it moves, values) of each drive."""
+    for drive in mechanism.drives:
+        place = drive.joint or ""
+        if drive.a is not None and drive.b is not None:
+            along = "distance" if drive.axis is None else f"along {_vector(drive.axis)}"
+            place = f"{_anchor(drive.a)}, {_anchor(drive.b)}, {along}"
+        values = []
+        for key in fields(drive.law):  # type: ignore[arg-type]
+            value = getattr(drive.law, key.name)
+            if isinstance(value, tuple) and len(value) > MANY:
+                values.append(f"{key.name} {value[0]:.6g} .. {value[-1]:.6g} ({len(value)})")
+            elif value is not None:
+                text = _vector(value) if isinstance(value, tuple) else f"{value:.6g}"
+                values.append(f"{key.name} {text}")
+        values += ["absolute"] if drive.absolute else []
+        yield drive.name, drive.law.type, place, ", ".join(values)
 
 
 def _anchor(anchor: Anchor) -> str:

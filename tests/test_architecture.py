@@ -16,10 +16,10 @@ PACKAGE = Path(srm_mbs.__file__).parent
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
     ("_kernel", "arrays", "errors", "records", "semi_explicit"),
-    ("anchors", "closures"),
+    ("anchors", "closures", "laws"),
     ("loop_closure",),
     ("mechanism",),
-    ("coordinates", "forces", "systems"),
+    ("coordinates", "drives", "forces", "systems"),
     ("methods",),
     ("stepping",),
     ("closing", "kernel"),

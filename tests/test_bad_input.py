@@ -143,7 +143,11 @@ DESCRIPTION_FAULTS = {
     "unknown key in initial": ("v = {", "w = {", ("initial.w", "q, v, guess")),
     "unknown key in simulation": ("t_end", "tend", ("simulation.tend", "t_end, rtol, atol")),
     "unknown table": ("[simulation]", "[simulations]", ("simulations", "unknown key")),
-    "a drive": ("[simulation]", '[[drive]]\njoint = "hinge"\n[simulation]', ("drive", "Remove")),
+    "a drive without a law": (
+        "[simulation]",
+        '[[drive]]\njoint = "hinge"\n[simulation]',
+        ("drive", "type"),
+    ),
     "an SDF": ("urdf =", 'sdf = "a.sdf"\nurdf =', ("sdf", "both given", "one of")),
     "an MJCF": ("urdf =", 'mjcf = "a.xml"\nurdf =', ("mjcf", "both given", "one of")),
     "no format": ("format = 1\n", "", ("format", "missing", "format = 1")),

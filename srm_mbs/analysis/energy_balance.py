@@ -2,9 +2,10 @@ r"""Energy balance of a run: what kinetic and potential energy gained is the wor
 
     K + V - (K + V)(t_0) = sum of the works W_i,   W_i' = tau_i . v,
 
-with the works of the controller, of joint damping and friction, and of each force element (of
-springs and bushings the damping only: their potential is part of V).  Closures that do not depend
-on time do no work.  Each power is integrated by Gauss quadrature on the dense output, step by step.
+with the works of the controller, of joint damping and friction, of each force element (of springs
+and bushings the damping only: their potential is part of V), and of each drive.  Closures, which do
+not depend on time, do no work.  Each power is integrated by Gauss quadrature on the dense output,
+step by step.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class EnergyBalance:
         Of the bodies; of gravity, springs and bushings.
     works : {name: (n,) J}
         Work done on the mechanism since the start of the run, by what does it: ``controller``,
-        ``joint damping``, ``joint friction``, ``force NAME``.
+        ``joint damping``, ``joint friction``, ``force NAME``, ``drive NAME``.
     start
         Energy (J) at the start of the run.
     """
@@ -113,7 +114,19 @@ def _elements(run: Solution, system: _System) -> Powers:
     }
 
 
-TERMS: tuple[Callable[[Solution, _System], Powers], ...] = (_controller, _joints, _elements)
+def _drives(run: Solution, system: _System) -> Powers:
+    if not run.mechanism.drives:
+        return {}
+    rates = run.drive_rates
+    return {f"drive {name}": force * rates[name] for name, force in run.drive_forces.items()}
+
+
+TERMS: tuple[Callable[[Solution, _System], Powers], ...] = (
+    _controller,
+    _joints,
+    _elements,
+    _drives,
+)
 """Everything that does work beside the potentials; what is new is added here."""
 
 

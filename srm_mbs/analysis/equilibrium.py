@@ -306,6 +306,7 @@ def equilibrium(
             element="search",
             remedy='Give "stable" or "nearest"',
         )
+    mechanism.refuse_drives("an equilibrium")
     held = (hold,) if isinstance(hold, str) else tuple(hold)
     start = assemble(mechanism, q, hold=held)
     if start.singular:

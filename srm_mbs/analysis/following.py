@@ -122,6 +122,7 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     AssemblyError
         If the start cannot be closed.
     """
+    mechanism = mechanism.undriven  # what is dragged takes the place of drives
     wanted = _dragged(mechanism, values)
     if not mechanism.loops:
         raise InputError("a mechanism without loops has nothing to follow", element="loop")

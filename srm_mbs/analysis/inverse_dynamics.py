@@ -151,6 +151,7 @@ def inverse_dynamics(
         If the motion violates the closures, stands on a singular configuration, or needs forces
         that the actuated joints cannot give.
     """
+    mechanism = mechanism.undriven  # the actuators take the place of drives
     times, q, v, a = _motion(mechanism, motion, t)
     names = mechanism.joint_names if actuated is None else actuated
     columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)

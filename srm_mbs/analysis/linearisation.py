@@ -215,6 +215,7 @@ def linearise(
         If the state is not consistent, or singular (there the closures leave no tangent space of
         the right size), or names do not fit.
     """
+    mechanism.refuse_drives("a linearisation")
     if q is None and v is None:
         q, v = mechanism.q0, mechanism.v0
     if q is None:

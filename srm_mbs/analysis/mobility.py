@@ -94,7 +94,7 @@ def mobility_map(solution: Solution) -> MobilityMap:
         values.append(singular)
     freedom = np.array([basis.shape[1] for basis in bases], dtype=int)
     table = np.array(values).reshape(len(bases), -1)
-    structural = mechanism.structure.rank
+    structural = mechanism.structure.loop_rank
     parts = [np.linalg.norm(basis, axis=1) for basis in bases]
     return MobilityMap(
         solution.t,
@@ -109,7 +109,7 @@ def mobility_map(solution: Solution) -> MobilityMap:
 
 
 def _changes(solution: Solution) -> tuple[MobilityChange, ...]:
-    if not solution.mechanism.structure.rank:
+    if not solution.mechanism.structure.loop_rank:
         return ()
     nv = solution.mechanism.model.nv
     met = [(passage.time, passage.singular, passage.loops) for passage in solution.crossings]

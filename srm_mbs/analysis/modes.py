@@ -130,6 +130,7 @@ def assembly_modes(
         raise InputError(
             f"starts = {starts!r} is not positive", element="starts", remedy="Give 200"
         )
+    mechanism = mechanism.undriven  # modes are those of the loops
     if not mechanism.loops:
         raise InputError("a mechanism without loops has no assembly modes", element="loop")
     start = np.array(mechanism.q0)

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ def _joints_that_must_move(description: Description) -> list[tuple[str, Sequence
             if isinstance(force, TorqueEntry | TorsionSpringEntry)
         ),
         *((f"loop[{i}].joints", loop.joints or []) for i, loop in enumerate(description.loop)),
+        *((f"drive[{i}].joint", [d.joint]) for i, d in enumerate(description.drive) if d.joint),
     ]
 
 
@@ -152,7 +154,7 @@ def _friction_note(mechanism: Mechanism) -> tuple[str, ...]:
 
 
 def unassembled(
-    description: Description, source: Source, notes: Sequence[str] = ()
+    description: Description, source: Source, notes: Sequence[str] = (), drives: bool = True
 ) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
     """The mechanism with the guess as its q0, and the held positions and rates by joint.
 
@@ -162,6 +164,8 @@ def unassembled(
         The parsed description, and the texts it was parsed from.
     notes
         Sentences of the translator that wrote them.
+    drives
+        Whether to read the drives, which may need tables from other files.
 
     Raises
     ------
@@ -192,6 +196,7 @@ def unassembled(
         description.closures(),
         q0=start,
         forces=description.force_elements(),
+        drives=description.drives(Path(file).parent) if drives else (),
         friction_speed=description.friction_speed,
         name=description.name or model.name,
         source=source,
@@ -202,8 +207,10 @@ def unassembled(
 
 
 def rebuild(source: Source) -> Mechanism:
-    """The mechanism of a saved run; its q0 is the guess of the description, not assembled."""
-    return unassembled(parse_description(source.description, source.path), source)[0]
+    """The mechanism of a saved run without its drives; its q0 is the guess of the description, not
+    assembled."""
+    description = parse_description(source.description, source.path)
+    return unassembled(description, source, drives=False)[0]
 
 
 def _in_gimbal_lock(source: Source, why: str) -> InputError:

@@ -9,14 +9,25 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, StrictStr, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    StrictBool,
+    StrictStr,
+    ValidationError,
+)
 from pydantic_core import PydanticCustomError
 
 from srm_mbs.closures import CLOSURE_TYPES
+from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
+from srm_mbs.loading.laws import LAW_KEYS, law_from
 from srm_mbs.loading.translation import MODEL_KEYS
 from srm_mbs.mechanism import FRICTION_SPEED, Anchor, ForceElement, LoopClosure
 
@@ -44,11 +55,6 @@ SixNumbers = Annotated[list[Number], Field(min_length=6, max_length=6)]
 JointValue = Annotated[float | list[float], PlainValidator(_joint_value)]
 Base = Literal["fixed", "floating", "planar"]
 
-LATER = {
-    "drive": "drives are not read by this version",
-}
-
-
 PROBLEMS = {
     "string_type": ("a text is wanted", "Put it in quotes"),
     "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
@@ -60,6 +66,7 @@ PROBLEMS = {
     "too_short": (None, "Give the right number of values"),
     "too_long": (None, "Give the right number of values"),
     "literal_error": (None, "Choose one of those"),
+    "bool_type": ("true or false is wanted", "Write true or false without quotes"),
 }
 """By pydantic's type of error: the problem (None: pydantic's own words) and the remedy."""
 
@@ -163,6 +170,39 @@ FORCE_ENTRIES: dict[str, type[ForceEntry]] = {
 }
 
 
+class LawEntry(_Strict):
+    """A law over time; which keys it takes depends on its type."""
+
+    type: StrictStr
+    speed: Number | None = None
+    amplitude: Number | None = None
+    frequency_hz: Number | None = None
+    omega: Number | None = None
+    phase: Number | None = None
+    offset: Number | None = None
+    coefficients: list[Number] | None = None
+    target: Number | None = None
+    duration: Number | None = None
+    start: Number | None = None
+    t: list[Number] | None = None
+    values: list[Number] | None = None
+    table: StrictStr | None = None
+    time: StrictStr | None = None
+    value: StrictStr | None = None
+
+
+class DriveEntry(LawEntry):
+    """One ``[[drive]]``: what moves, and the keys of its law."""
+
+    name: StrictStr = ""
+    joint: StrictStr | None = None
+    a: AnchorEntry | None = None
+    b: AnchorEntry | None = None
+    axis: Vector | None = None
+    distance: StrictBool = False
+    absolute: StrictBool = False
+
+
 class InitialEntry(_Strict):
     """``[initial]``: held positions and rates, and guesses, by joint name."""
 
@@ -194,6 +234,7 @@ class Description(_Strict):
     friction_speed: Annotated[Number, Field(gt=0)] = FRICTION_SPEED
     loop: list[LoopEntry] = []
     force: list[AnyForceEntry] = []
+    drive: list[DriveEntry] = []
     initial: InitialEntry = InitialEntry()
     simulation: SimulationEntry = SimulationEntry()
 
@@ -225,6 +266,7 @@ class Description(_Strict):
         entries: list[tuple[str, Iterable[tuple[str, Any]]]] = [
             *((f"loop[{i}]", entry) for i, entry in enumerate(self.loop)),
             *((f"force[{i}]", entry) for i, entry in enumerate(self.force)),
+            *((f"drive[{i}]", entry) for i, entry in enumerate(self.drive)),
         ]
         for where, entry in entries:
             for key, value in entry:
@@ -244,6 +286,34 @@ class Description(_Strict):
             with _labelled("force", i, entry.name) as label:
                 values = _with_anchors(label, entry)
                 out.append(FORCE_TYPES[values.pop("type")](**values))
+        return tuple(out)
+
+    def drives(self, folder: Path) -> tuple[Drive, ...]:
+        """The drives; tables are read from ``folder``, unless their paths are absolute.
+
+        Raises
+        ------
+        InputError
+            For a law or value that a drive cannot take, or a table that cannot be read.
+        """
+        out = []
+        for i, entry in enumerate(self.drive):
+            with _labelled("drive", i, entry.name or entry.joint or "") as label:
+                anchors = {
+                    side: None if given is None else _anchor(label, side, given)
+                    for side, given in (("a", entry.a), ("b", entry.b))
+                }
+                out.append(
+                    Drive(
+                        law_from({key: getattr(entry, key) for key in LAW_KEYS}, folder),
+                        joint=entry.joint,
+                        axis=entry.axis,
+                        distance=entry.distance,
+                        absolute=entry.absolute,
+                        name=entry.name,
+                        **anchors,
+                    )
+                )
         return tuple(out)
 
 
@@ -321,8 +391,6 @@ def _explain(error: ValidationError) -> tuple[str, str, str | None]:
     key = _key_path(location)
     if first["type"] == "extra_forbidden":
         name = str(location[-1])
-        if len(location) == 1 and name in LATER:
-            return key, LATER[name], "Remove it"
         return key, f"unknown key {name!r}", f"Known here: {_known_keys(first['loc'])}"
     if first["type"] == "union_tag_not_found":
         return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"

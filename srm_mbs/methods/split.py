@@ -111,6 +111,7 @@ def split_step(
             multiplier = terms.multiplier()
             if sigma < WATCHED:
                 normals = terms.normals()
+                normals = normals if normals.shape[1] else None
         if branch is not None and moved is not None:
             correction = correction + moved
     sigmas = np.array(all_sigmas)

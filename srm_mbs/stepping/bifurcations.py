@@ -151,7 +151,7 @@ def find_bifurcations(
     failed
         Whether the run could not go on from its last state.
     """
-    if not isinstance(system, ClosedSystem) or not steps.count:
+    if not isinstance(system, ClosedSystem) or not steps.count or not system.mechanism.loops:
         return ()
     if not steps.held.any() and not steps.sigmas.min() < LOOKED_AT:
         return ()

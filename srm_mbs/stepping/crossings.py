@@ -61,7 +61,7 @@ class Watched:
     def __init__(self, system: ClosedSystem, dense: DenseOutput) -> None:
         mechanism = system.mechanism
         self.geometry = ClosureGeometry(mechanism, mechanism.q0)
-        self.rank = mechanism.structure.rank
+        self.rank = mechanism.structure.loop_rank
         self._system = system
         self._dense = dense
 
@@ -337,7 +337,7 @@ def find_crossings(
     dense: DenseOutput,
 ) -> tuple[Crossing, ...]:
     """All passages of a run, in order of time."""
-    if not isinstance(system, ClosedSystem) or not steps.count:
+    if not isinstance(system, ClosedSystem) or not steps.count or not system.mechanism.loops:
         return ()
     abscissae = np.append(scheme.c, 1.0)
     t, sigma = _recorded(abscissae, steps)

@@ -73,7 +73,7 @@ def _solved(
     strong = Zone(2.0 * DIRECT_SIGMA, lambda _: nothing)
     x = system.retract(x, -system.evaluate(t, x, strong).correction())
     q, v = system.split(x)
-    _, limit = branch_next_to(geometry, system.mechanism.structure.rank, q, v / geometry.unit)
+    _, limit = branch_next_to(geometry, system.mechanism.structure.loop_rank, q, v / geometry.unit)
     if limit is None:
         return None
     v = v - limit.projector @ v

@@ -285,7 +285,7 @@ class Closures:
         if unused and gap > 0.5 * result.gap:
             return (
                 "closures that seemed to follow from the others open: no motion was found that "
-                "keeps all loops closed, the mechanism is locked there"
+                "keeps all loops closed and follows all drives, the mechanism is locked there"
             )
         self._seen = max(self._seen, result.gap)
         return ""

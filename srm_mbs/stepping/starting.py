@@ -19,11 +19,11 @@ from srm_mbs.methods.base import ErrorNorm, Memory, Method
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.stepping.leaving import DIRECT_SIGMA, Point, free_acceleration, known_multipliers
 from srm_mbs.systems.base import System
-from srm_mbs.systems.branch_limit import BranchLimit, branch_next_to
+from srm_mbs.systems.branch_limit import NEAR, BranchLimit, branch_next_to
 from srm_mbs.systems.branches import branch_tangents
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
-from srm_mbs.systems.singular import SingularConfiguration
+from srm_mbs.systems.singular import SingularConfiguration, nearest_singular
 
 LOOK = 0.05
 """sigma below which a singular configuration is looked for."""
@@ -114,6 +114,32 @@ def _limit(
     return limit
 
 
+def _refuse_driven(
+    mechanism: Mechanism, geometry: ClosureGeometry, q: FloatArray, sigma: float
+) -> None:
+    """Refuse a start where the direct solve is not accurate and that drives lead through: what the
+    limit on a branch would be with their rows is not known here.
+
+    Raises
+    ------
+    InputError
+        There.
+    """
+    near = sigma < UNDECIDED
+    if not near and mechanism.loops:
+        found = nearest_singular(geometry, q, mechanism.structure.loop_rank, NEAR)
+        near = found is not None and (
+            float(np.linalg.norm(geometry.difference(found, q))) < DIRECT_FROM
+        )
+    if near:
+        raise InputError(
+            "the start is a singular configuration of the closures and drives "
+            f"(sigma = {sigma:.1e}), where a driven motion cannot begin",
+            element="q0",
+            remedy="Start further away; the motion may lead through it",
+        )
+
+
 def start(
     system: OpenSystem | ClosedSystem,
     method: Method,
@@ -153,6 +179,9 @@ def start(
     q, v = system.split(state)
     geometry = ClosureGeometry(mechanism, q)
     try:
+        if mechanism.drives:
+            _refuse_driven(mechanism, geometry, q, memory.sigma)
+            return memory
         limit = _limit(geometry, mechanism.structure.rank, q, v, memory.sigma)
     except InputError:
         if begins or memory.sigma < UNDECIDED:

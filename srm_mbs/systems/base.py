@@ -59,7 +59,8 @@ class Terms(Protocol):
         """Whether the normals of the zone took the place of the dropped rows."""
 
     def normals(self) -> FloatArray:
-        """M-orthonormal normals of the closures (nv, rank), the weakest last."""
+        """M-orthonormal normals of the closures (nv, rank), the weakest last; (nv, 0) where the
+        motion has a part along them, with drives: it cannot be held tangential then."""
 
     def rate(self) -> FloatArray:
         """Tangent rate (2 nv,): (v, M^-1 f - yhat)."""
@@ -74,7 +75,10 @@ class Terms(Protocol):
         """Largest |g|, of all rows, in row units; 0 where there are none."""
 
     def correction(self) -> FloatArray:
-        """(E g, E c) (2 nv,): what to subtract from the state to satisfy g = 0 and c = 0."""
+        """(E g, E c) (2 nv,): what to subtract from the state to satisfy g = 0 and c = 0.
+
+        With drives g is g - s(t), and c = G v - s'(t).
+        """
 
     def prediction(self) -> FloatArray:
         """The exact multiplier in the form that sweeps carry: yhat, or y of some DAEs."""
@@ -82,7 +86,8 @@ class Terms(Protocol):
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         """Tangent rate and new multiplier of one SRM sweep, given the ``previous`` sweep's.
 
-        Mechanisms, (2.6): (v - E g/eps, M^-1 f - yhat_s), yhat_s = P (yhat_{s-1} + v/eps).
+        Mechanisms, (2.6): (v - E g/eps, M^-1 f - yhat_s), yhat_s = P (yhat_{s-1} + v/eps), with
+        drives P yhat_{s-1} + E (G v - s')/eps.
         DAEs, (2.2): (f - B y_s,), y_s = y_{s-1} + T g/eps, or (2.4), which carries B y.
         """
 

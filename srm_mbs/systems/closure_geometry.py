@@ -1,5 +1,7 @@
 """Closure rows without forces: g, G and Gdot v as pure numbers, for geometry on the loops.
 
+Drives are not part of it: what is singular here is singular whatever the motion.
+
 Coordinates count in their units (1 rad, the scene diagonal), rows in theirs; *normalised* rows are
 divided by their usual size, so that ranks can be judged.
 """

@@ -1,9 +1,10 @@
 r"""A mechanism as a system: Pinocchio terms, closures, and the answers of a stage.
 
-    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0,   f = tau - nle(q, v),
+    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),   f = tau - nle(q, v),
 
-tau from controller, joint damping and friction, and force elements.  Only this module, ``loops``,
-``forces`` and the load-time analysis call Pinocchio algorithms.
+s the motion of the drives, 0 in the rows of the loops; tau from controller, joint damping and
+friction, and force elements.  Only this module, ``loops``, ``driven``, ``forces`` and the load-time
+analysis call Pinocchio algorithms.
 """
 
 from __future__ import annotations
@@ -29,11 +30,12 @@ from srm_mbs.systems.charts import (
     group_joints,
     planar_translation,
 )
+from srm_mbs.systems.driven import DrivenKinematics
 from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.loops import COINCIDENT, LoopKinematics
 from srm_mbs.systems.projection import Projection, unwhiten
-from srm_mbs.systems.units import row_units
+from srm_mbs.systems.units import constraint_units
 
 Controller = Callable[[float, FloatArray, FloatArray], Any]
 """(t, q, v) -> generalised forces tau (nv,), N and N m."""
@@ -189,6 +191,7 @@ class _Mechanics:
         return {
             "loops": [],
             "joint_rows": [],
+            "drives": [],
             "rows": 0,
             "structural_rank": 0,
             "sigma_ref": 1.0,
@@ -354,10 +357,14 @@ class _ClosedTerms:
     """Terms of one stage of a closed-loop mechanism."""
 
     def __init__(
-        self, projection: Projection, loops: LoopKinematics, gap_scale: FloatArray
+        self,
+        projection: Projection,
+        loops: LoopKinematics | DrivenKinematics,
+        gap_scale: FloatArray,
     ) -> None:
         self._p = projection
         self._loops = loops
+        self._pushed = loops.pushed if isinstance(loops, DrivenKinematics) else None
         self._gap_scale = gap_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
@@ -381,6 +388,8 @@ class _ClosedTerms:
         return self._p.held is not None
 
     def normals(self) -> FloatArray:
+        if self._pushed is not None:
+            return np.zeros((self.v.size, 0))
         return self._p.normals()
 
     def _white_multiplier(self) -> FloatArray:
@@ -404,6 +413,12 @@ class _ClosedTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return self._p.project(w)
 
+    def _white_rates(self, w: FloatArray, s: float = 1.0) -> FloatArray:
+        """L^T (P w - s E s'): with w = v and s = 1 that of the rates that violate G v = s'."""
+        p = self._p
+        white = p.white_project(w)
+        return white if self._pushed is None else white - s * p.normal(self._pushed[p.order])
+
     def gap(self) -> float:
         gaps = self._loops.g * self._gap_scale
         return abs(float(gaps.item(_largest(gaps))))
@@ -413,7 +428,7 @@ class _ClosedTerms:
         nv = self.v.size
         right = np.empty((nv, 2), order="F")
         right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = p.white_project(self.v)
+        right[:, 1] = self._white_rates(self.v)
         return p.unwhiten(right).ravel(order="F")
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
@@ -421,7 +436,7 @@ class _ClosedTerms:
         nv = self.v.size
         right = np.empty((nv, 3), order="F")
         right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = self._completed(p.white_project(previous + self.v / eps))
+        right[:, 1] = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
         right[:, 2] = p.white_force - right[:, 1]
         back = p.unwhiten(right)
         rate = np.concatenate([self.v - back[:, 0] / eps, back[:, 2]])
@@ -445,15 +460,27 @@ class ClosedSystem(_Mechanics):
 
     def _gap_scales(self) -> FloatArray:
         structure = self.structure
-        unit = row_units(self.mechanism, structure.units)
+        unit = constraint_units(self.mechanism, structure.units)
         scale: FloatArray = (structure.row_scale / unit)[structure.kept]
         return scale
 
     @cached_property
-    def loops(self) -> LoopKinematics:
-        """The rows of the closures that are in use, with memory of their own."""
+    def loops(self) -> LoopKinematics | DrivenKinematics:
+        """The rows of closures and drives that are in use, with memory of their own."""
+        if self._driven is not None:
+            return self._driven
         resolved: LoopKinematics = self.mechanism.derived("loops", self._resolved_loops)
         return resolved.anew()
+
+    @cached_property
+    def _driven(self) -> DrivenKinematics | None:
+        """Those rows, if there are drives."""
+        mechanism, structure = self.mechanism, self.structure
+        if not mechanism.drives:
+            return None
+        curves = mechanism.drive_curves
+        scale, kept = structure.row_scale, structure.kept
+        return DrivenKinematics(self.model, mechanism.loops, mechanism.drives, curves, scale, kept)
 
     @cached_property
     def _mass_matrix(self) -> FloatArray:
@@ -466,7 +493,8 @@ class ClosedSystem(_Mechanics):
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
-        return super().constants() | {"gap_scale": self._gap_scale}
+        own = super().constants() | {"gap_scale": self._gap_scale}
+        return own if self._driven is None else own | {"drives": self._driven.moving()}
 
     def _constants(self) -> dict[str, Any]:
         own = {
@@ -507,7 +535,7 @@ class ClosedSystem(_Mechanics):
         if self._forces is not None:
             f += self._forces.generalised(data, q, v)
         loops = self.loops
-        loops.update(data, q)
+        self._update(t, q)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
         projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
@@ -523,21 +551,31 @@ class ClosedSystem(_Mechanics):
                     raise EvaluationError(
                         "the motion stays next to a singular configuration with too little "
                         "momentum to tell its branch"
+                        if self._driven is None
+                        else "the drives keep the motion next to a singular configuration, or "
+                        "lead to one that it cannot pass"
                     )
                 projection.hold(zone.normals)
         return terms
 
     def closure_gap(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.systems.base.System`."""
-        g, _ = self.residuals(state)
+        g, _ = self.residuals(state, t)
         return float(np.max(np.abs(g) * self._gap_scale))
 
-    def residuals(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Scaled closure errors g (m,) and closure rates G v (m,) of the kept rows."""
+    def _update(self, t: float, q: FloatArray, with_bias: bool = True) -> None:
+        """The rows at t and q, for which ``data`` has the kinematics."""
+        self.loops.update(self.data, q, with_bias)
+        if self._driven is not None:
+            self._driven.move_to(t)
+
+    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Scaled g - s (m,) and G v - s' (m,) of the kept rows at the time t (s)."""
         q, v = self.split(state)
         pin.crba(self.model, self.data, q, _WORLD)
-        self.loops.update(self.data, q, with_bias=False)
-        return self.loops.g.copy(), self.loops.G @ v
+        self._update(t, q, with_bias=False)
+        rates = self.loops.G @ v
+        return self.loops.g.copy(), rates if self._driven is None else rates - self._driven.pushed
 
 
 def make_system(

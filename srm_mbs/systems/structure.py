@@ -14,7 +14,9 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
+from srm_mbs.drives import in_order_of_rows
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.driven import DrivenKinematics
 from srm_mbs.systems.loops import LoopKinematics, world_jacobian
 from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
 from srm_mbs.systems.units import Units, coordinate_units, row_units
@@ -37,19 +39,22 @@ RANK_GAP = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Constant facts about the closures of a mechanism.
+    """Constant facts about the closures and drives of a mechanism.
 
     Attributes
     ----------
     row_names
-        Names of all rows, ``loop.row``.
+        Names of all rows, ``loop.row``, then those of the drives.
     row_scale : (rows,)
         Every row is divided by its scale: the rms of ||L^-1 G^T row|| over open configurations,
         averaged over the rows of one kind in a closure.
     kept : (rows,) bool
-        False for rows that are zero on every closed sample; the solve leaves them out.
+        False for rows that are zero on every closed sample; the solve leaves them out.  Rows of
+        drives are always kept.
     rank
         Structural rank: the largest number of pivots above 1e-6 over the closed samples.
+    loop_rank
+        The same of the loops alone.
     sigma_ref
         Median of the last structural pivot over the samples of that rank.
     units
@@ -64,6 +69,7 @@ class Structure:
     row_scale: FloatArray
     kept: BoolArray
     rank: int
+    loop_rank: int
     sigma_ref: float
     units: Units
     samples: int
@@ -93,21 +99,27 @@ class _Walker:
         self.units = units
         self.rows = LoopKinematics(self.model, mechanism.loops)
         self.row_unit = row_units(mechanism, units)
-        self.scale = np.ones(len(self.rows.g))
+        self._all = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        self.closed = len(self.rows.g)
+        self.scale = np.ones(len(self._all.g))
 
     def evaluate(self, q: FloatArray) -> None:
-        """g and G of ``rows``, and M in ``data``, at q."""
+        """g and G of ``rows``, the loops', and M in ``data``, at q."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
         self.rows.update(self.data, q, with_bias=False)
 
     def white(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """W = L^-1 G^T (nv, m) of the scaled rows, and the Cholesky factor U (nv, nv), at q."""
-        self.evaluate(q)
+        """W = L^-1 G^T (nv, m) of all scaled rows, those of the loops first, and the Cholesky
+        factor U (nv, nv), at q."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        self._all.update(self.data, q, with_bias=False)
         U = cholesky(self.data.M)
-        return whiten(U, np.asfortranarray((self.rows.G / self.scale[:, None]).T)), U
+        return whiten(U, np.asfortranarray((self._all.G / self.scale[:, None]).T)), U
 
     def close(self, q: FloatArray, iterations: int = 30) -> tuple[FloatArray, float]:
         """Gauss-Newton onto the closure manifold; q and the largest error left, in row units."""
+        if not self.closed:
+            return q, 0.0
         unit = self.units.coordinate
         for _ in range(iterations):
             self.evaluate(q)
@@ -149,6 +161,8 @@ class _Walker:
                 scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
             scale[joints] = np.sqrt(own[joints])  # constant entries: nothing cancels
             at += loop.rows.count
+        driven = squares[at:]
+        self.scale[at:] = np.sqrt(np.where(driven > 0.0, driven, 1.0))
 
     def step(self, q: FloatArray, direction: FloatArray, reach: float) -> FloatArray | None:
         """A closed configuration about ``reach`` units from q along ``direction``; None if none."""
@@ -166,16 +180,21 @@ class _Walker:
 
 def _closed_samples(
     mechanism: Mechanism, walker: _Walker, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Pivots (n, k) and largest row norms (m,) over closed configurations."""
-    rows = len(walker.scale)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pivots (n, k) of all rows, those (n, l) of the loops alone, and largest row norms (m,) over
+    closed configurations."""
+    rows, closed_rows = len(walker.scale), walker.closed
     pivots: list[FloatArray] = []
+    of_loops: list[FloatArray] = []
     largest = np.zeros(rows)
 
     def record(q: FloatArray) -> None:
         W, _ = walker.white(q)
-        pivots.append(pivoted_qr(W)[3])
         np.maximum(largest, np.linalg.norm(W, axis=0), out=largest)
+        pivots.append(pivoted_qr(W)[3])
+        if closed_rows < rows:
+            W = W[:, :closed_rows]
+            of_loops.append(pivoted_qr(W)[3] if closed_rows else np.zeros(0))
 
     start, error = walker.close(mechanism.q0, iterations=100)
     if error < 1e-11:
@@ -187,7 +206,8 @@ def _closed_samples(
         q = start
         for k in range(WALK_STEPS):
             W, U = walker.white(q)
-            left, singular, _ = np.linalg.svd(W, full_matrices=True)
+            # Drives take no part: they lead along the closed configurations, wherever that is.
+            left, singular, _ = np.linalg.svd(W[:, :closed_rows], full_matrices=True)
             rank = int(np.sum(singular > 1e-7))
             null = left[:, rank:]
             if null.shape[1] == 0:
@@ -200,8 +220,19 @@ def _closed_samples(
             if closed is not None:
                 q = closed
                 record(q)
-    width = min(rows, mechanism.model.nv)
-    return (np.array(pivots) if pivots else np.zeros((0, width))), largest
+    if closed_rows == rows:
+        of_loops = pivots
+
+    def stacked(found: list[FloatArray], count: int) -> FloatArray:
+        return np.array(found) if found else np.zeros((0, min(count, mechanism.model.nv)))
+
+    return stacked(pivots, rows), stacked(of_loops, closed_rows), largest
+
+
+def row_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """Names of all rows: ``loop.row``, then those of the drives."""
+    names = [name for loop in mechanism.loops for name in loop.row_names]
+    return (*names, *(drive.name for drive in in_order_of_rows(mechanism.drives)))
 
 
 def analyse(mechanism: Mechanism) -> Structure:
@@ -215,13 +246,13 @@ def analyse(mechanism: Mechanism) -> Structure:
         If the mass matrix is not positive definite.
     """
     units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
-    names = tuple(name for loop in mechanism.loops for name in loop.row_names)
+    names = row_names(mechanism)
     if not names:
-        return Structure((), np.ones(0), np.ones(0, bool), 0, 1.0, units, 0, ())
+        return Structure((), np.ones(0), np.ones(0, bool), 0, 0, 1.0, units, 0, ())
     rng = np.random.default_rng(0)
     walker = _Walker(mechanism, units)
     walker.set_scale(mechanism, rng)
-    pivots, largest = _closed_samples(mechanism, walker, rng)
+    pivots, of_loops, largest = _closed_samples(mechanism, walker, rng)
     notes: list[str] = []
     if not len(pivots):
         notes.append(
@@ -229,11 +260,20 @@ def analyse(mechanism: Mechanism) -> Structure:
         )
         kept = np.ones(len(names), dtype=bool)
         rank = min(len(names), mechanism.model.nv)
-        return Structure(names, walker.scale, kept, rank, 1.0, units, 0, tuple(notes))
+        closed = min(walker.closed, mechanism.model.nv)
+        return Structure(names, walker.scale, kept, rank, closed, 1.0, units, 0, tuple(notes))
     kept = largest > ZERO_ROW
+    kept[walker.closed :] = True
+    loop_rank = int((of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     ranks = (pivots > STRUCTURAL_PIVOT).sum(axis=1)
     rank = int(ranks.max())
     sigma_ref = float(np.median(pivots[ranks == rank, rank - 1])) if rank else 1.0
+    if rank < loop_rank + len(mechanism.drives):
+        driven = ", ".join(repr(drive.name) for drive in mechanism.drives)
+        notes.append(
+            f"the drives ({driven}) prescribe motions that follow from the closures or from each "
+            "other: they must agree, and their forces are those of least norm"
+        )
     if 0 < rank < pivots.shape[1]:
         weakest = float(pivots[ranks == rank, rank - 1].min())
         redundant = max(float(pivots[:, rank:].max()), PIVOT_ZERO)
@@ -243,4 +283,6 @@ def analyse(mechanism: Mechanism) -> Structure:
                 f"{weakest:.1e}, largest redundant pivot {redundant:.1e}"
             )
             log.warning("%s: %s", mechanism.name, notes[-1])
-    return Structure(names, walker.scale, kept, rank, sigma_ref, units, len(pivots), tuple(notes))
+    return Structure(
+        names, walker.scale, kept, rank, loop_rank, sigma_ref, units, len(pivots), tuple(notes)
+    )

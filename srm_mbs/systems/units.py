@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
+from srm_mbs.drives import in_order_of_rows
 from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.forces import resolved_forces
@@ -55,21 +56,29 @@ def row_angles(mechanism: Mechanism) -> BoolArray:
 
 def _row_angles(mechanism: Mechanism) -> BoolArray:
     model = mechanism.model
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    turning = _turning(data)
     out: list[bool] = []
     for loop in mechanism.loops:
         lengths, alignments, _ = loop.rows.blocks
         out += [False] * lengths.stop + [True] * (alignments.stop - alignments.start)
         for row in loop.rows.joint_rows:
-            out.append(bool(turning[model.joints[model.getJointId(row.joints[0])].idx_v]))
+            out.append(joint_turns(model, row.joints[0]))
     return np.array(out, dtype=bool)
 
 
+def joint_turns(model: pin.Model, name: str) -> bool:
+    """Whether the coordinate of a joint with one degree of freedom is an angle."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    return bool(_turning(data)[model.joints[model.getJointId(name)].idx_v])
+
+
 def row_dimensions(mechanism: Mechanism) -> tuple[str, ...]:
-    """Units that closure errors have: "m", "rad" or both, in this order."""
-    angles = row_angles(mechanism)
+    """Units that closure errors have, drives included: "m", "rad" or both, in this order."""
+    driven = [
+        drive.joint is not None and joint_turns(mechanism.model, drive.joint)
+        for drive in mechanism.drives
+    ]
+    angles = np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
     return tuple(unit for unit, own in (("m", ~angles), ("rad", angles)) if own.any())
 
 
@@ -96,6 +105,18 @@ def row_units(mechanism: Mechanism, units: Units) -> FloatArray:
             terms = zip(row.coefficients, joints)
             out.append(max(abs(c) * float(units.coordinate[j.idx_v]) for c, j in terms))
     return np.array(out)
+
+
+def constraint_units(mechanism: Mechanism, units: Units) -> FloatArray:
+    """Units of all rows (rows,), those of the drives after those of the loops."""
+    model = mechanism.model
+    driven = [
+        units.length
+        if drive.joint is None
+        else units.coordinate[model.joints[model.getJointId(drive.joint)].idx_v]
+        for drive in in_order_of_rows(mechanism.drives)
+    ]
+    return np.concatenate([row_units(mechanism, units), driven])
 
 
 def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
@@ -128,8 +149,11 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
 def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
     found = []
-    for loop in mechanism.loops:
-        for anchor in loop.anchors:
+    driven = [anchor for drive in mechanism.drives for anchor in (drive.a, drive.b)]
+    for anchors in (*(loop.anchors for loop in mechanism.loops), driven):
+        for anchor in anchors:
+            if anchor is None:
+                continue
             joint, placement = anchor.resolve(mechanism.model)
             found.append((joint, placement.translation.copy()))
     return found

@@ -196,6 +196,10 @@ ForceElement force_of(const nb::dict& d) {
     return out;
 }
 
+Curve curve_of(const nb::dict& d) {
+    return {vector_of(d["breaks"]), vector_of(d["pieces"]), vector_of(d["sines"])};
+}
+
 struct PySystem {
     nb::object model, controller;  // kept alive
     std::unique_ptr<System> system;
@@ -226,6 +230,13 @@ struct PySystem {
                                        nb::cast<std::vector<int>>(row["in_q"]),
                                        nb::cast<std::vector<int>>(row["in_v"]),
                                        number(row, "offset")});
+        }
+        for (nb::handle item : nb::cast<nb::list>(d["drives"])) {
+            const nb::dict drive = nb::cast<nb::dict>(item);
+            data.drives.push_back({whole(drive, "row"), number(drive, "factor"),
+                                   whole(drive, "in_q"), whole(drive, "in_v"),
+                                   nb::cast<bool>(drive["wound"]),
+                                   curve_of(nb::cast<nb::dict>(drive["curve"]))});
         }
         data.rows = whole(d, "rows");
         data.structural_rank = whole(d, "structural_rank");

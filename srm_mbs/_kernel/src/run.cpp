@@ -94,7 +94,7 @@ bool Run::opens(const StepResult& r) {
     // With every structural row in use the correction closes all rows, or the rank is wrong.
     const bool unused = !r.in_zone && r.gap > 2.0 * seen_;
     if (!(large || unused)) return false;
-    const double gap = system.closure_gap(r.state.data());
+    const double gap = system.closure_gap(r.t + r.h, r.state.data());
     if (!(gap < constants_.lost) || (unused && gap > 0.5 * r.gap)) return true;
     seen_ = std::max(seen_, r.gap);
     return false;

@@ -235,7 +235,7 @@ const StepResult& SplitStep::make(double t, double h, const double* state, const
             r.has_multiplier = true;
             if (sigma < constants.watched) {
                 system_.normals(r.normals, r.normal_count);
-                r.has_normals = true;
+                r.has_normals = r.normal_count > 0;
             }
         }
         if (moved) add(1.0, moved_.data(), r.correction.data(), n);

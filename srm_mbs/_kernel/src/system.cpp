@@ -23,6 +23,7 @@ using pinocchio_model::Argument;
 namespace {
 
 constexpr double overflow = 1e100;
+constexpr double two_pi = 6.283185307179586;
 
 // Where a joint is in the world; its velocity and bias acceleration (with -gravity) in its own axes.
 struct Body {
@@ -66,6 +67,7 @@ System::System(const void* model, SystemData data, Controller controller)
                                                                             : "dense");
     g_.resize(data_.rows);
     bias_.resize(data_.rows);
+    pushed_.resize(data_.rows);
     f_.resize(nv);
     v_.resize(nv);
     rate_.resize(nv);
@@ -86,6 +88,8 @@ Pattern System::pattern() const {
                         loop.alignments.size() / 6,
                     loop.columns);
     for (const JointRow& joints : data_.joint_rows) out.supports[joints.row] = joints.in_v;
+    for (const DrivenRow& drive : data_.drives)
+        if (drive.in_v >= 0) out.supports[drive.row] = {drive.in_v};
     return out;
 }
 
@@ -218,6 +222,29 @@ const double* System::held_force(double t) const {
     return &held_[k * nv];
 }
 
+// The rows of driven joints, and the motion at t taken off all driven rows.
+void System::update_drives(double t, bool with_bias) {
+    const double* q = work_->q.data();
+    for (const DrivenRow& drive : data_.drives) {
+        const int row = drive.row;
+        const bool joint = drive.in_v >= 0;
+        if (joint) {
+            const double angle = drive.wound ? std::atan2(q[drive.in_q + 1], q[drive.in_q])
+                                             : q[drive.in_q];
+            g_[row] = drive.factor * angle;
+            bias_[row] = 0.0;
+            projection_->column(row)[drive.in_v] = drive.factor;
+        }
+        double s[3];
+        drive.curve.at(t, s);
+        g_[row] -= drive.factor * s[0];
+        pushed_[row] = drive.factor * s[1];
+        if (with_bias) bias_[row] -= drive.factor * s[2];
+        if (drive.wound)  // the turn that is nearest
+            g_[row] = drive.factor * std::remainder(g_[row] / drive.factor, two_pi);
+    }
+}
+
 void System::evaluate(double t, const double* state, const ZoneView& zone) {
     ++evaluations;
     t = std::min(std::max(t, first_), last_);
@@ -254,6 +281,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
     update_loops(state, true);
+    update_drives(t, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);
     predicted_ = false;
@@ -303,6 +331,10 @@ void System::correction(double* out) {
     projection_->normal(g_.data(), out);
     projection_->unwhiten(out);
     projection_->white_project(v_.data(), out + nv);
+    if (!data_.drives.empty()) {  // E (G v - s') is P v - E s'
+        projection_->normal(pushed_.data(), white_.data());
+        for (int i = 0; i < nv; ++i) out[nv + i] -= white_[i];
+    }
     projection_->unwhiten(out + nv);
 }
 
@@ -313,7 +345,8 @@ double System::gap() const {
 }
 
 void System::normals(std::vector<double>& out, int& count) const {
-    count = rank();
+    // With drives the motion has a part along them: it cannot be held tangential.
+    count = data_.drives.empty() ? rank() : 0;
     out.resize(static_cast<std::size_t>(count) * nv);
     if (count) projection_->normals(out.data());
 }
@@ -391,12 +424,13 @@ double System::step_limit(const double* state) const {
                        : std::numeric_limits<double>::infinity();
 }
 
-double System::closure_gap(const double* state) {
+double System::closure_gap(double t, const double* state) {
     if (!closed_) return 0.0;
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
     pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
     update_loops(state, false);
+    update_drives(t, false);
     return gap();
 }
 

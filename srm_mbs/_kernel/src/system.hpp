@@ -1,6 +1,8 @@
 // Twin of srm_mbs/systems/multibody.py and loops.py: a mechanism as a system.
 //
-//     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = 0.
+//     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),
+//
+// s the motion of the drives, 0 in the rows of the loops.
 //
 // A state is (q, v), a tangent (dq, dv).  The terms of the stage evaluated last are answered by
 // the system itself, each at its own cost.
@@ -13,6 +15,7 @@
 #include <vector>
 
 #include "charts.hpp"
+#include "curve.hpp"
 #include "forces.hpp"
 #include "history.hpp"
 #include "projection.hpp"
@@ -40,12 +43,22 @@ struct JointRow {
     double offset;
 };
 
+// A driven row: that of a closure among the loops, or of a joint coordinate.
+struct DrivenRow {
+    int row;
+    double factor;              // the inverse of the row scale
+    int in_q = -1, in_v = -1;   // of a joint, else -1
+    bool wound = false;         // a joint that stores (cos, sin)
+    Curve curve;
+};
+
 // (t, q, v) -> generalised forces (nv,), added to tau.
 using Controller = std::function<void(double, const double*, const double*, double*)>;
 
 struct SystemData {
     std::vector<LoopRows> loops;
     std::vector<JointRow> joint_rows;
+    std::vector<DrivenRow> drives;      // in the order of their rows, which are the last
     int rows = 0, structural_rank = 0;
     double sigma_ref = 1.0;
     std::string algebra = "auto";       // "auto", "dense" or "sparse"
@@ -108,7 +121,7 @@ public:
     double size(const double* positions) const;  // of dq (nv,), in units
     void magnitudes(const double* state, double* out) const;
     double step_limit(const double* state) const;
-    double closure_gap(const double* state);
+    double closure_gap(double t, const double* state);
 
     int nq, nv;
     long evaluations = 0;
@@ -120,6 +133,7 @@ private:
     void update_positions(const LoopRows& loop, bool with_bias);
     void update_alignments(const LoopRows& loop, bool with_bias);
     void fill(const LoopRows& loop, int row, const Vec& force, const Vec& moment);
+    void update_drives(double t, bool with_bias);
     void completed(const double* white, double* out) const;
     const double* held_force(double t) const;
 
@@ -131,7 +145,7 @@ private:
     std::unique_ptr<pinocchio_model::Workspace> work_;
     std::unique_ptr<Projection> projection_;
     bool closed_, flat_, predicted_ = false;
-    std::vector<double> g_, bias_, f_, v_, rate_, prediction_, white_, acted_;
+    std::vector<double> g_, bias_, pushed_, f_, v_, rate_, prediction_, white_, acted_;
 };
 
 }  // namespace srm

@@ -1,0 +1,176 @@
+"""Drives: motions prescribed over time, and the constraints g(q) = s(t) that they are.
+
+A drive takes away one degree of freedom; the force that it needs is ``solution.drive_forces``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.anchors import Anchor, resolve_apart
+from srm_mbs.errors import InputError
+from srm_mbs.laws import Curve, Law, Polynomial, Sine, Table
+from srm_mbs.loop_closure import LoopClosure
+
+HAS_VALUES = (Table, Polynomial, Sine)
+"""Laws that say where they start, so that they can be meant as positions themselves."""
+
+NOMINAL = 1e-9
+"""Length (m) of the closure of a driven distance, which the motion of the drive takes off again."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A prescribed motion of a joint, or of a point relative to another.
+
+    By default the law is the motion *from the initial value*: q(t) = q_initial + s(t) - s(0).
+
+    Parameters
+    ----------
+    law
+        From :mod:`srm_mbs.laws`: :class:`~srm_mbs.laws.ConstantSpeed`, ...
+    joint
+        Name of a joint with one degree of freedom (rad; prismatic: m).  The angle of a continuous
+        joint counts turns.
+    a, b
+        Instead of a joint: anchors on different bodies, with ``axis`` or ``distance``.
+    axis : (3,)
+        In b's frame: the position (m) of a's origin along it is driven.
+    distance
+        True: the distance (m) of the two origins is driven.
+    absolute
+        True: the law is the position itself, q(t) = s(t); for laws with values of their own
+        (table, polynomial, sine).  The mechanism is then assembled with q(0) = s(0).
+    name
+        Unique name; by default that of the joint, or ``drive_a_b``.
+
+    Raises
+    ------
+    InputError
+        Unless exactly one motion is described, or for a malformed value.
+    """
+
+    law: Law
+    joint: str | None = None
+    a: Anchor | None = None
+    b: Anchor | None = None
+    axis: Sequence[float] | None = None
+    distance: bool = False
+    absolute: bool = False
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            places = [anchor.where for anchor in (self.a, self.b) if anchor is not None]
+            object.__setattr__(self, "name", self.joint or "_".join(["drive", *places]))
+        if not isinstance(self.law, Law):
+            raise self._fault(f"{self.law!r} is not a law", "Give srm.ConstantSpeed(...) or alike")
+        anchors = self.a is not None and self.b is not None
+        if (self.joint is None) != anchors or (self.a is None) != (self.b is None):
+            raise self._fault(
+                "a drive moves either a joint or a point relative to another",
+                "Give joint, or a and b",
+            )
+        if anchors == (self.axis is None and not self.distance) or (
+            self.axis is not None and self.distance
+        ):
+            raise self._fault(
+                "what is driven is not determined",
+                "With a and b give axis = [x, y, z] or distance = true; neither with a joint",
+            )
+        if self.absolute and not isinstance(self.law, HAS_VALUES):
+            raise self._fault(
+                f"the law {self.law.type!r} starts from the initial value in any case",
+                "Remove absolute",
+            )
+        if self.axis is not None and self.closure is not None:
+            object.__setattr__(self, "axis", self.closure.axis)
+
+    def _fault(self, problem: str, remedy: str) -> InputError:
+        return InputError(problem, element=f"drive {self.name!r}", remedy=remedy)
+
+    @property
+    def closure(self) -> LoopClosure | None:
+        """For a point: the closure whose row g(q) the drive lets move; None for a joint."""
+        if self.a is None or self.b is None:
+            return None
+        if self.distance:
+            return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL)
+        x, y, z = self.axis or ()
+        return LoopClosure("point_on_plane", self.a, self.b, (x, y, z), self.name)
+
+    def frozen(self, value: float) -> LoopClosure:
+        """For a point: the closure that holds its coordinate at ``value`` (m).
+
+        Raises
+        ------
+        InputError
+            For a distance that is not positive.
+        """
+        moving = self.closure
+        if moving is None or moving.b is None:
+            raise self._fault("it moves a joint", "Hold that in q")
+        if moving.axis is None:
+            return replace(moving, length=value)
+        b = moving.b
+        ahead = pin.rpy.rpyToMatrix(np.array(b.rpy)) @ np.array(moving.axis) * value
+        x, y, z = (np.array(b.xyz) + ahead).tolist()
+        return replace(moving, b=Anchor(b.link, b.frame, (x, y, z), b.rpy))
+
+    def curve(self, initial: float) -> Curve:
+        """s(t) for the coordinate that is ``initial`` at t = 0."""
+        curve = self.law.curve(initial)
+        return curve if self.absolute else curve.shifted(initial - curve(0.0)[0])
+
+    def check(self, model: pin.Model) -> None:
+        """Refuse a joint, link or frame that ``model`` does not have or that cannot be driven.
+
+        Raises
+        ------
+        InputError
+            Naming the drive and the remedy.
+        """
+        if self.a is not None and self.b is not None:
+            resolve_apart(model, self.a, self.b, f"drive {self.name!r}")
+            return
+        names = list(model.names)[1:]
+        if self.joint not in names:
+            raise self._fault(
+                f"there is no moving joint {self.joint!r}", f"Known: {', '.join(names) or 'none'}"
+            )
+        joint = model.joints[model.getJointId(self.joint)]
+        if joint.nv != 1:
+            raise self._fault(
+                f"joint {self.joint!r} has {joint.nv} degrees of freedom",
+                "Drive a point with a, b and axis, or model it with joints of one degree",
+            )
+
+
+def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
+    """The drives as their rows come after those of the loops: points first, then joints."""
+    return tuple(sorted(drives, key=lambda drive: drive.joint is not None))
+
+
+def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> Mapping[str, float]:
+    """The driven coordinate of each drive (rad, m) at q (nq,); angles of continuous joints in
+    (-pi, pi]."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, np.asarray(q, dtype=float))
+    out = {}
+    for drive in drives:
+        if drive.a is None or drive.b is None:
+            joint = model.joints[model.getJointId(drive.joint)]
+            own = q[joint.idx_q]
+            out[drive.name] = float(own if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], own))
+            continue
+        (at_a, in_a), (at_b, in_b) = drive.a.resolve(model), drive.b.resolve(model)
+        apart = (data.oMi[at_b] * in_b).actInv((data.oMi[at_a] * in_a).translation)
+        axis = None if drive.axis is None else np.array(drive.axis)
+        out[drive.name] = float(np.linalg.norm(apart) if axis is None else axis @ apart)
+    return MappingProxyType(out)

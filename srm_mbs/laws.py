@@ -1,0 +1,400 @@
+r"""Laws over time: what drives and forces follow, as data that checks itself.
+
+Every law becomes a :class:`Curve`,
+
+    s(t) = sum_j c_ij (t - b_i)^j  on [b_i, b_{i+1})  +  sum_k A_k sin(w_k t + phi_k),
+
+so that both backends evaluate the same numbers.  All of them are twice continuously differentiable;
+where s''' jumps is a knot, on which steps must end to keep the order of a scheme.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import InputError
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A law ready for evaluation.
+
+    Attributes
+    ----------
+    breaks
+        b_i (s), ascending; the first piece also holds before its start, the last one for ever.
+    pieces
+        c_i: the coefficients of each piece in rising powers, all of one length >= 1.
+    sines
+        (amplitude, angular frequency in rad/s, phase in rad) of each sine.
+    """
+
+    breaks: tuple[float, ...] = (0.0,)
+    pieces: tuple[tuple[float, ...], ...] = ((0.0,),)
+    sines: tuple[tuple[float, float, float], ...] = ()
+
+    def __call__(self, t: float) -> tuple[float, float, float]:
+        """s, s' and s'' at t (s)."""
+        i = max(bisect_right(self.breaks, t) - 1, 0)
+        x = t - self.breaks[i]
+        value = rate = half = 0.0
+        for c in reversed(self.pieces[i]):
+            half = half * x + rate
+            rate = rate * x + value
+            value = value * x + c
+        bend = 2.0 * half
+        for amplitude, omega, phase in self.sines:
+            angle = omega * t + phase
+            value += amplitude * math.sin(angle)
+            rate += amplitude * omega * math.cos(angle)
+            bend -= amplitude * omega * omega * math.sin(angle)
+        return value, rate, bend
+
+    def shifted(self, by: float) -> Curve:
+        """The same curve ``by`` higher."""
+        pieces = tuple((piece[0] + by, *piece[1:]) for piece in self.pieces)
+        return Curve(self.breaks, pieces, self.sines)
+
+    def constants(self) -> dict[str, Any]:
+        """What the compiled kernel needs of it."""
+        return {
+            "breaks": np.array(self.breaks),
+            "pieces": np.array(self.pieces),
+            "sines": np.array(self.sines, dtype=float).reshape(-1, 3),
+        }
+
+
+@runtime_checkable
+class Law(Protocol):
+    """A law over time."""
+
+    type: ClassVar[str]
+    """Its name in a description."""
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        """The law itself; ``initial`` is where a law starts that only knows where it leads."""
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        """Times (s) at which its third derivative jumps."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time (s) that it says something about."""
+
+
+ALWAYS = (-math.inf, math.inf)
+
+
+def _fault(law: Law, problem: str, remedy: str) -> InputError:
+    return InputError(problem, element=f"law {law.type!r}", remedy=remedy)
+
+
+def _take(law: Law, key: str, above: float = -math.inf) -> float:
+    """Check a number of ``law`` and store it as a float."""
+    given = getattr(law, key)
+    usable = isinstance(given, (int, float, np.integer, np.floating)) and not isinstance(
+        given, bool
+    )
+    if not usable or not math.isfinite(given):
+        raise _fault(law, f"{key} = {given!r} is no finite number", f"Give a number for {key}")
+    if not given > above:
+        raise _fault(law, f"{key} = {given!r} is too small", f"Give {key} above {above:g}")
+    object.__setattr__(law, key, float(given))
+    return float(given)
+
+
+def _take_list(law: Law, key: str, least: int) -> tuple[float, ...]:
+    """Check a list of numbers of ``law`` and store it as a tuple of floats."""
+    given = getattr(law, key)
+    remedy = f"Give a list of at least {least} finite numbers"
+    try:
+        array = np.asarray(given, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise _fault(law, f"{key} is not a list of numbers", remedy) from error
+    if array.ndim != 1 or len(array) < least or not np.isfinite(array).all():
+        raise _fault(law, f"{key} has shape {array.shape} or is not finite", remedy)
+    values = tuple(array.tolist())
+    object.__setattr__(law, key, values)
+    return values
+
+
+@dataclass(frozen=True)
+class ConstantSpeed:
+    """s = s_0 + speed t.
+
+    Parameters
+    ----------
+    speed
+        rad/s or m/s.
+
+    Raises
+    ------
+    InputError
+        For a value that is not finite.
+    """
+
+    type: ClassVar[str] = "constant_speed"
+    speed: float
+
+    def __post_init__(self) -> None:
+        _take(self, "speed")
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        return Curve(pieces=((initial, self.speed),))
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        return ()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return ALWAYS
+
+
+@dataclass(frozen=True)
+class Sine:
+    """s = offset + amplitude sin(omega t + phase), omega = 2 pi frequency_hz.
+
+    Parameters
+    ----------
+    amplitude
+        In the unit of what follows the law (rad, m, N m, N).
+    frequency_hz, omega
+        One of the two: Hz, or rad/s.
+    phase
+        rad.
+    offset
+        Mean value; a drive, which starts from its initial value, has no use for it.
+
+    Raises
+    ------
+    InputError
+        For a value that is not finite, or unless one of the frequencies is given.
+    """
+
+    type: ClassVar[str] = "sine"
+    amplitude: float
+    frequency_hz: float | None = None
+    omega: float | None = None
+    phase: float = 0.0
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key in ("amplitude", "phase", "offset"):
+            _take(self, key)
+        if (self.frequency_hz is None) == (self.omega is None):
+            raise _fault(
+                self, "a sine needs one frequency", "Give frequency_hz (Hz) or omega (rad/s)"
+            )
+        _take(self, "omega" if self.frequency_hz is None else "frequency_hz")
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        turns = 2.0 * math.pi * (self.frequency_hz or 0.0)
+        wave = (self.amplitude, turns if self.omega is None else self.omega, self.phase)
+        return Curve(pieces=((self.offset,),), sines=(wave,))
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        return ()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return ALWAYS
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """s = c_0 + c_1 t + c_2 t^2 + ...
+
+    Parameters
+    ----------
+    coefficients
+        c_0, c_1, ...: unit, unit/s, unit/s^2, ...
+
+    Raises
+    ------
+    InputError
+        Unless they are finite numbers.
+    """
+
+    type: ClassVar[str] = "polynomial"
+    coefficients: Sequence[float]
+
+    def __post_init__(self) -> None:
+        _take_list(self, "coefficients", 1)
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        return Curve(pieces=(tuple(self.coefficients),))
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        return ()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return ALWAYS
+
+
+@dataclass(frozen=True)
+class MinimumJerk:
+    """From rest to rest: s = s_0 + (target - s_0)(10 x^3 - 15 x^4 + 6 x^5).
+
+    x = (t - start)/duration.  It holds s_0 before ``start`` and ``target`` after start + duration.
+    T. Flash, N. Hogan, J. Neurosci. 5 (1985) 1688.
+
+    Parameters
+    ----------
+    target
+        Where it ends (rad, m): a position, not a distance.
+    duration
+        s, positive.
+    start
+        s, not negative.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite, a duration that is not positive, or start < 0.
+    """
+
+    type: ClassVar[str] = "minimum_jerk"
+    target: float
+    duration: float
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        _take(self, "target")
+        _take(self, "duration", 0.0)
+        if _take(self, "start") < 0.0:
+            raise _fault(self, f"start = {self.start:g} is negative", "Give a start >= 0")
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        way, T = self.target - initial, self.duration
+        moving = (initial, 0.0, 0.0, 10.0 * way / T**3, -15.0 * way / T**4, 6.0 * way / T**5)
+        still = (0.0,) * 5
+        return Curve(
+            (self.start - 1.0, self.start, self.start + T),
+            ((initial, *still), moving, (self.target, *still)),
+        )
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        return (self.start, self.start + self.duration)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return ALWAYS
+
+
+@dataclass(frozen=True)
+class Table:
+    """The cubic spline (C2, not-a-knot) through values over time.
+
+    Parameters
+    ----------
+    t
+        Times (s), ascending, from 0 or earlier; at least 4.
+    values
+        As many values.
+
+    Raises
+    ------
+    InputError
+        If they do not fit, are not finite, or the times do not ascend from 0 or earlier.
+    """
+
+    type: ClassVar[str] = "table"
+    t: Sequence[float]
+    values: Sequence[float]
+
+    def __post_init__(self) -> None:
+        t, values = _take_list(self, "t", 4), _take_list(self, "values", 4)
+        if len(t) != len(values):
+            raise _fault(self, f"{len(t)} times and {len(values)} values", "Give as many of each")
+        if not (np.diff(t) > 0.0).all():
+            raise _fault(self, "the times do not ascend", "Sort them, each time once")
+        if t[0] > 0.0:
+            raise _fault(
+                self, f"the table begins at t = {t[0]:g} s", "Let it begin at t = 0 or before"
+            )
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        from scipy.interpolate import CubicSpline
+
+        spline = CubicSpline(np.array(self.t), np.array(self.values))
+        return Curve(tuple(self.t[:-1]), tuple(map(tuple, spline.c[::-1].T.tolist())))
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        # Not-a-knot: the third derivative is the same on both sides of the second and last but one.
+        return tuple(self.t[2:-2])
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return self.t[0], self.t[-1]
+
+
+LAW_TYPES: Mapping[str, type[Law]] = MappingProxyType(
+    {kind.type: kind for kind in (ConstantSpeed, Sine, Polynomial, MinimumJerk, Table)}
+)
+"""The laws by their type in a description."""
+
+
+def read_table(path: Path, columns: Sequence[str]) -> FloatArray:
+    """Columns (n, k) of a CSV file with a header line.
+
+    Parameters
+    ----------
+    path
+        The file: numbers separated by commas, the first line naming the columns.
+    columns
+        Names of the wanted columns, in that order.
+
+    Raises
+    ------
+    InputError
+        Naming the file, and the line or column that is wrong.
+    """
+    import csv
+
+    file = str(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise InputError(
+            f"the table cannot be read: {error}", file=file, remedy="Give a CSV file of numbers"
+        ) from error
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    for name in columns:
+        if header.count(name) != 1:
+            raise InputError(
+                f"there is no column {name!r}" if name not in header else f"two columns {name!r}",
+                file=file,
+                element="first line",
+                remedy=f"Columns: {', '.join(header) or 'none'}",
+            )
+    wanted = [header.index(name) for name in columns]
+    out = np.empty((len(rows) - 1, len(wanted)))
+    for i, row in enumerate(rows[1:]):
+        try:
+            if len(row) != len(header):
+                raise ValueError(f"{len(row)} values, {len(header)} columns")
+            out[i] = [float(row[k]) for k in wanted]
+        except ValueError as error:
+            raise InputError(
+                f"row {i + 1} of the table is wrong: {error}",
+                file=file,
+                remedy="Give one finite number in every column",
+            ) from error
+    return out

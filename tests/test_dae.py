@@ -155,6 +155,7 @@ def test_sweeps_that_carry_by_pass_an_isolated_singularity(method: Any, bound: f
     [
         (srm.PSRM("tvd32", correction="sweep", T="inverse"), (2e-4, 2e-6)),
         (srm.PSRM("dopr54", correction="sweep", T="inverse"), (2e-4, 2e-6)),
+        (srm.PSRM("dopr54", correction="sweep", T="inverse", interpolation="linear"), (1e-3, 2e-5)),
         (srm.PSRM("dop853", correction="fused", T="inverse"), (1e-6, 1e-8)),
         (srm.SRM("tvd32", 3, T="inverse", restart=True, carry=True), (2e-4, 2e-6)),
     ],

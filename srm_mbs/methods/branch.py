@@ -37,6 +37,8 @@ AMBIGUOUS = 0.1
 Newton might lead to another branch."""
 HELD = 0.1
 """Part of the tolerance up to which a slow motion is held on its branch, not extrapolated."""
+TURNS = 2.0
+"""Margin for what a constraint error changes by because the closures turn."""
 ROUNDING = 16.0 * np.finfo(float).eps
 """Rounding of the positions, in units."""
 
@@ -155,6 +157,15 @@ class BranchStages:
         if part.start:
             out[part] += (reach * reach / self.h) * np.abs(error[: part.start])
         return out
+
+    def turning(self, off: FloatArray, sigma: float) -> FloatArray:
+        """Change (n,), at most, over the step of how far a sweep is ``off`` (n,) the closures by
+        their turning next to ``sigma``.
+
+        It is a part of ``off`` however short the step: nothing for a shorter one to mend.
+        """
+        reach = self.sigma_change / sigma
+        return TURNS * (self._turning(off, sigma, self.sigma_change) + reach * np.abs(off))
 
     def rounding(self, sigma: float, change: float, projected: bool) -> FloatArray:
         """What rounding at a stage with ``sigma`` does to h times the tangent rate (n,).

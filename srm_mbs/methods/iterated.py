@@ -8,8 +8,11 @@ The error estimate is the embedded pair of the last sweep.  It is never the diff
 sweeps' trajectories: these drift apart, and their gap does not fall with the step (the impasse of
 the thesis, section 5.7).  The pair of one sweep does not see what more sweeps would correct; this
 shows in the constraint error.  What a step adds to it, (E g, E c) at its end less exp(-h/eps) of
-that at its start, counts as well.  Both parts vanish with the step.  Sweeps with own histories are
-off the closures by what their histories left, which no step mends: their runs report it.
+that at its start, counts as well.  Constraint errors last for about eps, which may be many steps:
+in two sweeps that carry yhat, where eps is longer than the steps, it is counted over
+1 - exp(-h/eps), the error at which such steps would settle.  All parts vanish with the step.
+Sweeps with own histories are off the closures by what their histories left, which no step mends:
+their runs report it.
 
 Next to a singular configuration the algebra of all sweeps is evaluated on the branch
 (:class:`~srm_mbs.methods.sweeps.OnBranch`), and own histories that are too far off the closures to
@@ -53,6 +56,9 @@ EPS_SHRINKS = 0.7
 """eps falls at most by this factor from one accepted step to the next.  With eps proportional to
 the trial step, shorter steps would not make a step's change small (v h/eps stays), and an error
 estimate above the tolerance would stay there."""
+LASTS = 0.5
+"""h/eps below which a constraint error is counted as it settles.  Above, schemes do not damp like
+exp(-h/eps), and what they leave would count however short the step."""
 _MANY = int(np.iinfo(np.int64).max)
 
 
@@ -180,7 +186,7 @@ class IteratedSweeps:
         scheme, s = self.scheme, self.scheme.n_stages
         if scheme.error is None:
             return 0.0, 0.0
-        norm, memory, history = stages.norm, stages.memory, stages.history
+        system, norm, memory, history = stages.system, stages.norm, stages.memory, stages.history
         weights = norm.weights(np.maximum(memory.magnitude, magnitude))
         weights = stages.widened(weights, scheme, last.sigmas)
         error = h * np.abs(scheme.error @ last.rates[: s + 1])
@@ -188,14 +194,21 @@ class IteratedSweeps:
             for j in last.weak:
                 if j < s:
                     uncertainty = history.uncertainty(t + scheme.c[j] * h)
-                    part = stages.system.multiplier_part
+                    part = system.multiplier_part
                     error[part] += h * abs(scheme.b[j]) * uncertainty
         if last.off is None:
             return norm(error, weights), 0.0
+        settled = 0.0
         if last.off_before is not None:
-            added = last.off - math.exp(-h / eps) * last.off_before
-            error = np.maximum(error, np.abs(added))
-        return norm(error, weights), norm(last.off, weights)
+            decay = math.exp(-h / eps)
+            added = np.abs(last.off - decay * last.off_before)
+            error = np.maximum(error, added)
+            lowest = float(last.sigmas.min())
+            lasting = self._exact and system.carries_yhat and h < LASTS * eps
+            if lasting and lowest > 0.0:
+                turning = norm(stages.turning(last.off_before, lowest), weights)
+                settled = max(0.0, norm(added, weights) - turning) / -math.expm1(-h / eps)
+        return max(norm(error, weights), settled), norm(last.off, weights)
 
     def accept(self, memory: Memory, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""

@@ -66,8 +66,8 @@ class PSRM:
         Of the predicted multiplier, with ``correction="sweep"``: ``"stages"``, the predictor's own
         stages, the default: full order with a fixed eps; or as in the thesis, ``"auto"`` or
         ``"linear"`` (:func:`~srm_mbs.methods.sweeps.interpolant`), which leave larger constraint
-        errors: the adaptive slider-crank passes with tvd32 (to t = 40: errors 5e-3 and 4e-4 at
-        tolerances of 1e-4 and 1e-5), but with dopr54 and ``"linear"`` not every passage.
+        errors and need more steps: with dopr54, the slider-crank to t = 20 at a tolerance of 1e-4,
+        95 for ``"stages"``, 101 for ``"auto"``, some 770 for ``"linear"``, which is of order 2.
 
     Raises
     ------

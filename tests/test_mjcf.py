@@ -18,6 +18,7 @@ from srm_mbs.mechanism import Anchor
 from srm_mbs.systems.forces import ForceKinematics
 from tests.lockstep import compare
 from tests.mjcf_files import BODY, FOUR_BAR, TREE, TWO, TWO_LOOPS, file, model_of, translated
+from tests.sdf_files import cassie
 from tests.test_kernel import agree
 
 mujoco = pytest.importorskip("mujoco")
@@ -215,3 +216,21 @@ def test_one_free_body_is_a_floating_robot_at_its_pose(tmp_path: Path) -> None:
         found = data.oMf[mechanism.model.getFrameId(name, pin.FrameType.BODY)]
         np.testing.assert_allclose(found.translation, state.xpos[i], atol=1e-14)
         np.testing.assert_allclose(found.rotation.ravel(), state.xmat[i], atol=1e-14)
+
+
+def test_the_inertia_of_an_exact_mesh_is_that_of_mujoco(tmp_path: Path) -> None:
+    mesh = cassie("cassie").parents[1] / "meshes" / "knee.stl"
+    geom = '<geom type="mesh" mesh="knee" pos="0.1 0 0" euler="30 0 0" density="500"/>'
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        '<mujoco><asset><mesh name="knee" inertia="exact" scale="1 2 1" '
+        f'file="{mesh}"/></asset><worldbody><body name="knee"><joint name="j"/>{geom}</body>'
+        '<body name="wall"><geom type="mesh" mesh="knee"/></body></worldbody></mujoco>'
+    )
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    inertia = srm.load(path).model.inertias[1]
+    np.testing.assert_allclose(inertia.mass, theirs.body_mass[1], rtol=1e-12)
+    np.testing.assert_allclose(inertia.lever, theirs.body_ipos[1], atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(inertia.inertia), np.sort(theirs.body_inertia[1]), rtol=1e-9
+    )

@@ -61,6 +61,11 @@ def test_what_gives_no_force_is_noted() -> None:
         assert word in notes
 
 
+def test_a_joint_may_have_an_armature_alone() -> None:
+    model = model_of(file(BODY.format("one", 'j" armature="0.3')))
+    np.testing.assert_array_equal(model.armature, [0.3])
+
+
 def test_simple_shapes_are_drawn() -> None:
     geoms = (
         '<geom type="box" size="0.1 0.2 0.3" rgba="1 0 0 1"/><geom type="cylinder" size="0.1 0.2"/>'

@@ -15,11 +15,11 @@ from srm_mbs.errors import InputError
 from srm_mbs.loading.graph_translation import GraphTranslator
 from srm_mbs.loading.mjcf_bodies import BodyReader
 from srm_mbs.loading.mjcf_equality import EqualityReader
+from srm_mbs.loading.mjcf_geoms import Mesh
 from srm_mbs.loading.mjcf_schema import IGNORED_SECTIONS, SECTIONS
 from srm_mbs.loading.mjcf_values import MjcfValues
 from srm_mbs.loading.safe_xml import parse_urdf
 from srm_mbs.loading.translation import Options, Translation
-from srm_mbs.loading.urdf_writer import numbers
 
 GRAVITY = "0 0 -9.81"
 DEEPEST = 20
@@ -119,8 +119,11 @@ def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
                 tree.colours[given.get("name", "")] = given["rgba"]
         elif "file" in given:
             path = Path(values.compiler.mesh_folder) / given["file"]
-            scale = numbers(values.get(given, "scale", 3, "1 1 1", where))
-            tree.meshes[given.get("name") or path.stem] = (path.as_posix(), scale)
+            scale = values.get(given, "scale", 3, "1 1 1", where)
+            moved = "refpos" in given or "refquat" in given
+            inertia = "" if moved else given.get("inertia", "legacy")
+            name = given.get("name") or path.stem
+            tree.meshes[name] = Mesh(path.as_posix(), scale, inertia)
 
 
 def translate(text: str, file: str, options: Options) -> Translation:

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.joint_graph import UNLIMITED, Body, Joint
-from srm_mbs.loading.mjcf_geoms import Geom, inertia_of, read_geom, visuals_of
+from srm_mbs.loading.mjcf_geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
 from srm_mbs.loading.mjcf_schema import BODY_IGNORED, BODY_READ
 from srm_mbs.loading.mjcf_values import MjcfValues
 from srm_mbs.loading.urdf_writer import anchor
@@ -56,9 +56,10 @@ class BodyReader:
         self.sites: dict[str, tuple[str, pin.SE3]] = {}
         self.forces: list[dict[str, Any]] = []
         self.references: dict[str, float] = {}
-        self.meshes: dict[str, tuple[str, str]] = {}
+        self.meshes: dict[str, Mesh] = {}
         self.colours: dict[str, str] = {}
         self._names: set[str] = set()
+        self._moving: set[str] = set()
 
     def world(self, node: Element) -> None:
         """Read a ``<worldbody>``."""
@@ -89,6 +90,8 @@ class BodyReader:
         self.placements[name] = self.placements[parent] * in_parent
         found: dict[str, list[Any]] = {"joint": [], "geom": [], "inertial": []}
         self.bodies[name] = Body(name)
+        if parent in self._moving or any(c.tag in ("joint", "freejoint") for c in node):
+            self._moving.add(name)
         # Joints first, so that they stand before those of the bodies inside.
         self._joints(node, name, parent, in_parent, childclass)
         self._contents(node, name, pin.SE3.Identity(), childclass, depth, found)
@@ -113,6 +116,7 @@ class BodyReader:
                 case "inertial":
                     found.get("inertial", []).append((child, around))
                 case "geom" if name == WORLD:
+                    read_geom(values, child, childclass, around, name)
                     values.ignore("<geom> of the world")
                 case "geom":
                     found["geom"].append(read_geom(values, child, childclass, around, name))
@@ -152,6 +156,9 @@ class BodyReader:
         values = self.values
         compiler = values.compiler
         where = f"body {name!r}"
+        visuals = [v for g in geoms for v in visuals_of(values, g, self.meshes, self.colours)]
+        if name not in self._moving and compiler.total_mass <= 0.0:
+            return Body(name, None, tuple(visuals))
         inertia: pin.Inertia | None = None
         if len(inertials) > 1:
             raise values.fault(where, "<inertial> stands there twice", "Keep one")
@@ -164,10 +171,9 @@ class BodyReader:
             for geom in geoms:
                 if not low <= geom.group <= high:
                     continue
-                part = inertia_of(geom, values.file)
+                part = inertia_of(geom, self.meshes, values.file)
                 if part is not None:
                     inertia = part if inertia is None else inertia + part
-        visuals = [v for g in geoms for v in visuals_of(values, g, self.meshes, self.colours)]
         return Body(name, self._bounded(inertia), tuple(visuals))
 
     def _inertial(self, node: Element, where: str) -> pin.Inertia:

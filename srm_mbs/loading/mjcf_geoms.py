@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -23,6 +24,16 @@ SIZES = {"sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3}
 ALONG = ("capsule", "cylinder", "ellipsoid", "box")
 """Shapes that may be given by two ends."""
 MASSLESS = ("plane", "hfield")
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A mesh of ``<asset>``: its file as the model names it, its scale (3,), and how MuJoCo finds
+    its inertia; empty if it is moved first."""
+
+    file: str
+    scale: FloatArray
+    inertia: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +68,9 @@ def read_geom(
     placement = values.placement(given, where)
     sizes = np.zeros(3)
     needed = SIZES.get(kind, 0)
+    text = given.get("size", "")
+    found = values.numbers(text, (1, 2, 3), where, "size") if text.split() else np.zeros(0)
     if needed:
-        text = given.get("size", "")
-        found = values.numbers(text, (1, 2, 3), where, "size") if text.split() else np.zeros(0)
         ends = given.get("fromto")
         if ends is not None:
             if kind not in ALONG:
@@ -86,27 +97,64 @@ def read_geom(
     return Geom(kind, around * placement, sizes, mass, density, group, where, given)
 
 
-def inertia_of(geom: Geom, file: str) -> pin.Inertia | None:
+def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], file: str) -> pin.Inertia | None:
     """Inertia of a solid shape in its body's frame; None without mass.
 
     Raises
     ------
     InputError
-        For a mesh with mass, whose inertia is not computed here.
+        For a shape whose inertia is not computed here.
     """
     if geom.kind in MASSLESS or geom.mass == 0.0 or (geom.mass is None and geom.density == 0.0):
         return None
-    if geom.kind not in SIZES:
+    if geom.kind == "mesh":
+        own = _enclosed(geom, meshes.get(geom.given.get("mesh", "")), file)
+    elif geom.kind in SIZES:
+        volume, moments = _solid(geom.kind, geom.sizes)
+        own = pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
+    else:
         raise InputError(
             f"the inertia of a {geom.kind} is not computed by this version",
             file=file,
             element=geom.where,
             remedy="Give the body an <inertial>",
         )
-    volume, moments = _solid(geom.kind, geom.sizes)
-    mass = geom.density * volume if geom.mass is None else geom.mass
-    own = pin.Inertia(mass, np.zeros(3), mass * np.diag(moments))
-    return geom.placement.act(own)
+    density = geom.density if geom.mass is None else geom.mass / own.mass
+    return geom.placement.act(pin.Inertia(density * own.mass, own.lever, density * own.inertia))
+
+
+def _enclosed(geom: Geom, mesh: Mesh | None, file: str) -> pin.Inertia:
+    """Of the solid of density 1 that the triangles of a mesh enclose: inertia="exact"."""
+    if mesh is None or mesh.inertia != "exact":
+        raise InputError(
+            "the inertia of a mesh is read from its triangles only, and only if MuJoCo does so too",
+            file=file,
+            element=geom.where,
+            remedy='Give the body an <inertial>, or the <mesh file=...> inertia="exact"',
+        )
+    import coal  # type: ignore[import-untyped]
+
+    path = Path(file).parent / mesh.file
+    try:
+        shape = coal.MeshLoader().load(str(path), mesh.scale)
+        volume = float(shape.computeVolume())
+        about = np.array(shape.computeMomentofInertiaRelatedToCOM())
+        centre = np.array(shape.computeCOM())
+    except Exception as error:  # Boost.Python raises whatever the C++ reader throws
+        raise InputError(
+            f"the mesh file {str(path)!r} cannot be read: {error}",
+            file=file,
+            element=geom.where,
+            remedy="Give the body an <inertial>",
+        ) from error
+    if not volume > 0.0:
+        raise InputError(
+            f"the triangles of {str(path)!r} enclose no volume",
+            file=file,
+            element=geom.where,
+            remedy="Give the body an <inertial>",
+        )
+    return pin.Inertia(volume, centre, about)
 
 
 def _solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:
@@ -137,7 +185,7 @@ def _solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:
 def visuals_of(
     values: MjcfValues,
     geom: Geom,
-    meshes: Mapping[str, tuple[str, str]],
+    meshes: Mapping[str, Mesh],
     colours: Mapping[str, str],
 ) -> list[Element]:
     """``<visual>`` elements of URDF; none, with a remark, for a shape that URDF does not have.
@@ -147,7 +195,7 @@ def visuals_of(
     values, geom
         The file and the shape.
     meshes
-        File and scale of the meshes of ``<asset>``, by name.
+        Those of ``<asset>``, by name.
     colours
         Red, green, blue, opacity of the materials of ``<asset>``, by name.
     """
@@ -171,8 +219,8 @@ def visuals_of(
                     for end in (-b, b)
                 ]
         case "mesh" if geom.given.get("mesh") in meshes:
-            name, scale = meshes[geom.given["mesh"]]
-            shapes = [("mesh", {"filename": name, "scale": scale}, at)]
+            mesh = meshes[geom.given["mesh"]]
+            shapes = [("mesh", {"filename": mesh.file, "scale": numbers(mesh.scale)}, at)]
         case kind:
             values.remark(f"a geom of the type {kind} is not drawn", geom.where)
     rgba = geom.given.get("rgba") or colours.get(geom.given.get("material", ""))

@@ -106,7 +106,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
         "springlength",
         "armature",
     ),
-    "mesh": ("name", "class", "file", "scale"),
+    "mesh": ("name", "class", "file", "scale", "inertia", "refpos", "refquat"),
     "material": ("name", "class", "rgba"),
 }
 """Attributes that are read; those of a joint equality stand in JOINT_EQUALITY."""
@@ -203,9 +203,6 @@ IGNORED_ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "mesh": (
         "content_type",
         "smoothnormal",
-        "inertia",
-        "refpos",
-        "refquat",
         "vertex",
         "normal",
         "texcoord",

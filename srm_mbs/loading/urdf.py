@@ -196,12 +196,17 @@ def build_urdf(
 
 def _armature(root: Element) -> dict[str, float]:
     """Inertias of motors by joint: an attribute of <dynamics> that URDF does not have."""
-    return {
-        joint.get("name", ""): float(dynamics.attrib.pop("armature"))
-        for joint in root.findall("joint")
-        for dynamics in joint.findall("dynamics")
-        if "armature" in dynamics.attrib and joint.get("type") != "fixed"
-    }
+    found = {}
+    for joint in root.findall("joint"):
+        dynamics = joint.find("dynamics")
+        if dynamics is None or "armature" not in dynamics.attrib:
+            continue
+        value = float(dynamics.attrib.pop("armature"))
+        if joint.get("type") != "fixed":
+            found[joint.get("name", "")] = value
+        if not dynamics.attrib:  # which urdfdom does not read
+            joint.remove(dynamics)
+    return found
 
 
 def _without_limits(root: Element, names: Collection[str]) -> dict[str, bool]:

@@ -97,6 +97,8 @@ class Source:
         The description's own path, for messages.
     base, gravity
         As used: the description's, unless the caller gave others.
+    format
+        Format of the file that held the links and joints.
     """
 
     description: str
@@ -105,6 +107,7 @@ class Source:
     path: str
     base: str
     gravity: tuple[float, float, float]
+    format: str = "URDF"
 
 
 @dataclass(frozen=True)

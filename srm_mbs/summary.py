@@ -66,9 +66,10 @@ def run_rows(solution: Solution) -> list[tuple[str, str]]:
 
 def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
     """Degrees of freedom, rank and redundancy: (quantity, value)."""
-    structure = mechanism.structure
+    structure, source = mechanism.structure, mechanism.source
     return [
         ("mechanism", mechanism.name),
+        ("read from", "Python" if source is None else f"{source.path} ({source.format})"),
         ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
         ("closure rows", f"{len(structure.row_names) - len(mechanism.drives)}"),
         *([("drives", f"{len(mechanism.drives)}")] if mechanism.drives else []),

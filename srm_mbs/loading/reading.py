@@ -125,6 +125,7 @@ def _reading(
         path=file,
         base=base,
         gravity=_gravity(description.gravity if gravity is None else gravity),
+        format=found.name,
     )
     return Reading(description, source, translation.notes)
 

@@ -35,11 +35,11 @@ def translate(text: str, file: str, options: Options) -> Translation:
     """
     root = parse_urdf(text, file)
     elements = LoopElements(file, Graph(root))
-    found = _cut_second_parents(root, elements, options)
+    notes: list[str] = []
+    found = _cut_second_parents(root, elements, options, notes)
     elements.graph = graph = Graph(root)
     found |= elements.read(root)
     found |= gazebo_joints.read(root, elements)
-    notes = list(elements.ignored_notes())
     found |= _mimics(elements, options, notes)
     loops, remarks = onshape.closing_frames(graph.links, options.own)
     elements.loops.extend(loops)
@@ -50,6 +50,8 @@ def translate(text: str, file: str, options: Options) -> Translation:
     if elements.forces:
         entries["force"] = _named(elements.forces, options.own.get("force", ()))
     if found:
+        # Otherwise the check of the tree counts the same again.
+        notes += elements.ignored_notes()
         ET.indent(root)
         text = ET.tostring(root, encoding="unicode") + "\n"
     return Translation(text, entries, tuple(notes))
@@ -76,18 +78,20 @@ def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
 # -- children of two parents -----------------------------------------------------------------
 
 
-def _cut_second_parents(root: Element, reader: LoopElements, options: Options) -> bool:
+def _cut_second_parents(
+    root: Element, reader: LoopElements, options: Options, notes: list[str]
+) -> bool:
     """Take the joints out that close loops, their closures into ``reader``; whether there were
     any."""
     by_child: dict[str, list[Element]] = {}
-    for joint in root.findall("joint"):
+    for joint in reader.named(root, "joint").values():
         child = link_of(joint, "child")
         if child and link_of(joint, "parent"):
             by_child.setdefault(child, []).append(joint)
     for name in options.cut:
         if name not in reader.graph.joints:
             raise reader.fault("cut", f"there is no joint {name!r}", "Name joints of the file")
-    found = False
+    cut = []
     for child, joints in by_child.items():
         wanted = [joint for joint in joints if joint.get("name") in options.cut]
         kept = next((joint for joint in joints if joint not in wanted), None)
@@ -101,8 +105,11 @@ def _cut_second_parents(root: Element, reader: LoopElements, options: Options) -
             if joint is not kept:
                 _close(joint, reader)
                 root.remove(joint)
-                found = True
-    return found
+                cut.append(joint.get("name", ""))
+    if cut:
+        names = ", ".join(map(repr, cut))
+        notes.append(f"the joints {names} close loops: they are cut and became closures")
+    return bool(cut)
 
 
 def _close(joint: Element, reader: LoopElements) -> None:
@@ -130,7 +137,7 @@ def _close(joint: Element, reader: LoopElements) -> None:
             f"its friction ({friction:g}) would not act: a closure has none",
             'Cut the loop at another joint (cut = ["..."]), or set the friction to 0',
         )
-    if kind == "floating":
+    if kind == "floating":  # it restrains nothing
         return
     parent, child = (
         (reader.link(Element(side, link=link_of(joint, side)), "link", where), frame)

@@ -54,6 +54,8 @@ def _read_joint(joint: Element, elements: LoopElements) -> None:
         if node.tag in parts:
             raise elements.fault(where, f"<{node.tag}> stands there twice", "Keep one")
         parts[node.tag] = node
+        if node.tag in ("parent", "child", "pose"):
+            elements.leaf(node, where)
     parent, child = (_link(parts.get(side), side, where, elements) for side in ("parent", "child"))
     frame = _pose(parts.get("pose"), child, where, elements)
     graph = elements.graph
@@ -132,6 +134,10 @@ def _axis(
             raise elements.fault(
                 where, f"unknown element <{inner.tag}> in <{tag}>", f"Known: {', '.join(known)}"
             )
+        if len(node.findall(inner.tag)) > 1:
+            raise elements.fault(where, f"<{inner.tag}> stands there twice", "Keep one")
+        if inner.tag not in ("limit", "dynamics"):
+            elements.leaf(inner, where)
     xyz = node.find("xyz")
     if xyz is None:
         raise elements.fault(where, f"<{tag}> has no <xyz>", "Give its direction")

@@ -72,7 +72,12 @@ class LoopElements(ElementChecker):
     # -- what every one of them needs ---------------------------------------------------------
 
     def parts(
-        self, node: Element, where: str, needed: dict[str, tuple[str, ...]], *optional: str
+        self,
+        node: Element,
+        where: str,
+        needed: dict[str, tuple[str, ...]],
+        *optional: str,
+        inner: tuple[str, ...] = (),
     ) -> dict[str, Element]:
         """The children of ``node``, each at most once, with no attributes but those named.
 
@@ -80,6 +85,8 @@ class LoopElements(ElementChecker):
         ----------
         needed
             Tags and their attributes; of these elements all but ``optional`` must be there.
+        inner
+            Tags of those that have children of their own.
         """
         found: dict[str, Element] = {}
         for child in node:
@@ -91,6 +98,8 @@ class LoopElements(ElementChecker):
             if tag in found:
                 raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
             self.only(child, where, needed[tag])
+            if tag not in inner:
+                self.leaf(child, where)
             found[tag] = child
         for tag in needed:
             if tag not in found and tag not in optional:
@@ -106,6 +115,15 @@ class LoopElements(ElementChecker):
                     f"<{local_name(node)}> has an unknown attribute {key!r}",
                     f"Known: {', '.join(known) or 'none'}",
                 )
+
+    def leaf(self, node: Element, where: str) -> None:
+        """Refuse elements inside ``node``."""
+        for inner in node:
+            raise self.fault(
+                where,
+                f"unknown element <{local_name(inner)}> in <{local_name(node)}>",
+                "Remove it",
+            )
 
     def link(self, node: Element, key: str, where: str) -> str:
         """The existing link that attribute ``key`` names."""
@@ -188,6 +206,7 @@ class LoopElements(ElementChecker):
             where,
             {"predecessor": ("link",), "successor": ("link",), "axis": ("xyz",)},
             "axis",
+            inner=("predecessor", "successor"),
         )
         ends = []
         for side in ("predecessor", "successor"):
@@ -227,6 +246,7 @@ class LoopElements(ElementChecker):
         ends, axes = [], []
         for child in node:
             tag = local_name(child)
+            self.leaf(child, where)
             if tag == "axis":
                 self.only(child, where, ("xyz",))
                 axes.append(self.numbers(child, "xyz", 3, where))

@@ -82,6 +82,10 @@ class ElementChecker:
             local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
             if tag in read:
                 self.attributes(child, where)
+                if tag not in READ and len(child):
+                    raise self.fault(
+                        where, f"unknown element <{child[0].tag}> in <{tag}>", "Remove it"
+                    )
             elif tag in ignored:
                 self.no_loop_inside(child, where)
                 self.no_inertia_inside(child, where)

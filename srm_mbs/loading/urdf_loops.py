@@ -167,6 +167,7 @@ def _mimics(elements: LoopElements, options: Options, notes: list[str]) -> bool:
             continue
         where = f"joint {name!r}, <mimic>"
         elements.only(mimic, where, ("joint", "multiplier", "offset"))
+        elements.leaf(mimic, where)
         if len(joint.findall("mimic")) > 1:
             raise elements.fault(where, "it stands there twice", "Keep one")
         joint.remove(mimic)

@@ -182,6 +182,8 @@ class UrdfMutator:
         twin = None
         if place.drawn or (tag == "limit" and key in ("lower", "upper")):
             expectation = must_load_unchanged()
+        elif tag == "dynamics":
+            expectation = legal(*MOVING)
         elif tag == "origin":
             expectation = legal(*MOVING)
             node.set(key, OPTIONAL["origin"][key])

@@ -566,6 +566,10 @@ FAULTS = {
     ),
     "gazebo joint with more": (gazebo("ball", "<plugin/>"), "unknown element <plugin>"),
     "second joint with friction": (second("revolute", '<dynamics friction="2"/>'), "friction (2)"),
+    "second joint with armature": (
+        second("revolute", '<dynamics armature="2"/>'),
+        "armature (2)",
+    ),
     "second joint with damping": (second("spherical", '<dynamics damping="2"/>'), "damping (2)"),
     "second joint of a screw": (second("screw", '<thread_pitch value="1"/>'), "type 'screw'"),
     "second joint that mimics": (second("revolute", '<mimic joint="hip"/>'), "it has a <mimic>"),

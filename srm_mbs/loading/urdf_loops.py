@@ -125,18 +125,19 @@ def _close(joint: Element, reader: LoopElements) -> None:
     if limit is not None:
         for key in limit.attrib:
             reader.numbers(limit, key, 1, where)
-    damping, friction = (
+    damping, friction, armature = (
         reader.numbers(dynamics, key, 1, where)[0]
         if (dynamics := joint.find("dynamics")) is not None and dynamics.get(key) is not None
         else 0.0
-        for key in ("damping", "friction")
+        for key in ("damping", "friction", "armature")
     )
-    if friction:
-        raise reader.fault(
-            where,
-            f"its friction ({friction:g}) would not act: a closure has none",
-            'Cut the loop at another joint (cut = ["..."]), or set the friction to 0',
-        )
+    for value, what in ((friction, "friction"), (armature, "armature")):
+        if value:
+            raise reader.fault(
+                where,
+                f"its {what} ({value:g}) would not act: a closure has none",
+                f'Cut the loop at another joint (cut = ["..."]), or set the {what} to 0',
+            )
     if kind == "floating":  # it restrains nothing
         return
     parent, child = (

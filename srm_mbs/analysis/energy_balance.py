@@ -152,11 +152,7 @@ def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
         for name, power in term(run, system).items():
             pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
             works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
-    model = solution.mechanism.model
-    data = model.createData()
-    kinetic = np.array(
-        [pin.computeKineticEnergy(model, data, *x) for x in zip(solution.q, solution.v)]
-    )
+    kinetic = np.array([system.kinetic_energy(*state) for state in zip(solution.q, solution.v)])
     return EnergyBalance(
         solution.t,
         kinetic,

@@ -273,10 +273,17 @@ class _Mechanics:
         speed = max((joint.rotation(v) for joint in self._groups), default=0.0)
         return ROTATION_PER_STEP / speed if speed > 0.0 else np.inf
 
+    def kinetic_energy(self, q: FloatArray, v: FloatArray) -> float:
+        """Kinetic energy (J), rotors on the joints (armature) included."""
+        energy = float(pin.computeKineticEnergy(self.model, self.data, q, v))
+        # Pinocchio's mass matrix has the armature, its energy does not.
+        return energy + 0.5 * float(self.model.armature @ (v * v))
+
     def energy(self, state: FloatArray) -> float:
         """Kinetic plus potential energy (J), of gravity and springs."""
         q, v = self.split(state)
-        energy = float(pin.computeMechanicalEnergy(self.model, self.data, q, v))
+        energy = self.kinetic_energy(q, v)
+        energy += float(pin.computePotentialEnergy(self.model, self.data, q))
         return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 

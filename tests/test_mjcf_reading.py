@@ -164,3 +164,15 @@ def test_a_fault_in_a_constraint_is_named(name: str, tmp_path: Path) -> None:
 def test_a_tendon_whose_force_cannot_act_is_refused(tmp_path: Path) -> None:
     tendon = '<tendon><fixed stiffness="2"><joint joint="j" coef="1"/></fixed></tendon>'
     refused(file(more=tendon), tmp_path, "fixed_tendon_1", "between two sites")
+
+
+def test_elements_too_deep_in_each_other_are_refused_before_the_stack_ends(tmp_path: Path) -> None:
+    chain = "<body>" * 5000 + "</body>" * 5000
+    refused(file(chain), tmp_path, "<body>", "more than 300 elements are in each other")
+    frames = "<frame>" * 299 + "</frame>" * 299
+    refused(file(frames), tmp_path, "<worldbody>", "there is no <body>")
+
+
+def test_a_chain_of_290_bodies_loads() -> None:
+    body = '<body pos="0 0 -0.1"><joint/><geom type="sphere" size="0.05" pos="0 0 -0.1"/>'
+    assert model_of(file(body * 290 + "</body>" * 290)).nv == 290

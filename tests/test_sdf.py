@@ -73,6 +73,9 @@ def test_links_are_placed_relative_to_frames_joints_and_nested_models() -> None:
         joint("inside", "revolute", "hand", "inner::box"),
         joint("weld", "fixed", "base", "far", axis=""),
         f'<model name="inner"><pose relative_to="mount">{ONE}</pose>{link("box", TWO)}</model>',
+        f'<model name="outer"><pose>{ONE}</pose><model name="deep"><pose>{TWO}</pose>'
+        f"{link('end', THREE)}</model></model>",
+        joint("deep_weld", "fixed", "base", "outer::deep::end", axis=""),
     )
     model = tree(text)
     world = of(THREE)
@@ -85,6 +88,7 @@ def test_links_are_placed_relative_to_frames_joints_and_nested_models() -> None:
         "hand": arm * of(THREE) * of(TWO),
         "inner::box": inner * of(TWO),
         "far": inner * of(TWO) * of(THREE),
+        "outer::deep::end": world * of(ONE) * of(TWO) * of(THREE),
     }.items():
         same(placed(model, name), expected)
 

@@ -45,6 +45,7 @@ def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -
                 where, f"it cannot be read: {error}", "The path is relative to the model"
             ) from error
         root = parse_urdf(text, str(folder / name))
+        values.check_depth(root)
         _expanded(values, root, folder, depth + 1)
         node.remove(child)
         for k, inner in enumerate(root):
@@ -148,7 +149,9 @@ def translate(text: str, file: str, options: Options) -> Translation:
             f"the root element is <{root.tag}>, not <mujoco>", file=file, remedy="Give an MJCF file"
         )
     values.attributes(root, "<mujoco>", ("model",))
+    values.check_depth(root)
     _expanded(values, root, Path(file).parent)
+    values.check_depth(root)
     if options.cut:
         raise values.fault(
             "cut", "the joints of an MJCF file are a tree: nothing is to be cut", "Remove cut"

@@ -24,8 +24,6 @@ from srm_mbs.mechanism import WORLD
 JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""
 OURS = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
-DEEPEST = 900
-"""Bodies in each other: Python's own recursion ends there."""
 
 
 class BodyReader:
@@ -63,19 +61,15 @@ class BodyReader:
 
     def world(self, node: Element) -> None:
         """Read a ``<worldbody>``."""
-        self._contents(node, WORLD, pin.SE3.Identity(), "", 0, {})
+        self._contents(node, WORLD, pin.SE3.Identity(), "", {})
 
     # Bodies ---------------------------------------------------------------------------------
 
-    def body(
-        self, node: Element, parent: str, around: pin.SE3, childclass: str, depth: int
-    ) -> None:
+    def body(self, node: Element, parent: str, around: pin.SE3, childclass: str) -> None:
         """Read a ``<body>`` in the frame ``around`` of ``parent``."""
         values = self.values
         name = node.get("name") or f"body_{len(self.placements)}"
         where = f"body {name!r}"
-        if depth > DEEPEST:
-            raise values.fault(where, f"more than {DEEPEST} bodies are in each other", "Split them")
         if name in self.placements or name == WORLD:
             problem = "two bodies have this name" if name != WORLD else "'world' is the ground"
             raise values.fault(where, problem, "Rename one of them")
@@ -94,7 +88,7 @@ class BodyReader:
             self._moving.add(name)
         # Joints first, so that they stand before those of the bodies inside.
         self._joints(node, name, parent, in_parent, childclass)
-        self._contents(node, name, pin.SE3.Identity(), childclass, depth, found)
+        self._contents(node, name, pin.SE3.Identity(), childclass, found)
         self.bodies[name] = self._finished(name, found["inertial"], found["geom"])
 
     def _contents(
@@ -103,7 +97,6 @@ class BodyReader:
         name: str,
         around: pin.SE3,
         childclass: str,
-        depth: int,
         found: dict[str, list[Any]],
     ) -> None:
         """What stands in a body, or in a ``<frame>`` in it; geoms and inertials into ``found``."""
@@ -123,7 +116,7 @@ class BodyReader:
                 case "site":
                     self._site(child, name, around, childclass)
                 case "body":
-                    self.body(child, name, around, childclass, depth + 1)
+                    self.body(child, name, around, childclass)
                 case "frame":
                     values.known(child, where)
                     inner = around * values.placement(child.attrib, f"{where}, <frame>")
@@ -132,7 +125,7 @@ class BodyReader:
                             where, "a joint inside a <frame> is not read", "Put it into the body"
                         )
                     inside = child.get("childclass", childclass)
-                    self._contents(child, name, inner, inside, depth, found)
+                    self._contents(child, name, inner, inside, found)
                 case "joint" | "freejoint" if name == WORLD:
                     raise values.fault("<worldbody>", "the world has no joints", "Put it in a body")
 

@@ -141,7 +141,7 @@ class SdfReader:
             placement, relative_to = placed, ""
         reference = f"{around}{relative_to}" if relative_to not in ("", WORLD) else ""
         if not reference:
-            nested = around or scope.prefix.count(SEPARATOR) > 1
+            nested = around or (scope.prefix and self._has_model)
             reference = f"{around}{MODEL}" if nested else WORLD
         links = [self.link(link, scope) for link in node.findall("link")]
         nested_links = [self.nested(child, scope) for child in node.findall("model")]
@@ -279,6 +279,7 @@ class SdfReader:
     def parsed(self, text: str, file: str) -> Element:
         """Root element of an SDF file."""
         root = parse_urdf(text, file)
+        self.values.check_depth(root)
         if root.tag != "sdf":
             raise InputError(
                 f"the root element is <{root.tag}>, not <sdf>", file=file, remedy="Give an SDF file"

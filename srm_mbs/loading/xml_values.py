@@ -14,6 +14,8 @@ from srm_mbs.loading.description import LARGEST
 
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
+DEEPEST = 300
+"""Most elements in each other."""
 NAMESPACED = re.compile(r"\{[^}]*\}")
 
 
@@ -94,6 +96,19 @@ class XmlValues:
             raise self.fault(where, f"{what} is zero", "Give a direction")
         out: FloatArray = values / length
         return out
+
+    def check_depth(self, root: Element) -> None:
+        """Refuse elements in each other deeper than the readers, which recurse, can follow."""
+        level, depth = [root], 0
+        while level:
+            if depth > DEEPEST:
+                raise self.fault(
+                    f"<{level[0].tag}>",
+                    f"more than {DEEPEST} elements are in each other",
+                    "Write such a long chain as a URDF, which is flat",
+                )
+            level = [child for node in level for child in node]
+            depth += 1
 
     def children(
         self,

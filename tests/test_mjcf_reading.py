@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.loading import mjcf_schema
 from tests.mjcf_files import BODY, TWO, file, model_of, translated
 
 
@@ -176,3 +178,16 @@ def test_elements_too_deep_in_each_other_are_refused_before_the_stack_ends(tmp_p
 def test_a_chain_of_290_bodies_loads() -> None:
     body = '<body pos="0 0 -0.1"><joint/><geom type="sphere" size="0.05" pos="0 0 -0.1"/>'
     assert model_of(file(body * 290 + "</body>" * 290)).nv == 290
+
+
+def test_the_page_of_formats_tells_of_everything_that_is_read() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    page = page[page.index("## MJCF") :]
+    sections = (*mjcf_schema.SECTIONS, *mjcf_schema.IGNORED_SECTIONS)
+    tags = (*sections, *mjcf_schema.BODY_READ, *mjcf_schema.BODY_IGNORED, *mjcf_schema.ATTRIBUTES)
+    missing = [tag for tag in tags if f"<{tag}" not in page]
+    words = [word for words in mjcf_schema.ATTRIBUTES.values() for word in words]
+    words += [*mjcf_schema.JOINT_EQUALITY, *mjcf_schema.IGNORED_ATTRIBUTES["compiler"]]
+    plain = ("name", "refpos", "refquat", "mesh", "scale", "file", "size")
+    missing += [word for word in words if word not in plain and not re.search(rf"\b{word}\b", page)]
+    assert not missing

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.loading import sdf as sdf_module
+from srm_mbs.loading import sdf_joints, sdf_links
 from tests.sdf_files import four_bar, joint, link, sdf
 
 PENDULUM = sdf(link("arm", "0 0 1 0 0 0"), joint("hinge", "revolute", "world", "arm"))
@@ -105,3 +107,18 @@ def test_a_static_model_has_nothing_that_moves(tmp_path: Path) -> None:
     path.write_text(four_bar("<static>true</static>"))
     with pytest.raises(srm.InputError, match="nothing in this mechanism can move"):
         srm.load(path)
+
+
+def test_the_page_of_formats_tells_of_every_element_that_is_known() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    page = page[page.index("## SDF") : page.index("## MJCF")]
+    lists = (
+        *(sdf_module.MODEL_READ, sdf_module.MODEL_IGNORED),
+        *(sdf_module.WORLD_READ, sdf_module.WORLD_IGNORED),
+        *(sdf_links.LINK_READ, sdf_links.LINK_IGNORED, sdf_links.INERTIAL_READ),
+        *(sdf_joints.JOINT_READ, sdf_joints.JOINT_IGNORED, sdf_joints.AXIS_READ),
+        *(sdf_joints.DYNAMICS_READ, sdf_joints.LIMIT_READ, sdf_joints.LIMIT_IGNORED),
+    )
+    missing = [tag for tags in lists for tag in tags if f"<{tag}" not in page]
+    missing += [kind for kind in sdf_joints.TYPES if f"`{kind}`" not in page]
+    assert not missing

@@ -123,7 +123,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(psrm, "split_start", plain_start),
         patch.object(psrm, "split_step", plain_step),
         patch.object(psrm, "split_accept", plain_accept),
-        patch.object(simulation, "_control", control),
+        patch.object(simulation, "placed_control", control),
         patch.object(simulation, "start", start),
         patch.object(simulation, "_bifurcations", lambda _: ""),
         patch.object(Closures, "trouble", lambda *_: ""),

@@ -20,7 +20,10 @@ from srm_mbs.stepping.singular_times import PLACEMENTS
 from srm_mbs.stepping.stepsize import FixedStep, PIControl, StepSizeControl
 
 LOOSEST_RTOL = 1e-4
-"""Looser tolerances let a step jump to another branch at a change point."""
+"""Looser tolerances let sweeps jump to another branch at a change point."""
+LOOSEST_OF_SPLIT = {8: 1e-2, 1: 1e-3}
+"""The split PSRM, which watches its branch itself: order of the error estimate, from which order on
+-> loosest rtol.  Estimates of low order let a run drift away altogether at 1e-2."""
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
 AVOIDABLE = 1e-9
 """Fraction of the run within which of its ends a given singular time cannot be avoided."""
@@ -61,17 +64,25 @@ def numbers(values: Any, what: str, remedy: str) -> FloatArray:
     return array
 
 
-def checked_rtol(value: Any) -> float:
-    """rtol within what the methods can use; warns where it is changed."""
+def loosest_rtol(method: Method) -> float:
+    """The loosest rtol with which ``method`` keeps to its branch of the motion."""
+    if not (isinstance(method, PSRM) and method.correction == "split"):
+        return LOOSEST_RTOL
+    order = method.scheme.controller_order or 1
+    return next(rtol for least, rtol in LOOSEST_OF_SPLIT.items() if order >= least)
+
+
+def checked_rtol(value: Any, loosest: float = LOOSEST_RTOL) -> float:
+    """rtol within what the methods can use, at most ``loosest``; warns where it is changed."""
     rtol = positive(value, "rtol")
-    if rtol > LOOSEST_RTOL:
+    if rtol > loosest:
         warnings.warn(
-            f"rtol = {rtol:g} is looser than {LOOSEST_RTOL:g}, from where a step may jump to "
-            f"another branch at a singular configuration: using {LOOSEST_RTOL:g}",
+            f"rtol = {rtol:g} is looser than {loosest:g}, from where a step may jump to "
+            f"another branch at a singular configuration: using {loosest:g}",
             SrmWarning,
             stacklevel=3,
         )
-        return LOOSEST_RTOL
+        return loosest
     if rtol < TIGHTEST_RTOL:
         warnings.warn(
             f"rtol = {rtol:g} is below round-off: using {TIGHTEST_RTOL:.1e}",

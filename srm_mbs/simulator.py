@@ -14,7 +14,13 @@ from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.psrm import PSRM
-from srm_mbs.options import check_embedded, checked_placement, checked_rtol, positive
+from srm_mbs.options import (
+    check_embedded,
+    checked_placement,
+    checked_rtol,
+    loosest_rtol,
+    positive,
+)
 from srm_mbs.records import Statistics
 from srm_mbs.simulation import (
     absolute_tolerance,
@@ -77,8 +83,8 @@ class Simulator:
         for value, what in ((step, "step"), (max_step, "max_step")):
             if value is not None:
                 positive(value, what, " of seconds")
-        rtol = checked_rtol(rtol)
         checked = mechanism_method(method, tableau)
+        rtol = checked_rtol(rtol, loosest_rtol(checked))
         check_embedded(checked.scheme, step)
         check_consistent(mechanism)
         self._mechanism = mechanism

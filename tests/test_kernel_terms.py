@@ -112,6 +112,6 @@ def test_workspaces_of_large_trees_hold_no_second_derivatives() -> None:
     system = make_system(srm.Mechanism(model))
     before = _resident()
     kept = [kernel.compiled(system) for _ in range(6)]
-    # What one gives back may stay with the process until the next one takes it: once, not six times.
+    # What one gives back may stay with the process until the next one takes it: once, not six.
     assert _resident() - before < 2.5 * 86.0
     assert np.isfinite(kept[0].terms(0.0, np.zeros(2 * model.nv))["rate"]).all()

@@ -161,9 +161,14 @@ def test_a_locked_up_error_estimate_ends_the_run_instead_of_hanging(
 
 
 def test_loose_tolerances_are_capped_with_a_warning(four_bar: srm.Mechanism) -> None:
-    with pytest.warns(srm.SrmWarning, match=r"rtol = 0.001 is looser than 0.0001"):
-        solution = srm.simulate(four_bar, 0.5, rtol=1e-3)
-    assert solution.settings.rtol == 1e-4
+    for tableau, method, loosest in (
+        ("dop853", "psrm", 1e-2),
+        ("dopr54", "psrm", 1e-3),
+        ("tvd32", "srm", 1e-4),
+    ):
+        with pytest.warns(srm.SrmWarning, match=f"rtol = 0.1 is looser than {loosest:g}"):
+            solution = srm.simulate(four_bar, 0.5, rtol=0.1, method=method, tableau=tableau)
+        assert solution.settings.rtol == loosest
 
 
 def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mechanism) -> None:

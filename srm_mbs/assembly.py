@@ -18,7 +18,7 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.closing import ClosureProblem, close_loops
 from srm_mbs.closing_failure import cannot_close, free_coordinates, limits_in_the_way, quoted
 from srm_mbs.coordinates import set_position, set_rate
-from srm_mbs.errors import AssemblyError, InputError
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.joint_limits import beyond_limits, close_within_limits
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
@@ -320,6 +320,18 @@ def _vector(values: Any, size: int, what: str) -> FloatArray:
     return array
 
 
+def _check_distances(problem: ClosureProblem, start: FloatArray) -> None:
+    """Refuse a guess in which the points of a ``distance`` coincide."""
+    try:
+        problem.closure(start)
+    except EvaluationError as error:
+        raise InputError(
+            f"the loops cannot be evaluated at the guess: {error}",
+            element="initial.guess",
+            remedy='Give another guess, or use type = "point" if they are to coincide',
+        ) from error
+
+
 def assemble(
     mechanism: Mechanism,
     q: Mapping[str, Any] | Any = None,
@@ -366,7 +378,8 @@ def assemble(
         or limits in the way, and the nearest values of held joints that close), or if held values
         or rates contradict each other (naming them).
     InputError
-        For unknown joints or malformed values.
+        For unknown joints or malformed values, or a guess in which the points of a ``distance``
+        coincide.
     """
     model = mechanism.model
     start = np.array(mechanism.q0)
@@ -410,6 +423,7 @@ def assemble(
     problem = ClosureProblem(to_close, start)
     closed = start.copy()
     if to_close.loops:
+        _check_distances(problem, start)
         closed = _positions(to_close, problem, start, held, limits)
     if to_close is not mechanism:
         problem = ClosureProblem(mechanism, start)

@@ -24,6 +24,7 @@ from srm_mbs.loop_closure import LoopClosure
 if TYPE_CHECKING:
     from srm_mbs.drives import Drive
     from srm_mbs.laws import Curve
+    from srm_mbs.systems.mobility import Mobility
     from srm_mbs.systems.structure import Structure
 
 __all__ = [
@@ -290,6 +291,16 @@ class Mechanism:
         from srm_mbs.systems.structure import analyse
 
         return analyse(self)
+
+    @property
+    def mobility(self) -> Mobility:
+        """Gruebler counts against the true rank, redundant rows, joints that are stuck or idle.
+
+        An upward import, as for :attr:`structure`.
+        """
+        from srm_mbs.systems.mobility import mobility
+
+        return self.derived("mobility", lambda: mobility(self))  # type: ignore[no-any-return]
 
     @cached_property
     def initial_errors(self) -> tuple[FloatArray, FloatArray]:

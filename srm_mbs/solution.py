@@ -318,6 +318,24 @@ class Solution:
         curves = self.mechanism.drive_curves
         return {name: np.array([curve(t)[1] for t in self.t]) for name, curve in curves.items()}
 
+    @property
+    def coupling_forces(self) -> Mapping[str, FloatArray]:
+        """Per coupling (n, joints): generalised forces on its joints, in their order, N m or N."""
+        out = {}
+        for loop in self.mechanism.loops:
+            for row, lam in zip(loop.rows.joint_rows, self.reaction_multipliers[loop.name].T):
+                out[loop.name] = -np.outer(lam, row.coefficients)
+        return out
+
+    @property
+    def indeterminate_reactions(self) -> tuple[str, ...]:
+        """Closure rows, ``loop.row``, whose reactions equilibrium alone does not determine.
+
+        For these :attr:`reactions`, :attr:`reaction_multipliers` and :attr:`coupling_forces` hold
+        the values of least norm (docs/closures.md); all others are unique.
+        """
+        return self.mechanism.mobility.indeterminate_rows
+
     def to_csv(self, path: str | Path, t: Any = None) -> None:
         """Write the motion as a table; see :func:`srm_mbs.export.write_csv`.
 

@@ -67,15 +67,23 @@ def run_rows(solution: Solution) -> list[tuple[str, str]]:
 def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
     """Degrees of freedom, rank and redundancy: (quantity, value)."""
     structure, source = mechanism.structure, mechanism.source
+    found = mechanism.mobility
+    count = f"{found.joint_freedoms} - {found.rows} = {found.gruebler}"
+    if found.planar_gruebler is not None:
+        count += f", in the plane {found.planar_gruebler}"
+    idle = [f"{', '.join(motion.joints)} ({motion.directions})" for motion in found.idle]
     return [
         ("mechanism", mechanism.name),
         ("read from", "Python" if source is None else f"{source.path} ({source.format})"),
         ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
-        ("closure rows", f"{len(structure.row_names) - len(mechanism.drives)}"),
+        ("Gruebler count", count),
+        ("closure rows", f"{found.rows}"),
         *([("drives", f"{len(mechanism.drives)}")] if mechanism.drives else []),
         ("rank", f"{structure.rank}"),
         ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
         ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
+        ("joints that cannot move", ", ".join(found.unreachable_joints) or "none"),
+        ("joints that move no loop", "; ".join(idle) or "none"),
         ("runs on", BACKENDS[backend()]),
     ]
 

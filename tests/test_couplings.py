@@ -13,9 +13,11 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from srm_mbs.summary import loop_rows
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.multibody import ClosedSystem
 from srm_mbs.systems.units import row_angles, row_dimensions, row_units
+from srm_mbs.visuals import visuals_of
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
@@ -82,6 +84,11 @@ def test_a_gear_pair_turns_as_one_wheel_with_the_effective_inertia(
     (lam,) = run.reaction_multipliers["gear"][0]
     assert -lam == pytest.approx(0.5 * acceleration - 2.0, rel=1e-9)
     assert "gear" not in run.reactions
+    forces = run.coupling_forces["gear"]
+    assert forces.shape == (17, 2)
+    assert_close(forces[:, 0], 0.5 * acceleration - 2.0, atol=1e-9)
+    assert_close(forces[:, 1], 0.2 * (acceleration / -3.0), atol=1e-9)
+    assert run.indeterminate_reactions == ()
 
 
 @on_both
@@ -107,6 +114,7 @@ def test_a_differential_relates_three_joints(backend: str, tmp_path: Path) -> No
     assert_close(run.q, run.q[0] + run.v[0] * t + 0.5 * acceleration * t**2, atol=1e-9)
     assert_close(run.v[0], [-0.5, 1.0, -2.0], atol=1e-12)
     assert_close(run.reaction_multipliers["differential"][:, 0], lam, atol=1e-9)
+    assert_close(run.coupling_forces["differential"], run.t[:, None] * 0.0 - c * lam, atol=1e-9)
     assert_close(run.q @ c, 0.3, atol=1e-12)
     assert run.drift.max() < 1e-11
 
@@ -303,6 +311,31 @@ def test_a_saved_run_with_couplings_is_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.hstack(again(t)), np.hstack(run(t)))
     run.to_csv(tmp_path / "run.csv")
     assert "||g|| (rad),||G v|| (rad/s)" in (tmp_path / "run.csv").read_text()
+
+
+def test_two_gears_that_say_the_same_share_their_force(tmp_path: Path) -> None:
+    """Known as indeterminate, with the sum that the wheels need."""
+    text = GEAR + "ratio = 2.0\n" + GEAR.replace("gear", "twin") + "ratio = 2.0\n" + MOTOR
+    mechanism = load(tmp_path, GEARS, text)
+    assert mechanism.mobility.pivoted_redundancy == 1
+    run = srm.simulate(mechanism, 0.5, rtol=1e-9)
+    assert run.indeterminate_reactions == ("gear.coupling", "twin.coupling")
+    acceleration = 2.0 / (0.5 + 0.2 / 4.0)
+    gear, twin = (run.coupling_forces[name] for name in ("gear", "twin"))
+    assert_close((gear + twin)[:, 1], 0.1 * acceleration, atol=1e-9)
+    assert_close(gear, twin, atol=1e-12)
+
+
+def test_a_mechanism_with_couplings_is_drawn_and_described(tmp_path: Path) -> None:
+    mechanism = load(tmp_path, GEARS, f"{GEAR}ratio = -3.0\noffset = 0.4\n")
+    (row,) = loop_rows(mechanism)
+    assert row[:4] == ("gear", "coupling", "a_joint, b_joint", "a_joint = -3 b_joint +0.4")
+    assert row[4].endswith(" rad")
+    assert len(visuals_of(mechanism)) > 0
+    general = '[[loop]]\ntype = "coupling"\njoints = ["a_joint", "b_joint"]\n'
+    text = f"{general}coefficients = [1.0, 2.5]\noffset = 0.25\n"
+    (row,) = loop_rows(load(tmp_path, GEARS, text))
+    assert row[3] == "+1 a_joint +2.5 b_joint = 0.25"
 
 
 @pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")

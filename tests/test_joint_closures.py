@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
+from srm_mbs.closures import perpendicular_basis
+from srm_mbs.systems.multibody import make_system
 from tests.reduced import trajectory
 from tests.test_couplings import on_both
 
@@ -287,8 +289,10 @@ def tied_body(kind: str, rng: np.random.Generator) -> srm.Mechanism:
     keys: dict[str, Any] = {"axis": tuple(rng.standard_normal(3))}
     if kind == "universal":
         keys = {f"axis_{side}": tuple(rng.standard_normal(3)) for side in "ab"}
-    if kind == "distance":
+    elif kind == "distance":
         keys = {"length": 0.7}
+    elif kind in ("point", "frame"):
+        keys = {}
     return srm.Mechanism(tree.model, (srm.LoopClosure(kind, a, b, name="tie", **keys),))
 
 
@@ -367,3 +371,67 @@ def test_a_guess_in_which_the_points_of_a_distance_coincide_is_refused() -> None
     bare = replace(loop, length=None)
     with pytest.raises(srm.InputError, match="loop 'tie': its two points coincide in the guess"):
         srm.Mechanism(mechanism.model, (bare,), q0=q)
+
+
+# --- reactions ----------------------------------------------------------------------------------
+
+ALL_KINDS = (
+    *KINDS, "point", "frame", "revolute", "point_on_line", "point_on_plane"
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("kind", ALL_KINDS)
+def test_reactions_are_what_a_free_body_needs_to_move_as_it_does(kind: str, swapped: bool) -> None:
+    """Newton and Euler for a spinning body: rnea of its acceleration is the wrench on it."""
+    rng = np.random.default_rng([KINDS.index(kind) if kind in KINDS else 9, 79])
+    mechanism = tied_body(kind, rng)
+    model = mechanism.model
+    model.gravity.linear = np.array([1.0, -4.0, -9.81])
+    (loop,) = mechanism.loops
+    if swapped:
+        loop = replace(loop, a=loop.b, b=loop.a)
+        mechanism = srm.Mechanism(model, (loop,))
+    state = srm.assemble(mechanism, v=rng.standard_normal(6))
+    mechanism = mechanism.with_state(state.q, state.v)
+    run = srm.simulate(mechanism, 0.01, step=0.01)
+    system = make_system(mechanism)
+    acceleration = system.evaluate(0.0, np.concatenate([state.q, state.v])).rate()[6:]
+    data = model.createData()
+    needed = pin.rnea(model, data, state.q, state.v, acceleration)  # force, moment: body's axes
+    pin.forwardKinematics(model, data, state.q)
+    (joint_b, in_b) = loop.resolve(model)[1]
+    at_b = (data.oMi[joint_b] * in_b).translation
+    given = run.reactions["tie"][0] * (1.0 if swapped else -1.0)
+    force, moment = given[:3], given[3:] + np.cross(at_b - data.oMi[1].translation, given[:3])
+    R = data.oMi[1].rotation
+    assert_close(np.concatenate([R.T @ force, R.T @ moment]), needed, atol=1e-10)
+    assert run.indeterminate_reactions == ()
+    assert "tie" not in run.coupling_forces
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reactions_do_no_work_on_what_a_closure_leaves_free(kind: str) -> None:
+    """Along a slide no force, about a free axis no moment: the wrench in the axes of b."""
+    rng = np.random.default_rng([KINDS.index(kind), 80])
+    mechanism = tied_body(kind, rng)
+    mechanism.model.gravity.linear = np.array([1.0, -4.0, -9.81])
+    (loop,) = mechanism.loops
+    state = srm.assemble(mechanism, v=rng.standard_normal(6))
+    run = srm.simulate(mechanism.with_state(state.q, state.v), 0.01, step=0.01)
+    _, (_, in_b) = loop.resolve(mechanism.model)
+    wrench = run.reactions["tie"][0]
+    force, moment = in_b.rotation.T @ wrench[:3], in_b.rotation.T @ wrench[3:]
+    assert np.linalg.norm(wrench) > 0.1
+    axis = np.array(loop.axis or (0.0, 0.0, 1.0))
+    free_directions, free_axes = {
+        "prismatic": ([axis], []),
+        "cylindrical": ([axis], [axis]),
+        "planar": (perpendicular_basis(axis), [axis]),
+        "universal": ([], [loop.axis_b]),
+        "distance": ([], np.eye(3)),
+    }[kind]
+    for direction in free_directions:
+        assert np.array(direction) @ force == pytest.approx(0.0, abs=1e-10)
+    for line in free_axes:
+        assert np.array(line) @ moment == pytest.approx(0.0, abs=1e-10)

@@ -8,6 +8,7 @@ random configurations alone give the wrong rank for over-constrained loops.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,8 +91,19 @@ class Structure:
         return int(np.sum(self.kept)) - self.rank
 
 
-class _Walker:
-    """Closes loops and measures pivots for the analysis."""
+class Walker:
+    """Closes loops and walks on the closure manifold.
+
+    Parameters
+    ----------
+    mechanism, units
+        The mechanism, and the units in which it counts.
+
+    Attributes
+    ----------
+    scale : (rows,)
+        Scale by which rows are divided; ones until :meth:`set_scale`.
+    """
 
     def __init__(self, mechanism: Mechanism, units: Units) -> None:
         self.model = mechanism.model
@@ -177,9 +189,42 @@ class _Walker:
             move = 0.5 * move
         return None
 
+    def walk(
+        self,
+        start: FloatArray,
+        rng: np.random.Generator,
+        restarts: int,
+        steps: int,
+        first: FloatArray | None = None,
+    ) -> Iterator[FloatArray]:
+        """Closed configurations of ``restarts`` random walks of ``steps`` steps from ``start``.
+
+        The first steps of two of them go along the velocity ``first`` (nv,) and against it, unless
+        it is zero.
+        """
+        along = [] if first is None or not np.abs(first).max() > 0.0 else [first, -first]
+        for restart in range(restarts):
+            q = start
+            for k in range(steps):
+                W, U = self.white(q)
+                # Drives take no part: they lead along the closed configurations, wherever that is.
+                left, singular, _ = np.linalg.svd(W[:, : self.closed], full_matrices=True)
+                rank = int(np.sum(singular > 1e-7))
+                null = left[:, rank:]
+                if null.shape[1] == 0:
+                    break
+                # Projected, not combined from the columns of null: their choice is LAPACK's.
+                direction = unwhiten(U, null @ (null.T @ rng.standard_normal(len(U))))
+                if k == 0 and restart < len(along):
+                    direction = along[restart]
+                closed = self.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
+                if closed is not None:
+                    q = closed
+                    yield q
+
 
 def _closed_samples(
-    mechanism: Mechanism, walker: _Walker, rng: np.random.Generator
+    mechanism: Mechanism, walker: Walker, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pivots (n, k) of all rows, those (n, l) of the loops alone, and largest row norms (m,) over
     closed configurations."""
@@ -201,25 +246,8 @@ def _closed_samples(
         record(start)
     else:
         start = np.array(mechanism.q0)
-    moving = bool(np.abs(mechanism.v0).max() > 0.0)
-    for restart in range(RESTARTS):
-        q = start
-        for k in range(WALK_STEPS):
-            W, U = walker.white(q)
-            # Drives take no part: they lead along the closed configurations, wherever that is.
-            left, singular, _ = np.linalg.svd(W[:, :closed_rows], full_matrices=True)
-            rank = int(np.sum(singular > 1e-7))
-            null = left[:, rank:]
-            if null.shape[1] == 0:
-                break
-            # Projected, not combined from the columns of null: their choice is LAPACK's.
-            direction = unwhiten(U, null @ (null.T @ rng.standard_normal(len(U))))
-            if k == 0 and restart < 2 and moving:
-                direction = mechanism.v0 if restart == 0 else -mechanism.v0
-            closed = walker.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
-            if closed is not None:
-                q = closed
-                record(q)
+    for q in walker.walk(start, rng, RESTARTS, WALK_STEPS, mechanism.v0):
+        record(q)
     if closed_rows == rows:
         of_loops = pivots
 
@@ -250,7 +278,7 @@ def analyse(mechanism: Mechanism) -> Structure:
     if not names:
         return Structure((), np.ones(0), np.ones(0, bool), 0, 0, 1.0, units, 0, ())
     rng = np.random.default_rng(0)
-    walker = _Walker(mechanism, units)
+    walker = Walker(mechanism, units)
     walker.set_scale(mechanism, rng)
     pivots, of_loops, largest = _closed_samples(mechanism, walker, rng)
     notes: list[str] = []

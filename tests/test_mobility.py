@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -235,3 +236,20 @@ def test_compounds_end_at_mass_anchors_and_branches() -> None:
     assert chain([0.0, 0.0, 1.0]).idle == (IdleMotion(("0", "1", "2"), 2),)
     assert [m.joints for m in chain([1.0, 1.0, 1.0]).idle] == []
     assert [m.joints for m in chain([0.0, 1.0, 1.0]).idle] == [("0", "1")]
+
+
+def test_drives_take_freedoms_and_share_what_they_hold_together() -> None:
+    """Mobility counts the loops; two motors on one degree of freedom cannot be told apart."""
+    loaded = srm.load("four_bar")
+
+    def driven(*names: str) -> srm.Mechanism:
+        drives = tuple(srm.Drive(srm.ConstantSpeed(0.0), joint=name) for name in names)
+        return replace(loaded, drives=drives)
+
+    one = driven("crank")
+    assert one.degrees_of_freedom == 0
+    assert one.mobility.degrees_of_freedom == 1
+    assert one.mobility.unreachable_joints == ()
+    assert one.mobility.indeterminate_rows == ("pin.y",)
+    two = driven("crank", "rocker")
+    assert set(two.mobility.indeterminate_rows) == {"pin.x", "pin.y", "pin.z", "crank", "rocker"}

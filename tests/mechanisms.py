@@ -15,6 +15,8 @@ CLOSED_MODELS = tuple(
     for name in srm.bundled_models()
     if "[[loop]]" in (models_folder() / f"{name}.toml").read_text(encoding="utf-8")
 )
+ANCHORED_MODELS = tuple(name for name in CLOSED_MODELS if name != "differential")
+"""Those whose closures join bodies; the others are couplings of joints."""
 INDEPENDENT_MODELS = tuple(name for name in CLOSED_MODELS if name != "bricard")
 """Those whose rows that are kept are independent off the closed configurations, too."""
 

@@ -366,7 +366,7 @@ def dense_terms(system: ClosedSystem, state: FloatArray) -> tuple[FloatArray, ..
     data = system.model.createData()
     M = np.triu(pin.crba(system.model, data, q, pin.Convention.WORLD))
     M = M + np.triu(M, 1).T
-    f = -pin.nonLinearEffects(system.model, data, q, v)
+    f = -pin.nonLinearEffects(system.model, data, q, v) - system.model.damping * v
     f += ForceKinematics(system.model, system.mechanism.forces).generalised(data, q, v)
     return M, system.loops.G.copy(), f, system.loops.bias.copy()
 
@@ -457,7 +457,8 @@ def test_one_correction_squares_the_closure_error(name: str) -> None:
         ratios.append(slope * after / before**2)
     # The light rod of the spatial slider-crank takes nearly the whole correction.
     assert max(ratios) < (10.0 if name == "spatial_slider_crank" else 5.0)
-    assert ratios[2] == pytest.approx(ratios[1], rel=0.05)
+    linear = name == "differential"  # solved at once: what is left is rounding
+    assert max(ratios) < 1e-9 if linear else ratios[2] == pytest.approx(ratios[1], rel=0.05)
 
 
 @every_independent_model

@@ -84,6 +84,16 @@ def test_a_fault_is_named_with_its_place(name: str, tmp_path: Path) -> None:
     assert error.remedy
 
 
+def test_an_element_of_another_tool_is_refused_if_it_acts(tmp_path: Path) -> None:
+    path = tmp_path / "drake.sdf"
+    prefixed = PENDULUM.replace("<sdf ", '<sdf xmlns:drake="drake.mit.edu" ')
+    path.write_text(prefixed.replace("<axis>", "<drake:controller_gains/><axis>"))
+    assert any("controller_gains" in note for note in srm.load(path).notes)
+    path.write_text(prefixed.replace("<xyz>", "<drake:rotor_inertia>1</drake:rotor_inertia><xyz>"))
+    with pytest.raises(srm.InputError, match=r"joint 'hinge'.*rotor_inertia.*not read"):
+        srm.load(path)
+
+
 def test_files_that_include_each_other_without_end_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "ring.sdf"
     path.write_text(sdf(link("a"), "<include><uri>ring.sdf</uri><name>inner</name></include>"))

@@ -9,7 +9,7 @@ from typing import Any
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
-from srm_mbs.loading.cut_joints import CLOSURE_OF, bushing
+from srm_mbs.loading.cut_joints import bushing, closure
 from srm_mbs.loading.joint_graph import (
     Body,
     Joint,
@@ -19,7 +19,7 @@ from srm_mbs.loading.joint_graph import (
     spanning_tree,
 )
 from srm_mbs.loading.translation import Translation
-from srm_mbs.loading.urdf_writer import anchor, is_identity, urdf_text
+from srm_mbs.loading.urdf_writer import is_identity, urdf_text
 from srm_mbs.mechanism import WORLD
 
 MODEL_FRAME = "__model__"
@@ -136,17 +136,17 @@ class GraphTranslator:
         ):
             if value:
                 raise self._refuse_cut(joint, why)
-        entry: dict[str, Any] = {
-            "name": joint.name,
-            "type": CLOSURE_OF[joint.type],
-            "a": anchor(joint.child, joint.in_child),
-            "b": anchor(joint.parent, joint.in_parent),
-        }
-        if joint.second_axis is not None:
-            entry["axis_a"], entry["axis_b"] = list(joint.second_axis), list(joint.axis)
-        elif joint.type in ("revolute", "prismatic"):
-            entry["axis"] = list(joint.axis)
-        return entry
+        return closure(
+            joint.type,
+            joint.name,
+            (joint.parent, joint.in_parent),
+            (joint.child, joint.in_child),
+            joint.axis,
+            joint.second_axis,
+            fault=lambda problem, remedy: InputError(
+                problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy
+            ),
+        )
 
     def _bushing(self, joint: Joint) -> list[dict[str, Any]]:
         """Spring and damper of a joint that is cut, in the one direction that it leaves free."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from xml.etree.ElementTree import Element
 
@@ -16,8 +15,7 @@ from srm_mbs.loading.urdf_schema import (
     LOOP_ELEMENTS,
     READ,
 )
-
-NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+from srm_mbs.loading.xml_values import NUMBER
 
 
 class ElementChecker:

@@ -14,6 +14,20 @@ from srm_mbs.loading.description import LARGEST
 
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
+ACTING = (
+    "joint",
+    "constraint",
+    "bushing",
+    "spring",
+    "damper",
+    "inertia",
+    "gear",
+    "mimic",
+    "coupling",
+    "tendon",
+)
+"""Words in the names of other tools' elements that tell that they act, such as
+``drake:rotor_inertia``."""
 DEEPEST = 300
 """Most elements in each other."""
 NAMESPACED = re.compile(r"\{[^}]*\}")
@@ -141,13 +155,24 @@ class XmlValues:
             elif tag in ignored:
                 self.ignore(f"<{tag}> element")
             elif NAMESPACED.match(tag) or ":" in tag:
-                self.ignore(f"<{NAMESPACED.sub('', tag)}> element of another tool")
+                self._other_tool(NAMESPACED.sub("", tag), where)
             else:
                 raise self.fault(
                     where or f"<{tag}>",
                     f"unknown element <{tag}> in <{node.tag}>",
                     f"Known here: {', '.join((*read, *ignored))}",
                 )
+
+    def _other_tool(self, tag: str, where: str) -> None:
+        """Refuse an element with a namespace prefix that acts, by its name; count the others."""
+        found = next((word for word in ACTING if word in tag), None)
+        if found is not None:
+            raise self.fault(
+                f"{where}, <{tag}>",
+                f"this element of another tool (a {found}) is not read by this version",
+                "Describe it in a TOML description and remove the element",
+            )
+        self.ignore(f"<{tag}> element of another tool")
 
     def attributes(
         self, node: Element, where: str, read: Iterable[str], ignored: Iterable[str] = ()

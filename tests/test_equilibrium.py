@@ -164,6 +164,19 @@ def test_motions_that_nothing_resists_are_neutral() -> None:
     assert found.eigenvalues[1] > 1.0
 
 
+def test_a_torque_on_a_wheel_that_nothing_resists_has_no_equilibrium() -> None:
+    model = pin.Model()
+    model.gravity.linear = np.zeros(3)
+    hinge = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "wheel")
+    model.appendBodyToJoint(hinge, rod(), pin.SE3.Identity())
+    mechanism = srm.Mechanism(model, forces=[srm.JointTorque("wheel", 1.0)])
+    with pytest.raises(srm.AnalysisError, match="go on doing work"):
+        srm.equilibrium(mechanism)
+    resting = srm.equilibrium(srm.Mechanism(model))  # without it every angle is one
+    assert resting.neutral
+    np.testing.assert_array_equal(resting.q, [0.0])
+
+
 def test_where_there_is_no_equilibrium_it_says_so() -> None:
     bundled = srm.load("four_bar")
     forces = [srm.JointTorque("crank", 500.0)]

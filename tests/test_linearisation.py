@@ -91,6 +91,19 @@ def test_a_ball_joint_swings_in_two_directions_and_spins() -> None:
     np.testing.assert_allclose(found.eigenvalues.real, 0.0, atol=1e-6)
 
 
+def test_a_spinning_top_has_the_derivatives_of_eulers_equations() -> None:
+    """z' = w + z x w / 2 + ... (rotation vector, body rates), I w' = -w x I w about the pivot."""
+    mechanism = chain([pin.JointModelSpherical()])
+    mechanism.model.gravity.linear = np.zeros(3)
+    w = np.array([0.7, -1.1, 2.3])
+    found = srm.linearise(srm.Mechanism(mechanism.model), [0.0, 0.0, 0.0, 1.0], w)
+    inertia = np.diag([0.24 / 12.0, 1.0 / 3.0, 1.0 / 3.0])
+    turned = np.linalg.solve(inertia, pin.skew(inertia @ w) - pin.skew(w) @ inertia)
+    exact = np.block([[-0.5 * pin.skew(w), np.eye(3)], [np.zeros((3, 3)), turned]])
+    np.testing.assert_allclose(found.A, exact, atol=1e-9)
+    np.testing.assert_allclose(found.drift[:3], w)
+
+
 @pytest.mark.parametrize(
     ("name", "field"),
     [

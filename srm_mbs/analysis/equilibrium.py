@@ -28,7 +28,7 @@ from srm_mbs.systems.reactions import reactions_at
 from srm_mbs.systems.singular import SINGULAR, TAU, nearest_singular, smallest_singular_value
 from srm_mbs.systems.tangent import ChartPoint, TangentChart, differences, tangent_basis
 
-ITERATIONS = 300
+ITERATIONS = 150
 LARGEST_STEP = 0.5
 """Of the trust region: rad, scene diagonals."""
 FARTHEST = 30.0
@@ -209,7 +209,7 @@ def _bounded(values: FloatArray, along: FloatArray, reach: float) -> FloatArray:
 
     along = along.copy()
     lowest = float(values[0])
-    scale = max(float(np.abs(values).max()), 1e-300)
+    scale = max(float(np.abs(values).max()), float(np.abs(along).max()) / reach, 1e-100)
     # On top of a hill nothing pulls: leave it along the steepest direction.
     along[0] += np.copysign(1e-8 * scale * reach, along[0])
 
@@ -232,7 +232,9 @@ def _nearest(statics: _Statics, start: FloatArray) -> FloatArray:
     ends = []
     for statics.sense in (1.0, -1.0):
         with suppress(AnalysisError):
-            ends.append(_descend(statics, start))
+            end = _descend(statics, start)
+            if statics.imbalance(end) <= BALANCED:
+                ends.append(end)
     statics.sense = 1.0
     distances = [np.linalg.norm(statics.geometry.difference(start, end)) for end in ends]
     return ends[int(np.argmin(distances))] if ends else found

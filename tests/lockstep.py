@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs import kernel, options, simulation
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.stepping.breakpoints import Passing, pieces_between
@@ -62,6 +64,13 @@ def control_state(control: Any) -> dict[str, Any]:
         control = control._inner
 
 
+def mass_matrix(mechanism: srm.Mechanism, state: FloatArray) -> FloatArray:
+    """M (nv, nv) at a state."""
+    model = mechanism.model
+    M = np.triu(pin.crba(model, model.createData(), state[: model.nq]))
+    return M + np.triu(M, 1).T  # type: ignore[no-any-return]
+
+
 @dataclass
 class Comparison:
     """Largest differences over all attempts, each over the size that it should be small to.
@@ -70,6 +79,11 @@ class Comparison:
     ----------
     h, state, rates, sigma, correction, error
         Step lengths, states (over units), stage rates, sigma, corrections, error ratios.
+    energy
+        States again, as sqrt(d^T M d): in the norm of the kinetic energy both backends' solves are
+        well conditioned; on single coordinates rounding is magnified by the condition of M.
+    condition
+        Largest condition number of M.
     near
         States of steps next to singular configurations, where rounding is magnified.
     verdicts
@@ -82,6 +96,8 @@ class Comparison:
 
     h: float = 0.0
     state: float = 0.0
+    energy: float = 0.0
+    condition: float = 1.0
     near: float = 0.0
     rates: float = 0.0
     sigma: float = 0.0
@@ -178,6 +194,11 @@ def compare(
             moved = float(np.max(np.abs(change) / scale))
             if result.quiet or not system.has_constraints:
                 out.state = max(out.state, moved)
+                M = mass_matrix(mechanism, x)
+                out.condition = max(out.condition, float(np.linalg.cond(M)))
+                for part in np.split(np.arange(2 * system.nv), 2):
+                    d, s = change[part], scale[part]
+                    out.energy = max(out.energy, float(np.sqrt((d @ M @ d) / (s * s @ np.diag(M)))))
             else:
                 out.near = max(out.near, moved)
             out.rates = max(

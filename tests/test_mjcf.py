@@ -234,3 +234,16 @@ def test_the_inertia_of_an_exact_mesh_is_that_of_mujoco(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         np.linalg.eigvalsh(inertia.inertia), np.sort(theirs.body_inertia[1]), rtol=1e-9
     )
+
+
+@pytest.mark.parametrize("sequence", ["xyz", "XYZ", "zYx", "XyZ", "yXy"])
+def test_euler_angles_turn_about_moving_and_fixed_axes_as_in_mujoco(sequence: str) -> None:
+    twins = Twins(
+        file(
+            BODY.format("one", "j").replace("<body", '<body euler="20 -35 50"'),
+            f'<compiler eulerseq="{sequence}"/>',
+        )
+    )
+    twins.put(np.zeros(1), np.zeros(1))
+    ours, theirs = twins.body("one")
+    np.testing.assert_allclose(ours.homogeneous, theirs.homogeneous, atol=1e-14)

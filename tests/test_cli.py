@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs.cli import app
+from tests.urdf_files import tree
 
 ROOT = Path(srm.__file__).parents[1]
 BOX = """<robot name="box"><link name="box"><inertial><mass value="1"/>
@@ -166,6 +167,18 @@ def test_info_shows_degrees_of_freedom_rank_redundant_rows_joints_and_loops() ->
     kind, a, b, gap = re.split("  +", row(output, "pin"))
     assert (kind, a, b) == ("point", "rod xyz [2, 0, 0] m", "slider")
     assert float(gap.removesuffix(" m")) < 1e-12
+
+
+def test_info_tells_what_was_read_and_what_was_ignored(tmp_path: Path) -> None:
+    assert row(run("info", "four_bar"), "read from").endswith("four_bar.toml (URDF)")
+    path = tmp_path / "robot.yaml"
+    path.write_text("closed_loop: []\ntype: []\nname_mot: [hip]\n")
+    urdf = tree().replace("</robot>", "<transmission/></robot>")
+    (tmp_path / "robot.urdf").write_text(urdf)
+    output = run("info", path)
+    assert row(output, "read from") == f"{path} (Gepetto YAML)"
+    assert "note: joints with motors (name_mot), which exert nothing here: hip" in output
+    assert "note: 1 <transmission> element(s) do not act and are ignored" in output
 
 
 def test_info_of_an_open_chain_has_no_table_of_loops() -> None:

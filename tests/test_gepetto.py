@@ -114,6 +114,11 @@ FAULTS = {
     "no YAML": ("closed_loop: [[\n", "not valid YAML"),
     "no keys": ("- closed_loop\n", "holds no keys"),
     "nothing": ("", "holds no keys"),
+    "aliases of aliases": (
+        "closed_loop: [&a [x, x, x], &b [*a, *a, *a], &c [*b, *b, *b], &d [*c, *c, *c], [*d, *d]]\n"
+        "type: [3d, 3d, 3d, 3d, 3d]\n",
+        "no pair of frames",
+    ),
     "an object": ("closed_loop: !!python/object:os.system []\n", "not valid YAML"),
 }
 

@@ -13,6 +13,7 @@ Parallel lists, whose names are frames and joints of the URDF:
 from __future__ import annotations
 
 import re
+import reprlib  # of nested anchors and aliases: repr would write out all of them
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -129,12 +130,15 @@ def _read(text: str, file: str) -> dict[str, list[Any]]:
     for pair in lists["closed_loop"]:
         if not isinstance(pair, list) or len(pair) != 2 or not all(map(_is_name, pair)):
             raise _fault(
-                file, "closed_loop", f"{pair!r} is no pair of frames", 'Write ["first", "second"]'
+                file,
+                "closed_loop",
+                f"{reprlib.repr(pair)} is no pair of frames",
+                'Write ["first", "second"]',
             )
     for key in ("type", "name_mot", "joint_name", "joint_type"):
         for entry in lists[key]:
             if not _is_name(entry):
-                raise _fault(file, key, f"{entry!r} is no text", "Put it in quotes")
+                raise _fault(file, key, f"{reprlib.repr(entry)} is no text", "Put it in quotes")
     for kind in lists["type"]:
         if kind.lower() not in CLOSURES:
             raise _fault(file, "type", f"there is no type {kind!r}", "Known: 3d, 6d")

@@ -80,7 +80,10 @@ def merged(own: Mapping[str, Any], entries: Mapping[str, Any], urdf: str) -> dic
         if key in dropped or key in out:
             continue
         if key in LISTS:
-            out[key] = [*own.get(key, ()), *entries.get(key, ())]
+            theirs = entries.get(key, ())
+            if key == "lock":
+                theirs = [name for name in theirs if name not in own.get(key, ())]
+            out[key] = [*own.get(key, ()), *theirs]
         elif key in TABLES:
             out[key] = {**entries.get(key, {}), **own.get(key, {})}
         elif key == "initial":

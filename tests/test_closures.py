@@ -100,10 +100,14 @@ def random_loop(kind: str, place: str, rng: np.random.Generator) -> LoopClosure:
 
 
 def evaluate(
-    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
+    model: pin.Model,
+    rows: LoopKinematics,
+    q: FloatArray,
+    v: FloatArray,
+    data: pin.Data | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """g, G and Gdot v at (q, v)."""
-    data = model.createData()
+    data = model.createData() if data is None else data
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, v)
     rows.update(data, q)
@@ -154,9 +158,10 @@ def test_jacobian_is_the_derivative_of_the_rows(kind: str, place: str, seed: int
     q, v = random_state(model, rng)
     rows = LoopKinematics(model, (loop,))
     _, G, _ = evaluate(model, rows, q, v)
+    data = model.createData()
 
     def moved(delta: FloatArray) -> FloatArray:
-        return evaluate(model, rows, pin.integrate(model, q, delta), v)[0]
+        return evaluate(model, rows, pin.integrate(model, q, delta), v, data)[0]
 
     for column, e in enumerate(np.eye(model.nv)):
         expected = extrapolated(lambda h, e=e: (moved(h * e) - moved(-h * e)) / (2 * h), 4e-3)
@@ -684,7 +689,15 @@ def test_the_kernel_evaluates_every_type_like_the_reference(kind: str) -> None:
         units = Units(1.3, np.ones(model.nv), 1.0)
         scale = rng.uniform(0.5, 2.0, len(names))
         mechanism.__dict__["structure"] = Structure(  # the analysis is not what is tested here
-            names, scale, np.ones(len(names), bool), len(names), 0.7, units, 1, ()
+            row_names=names,
+            row_scale=scale,
+            kept=np.ones(len(names), dtype=bool),
+            rank=len(names),
+            loop_rank=len(names),
+            sigma_ref=0.7,
+            units=units,
+            samples=1,
+            notes=(),
         )
         system = ClosedSystem(mechanism)
         for algebra in ("dense", "sparse"):

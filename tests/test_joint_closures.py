@@ -14,11 +14,14 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 import srm_mbs as srm
+from srm_mbs import kernel
 from srm_mbs.arrays import FloatArray
 from srm_mbs.closures import perpendicular_basis
 from srm_mbs.systems.multibody import make_system
+from tests.lockstep import compare
 from tests.reduced import trajectory
 from tests.test_couplings import on_both
+from tests.test_kernel import agree
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
@@ -82,10 +85,12 @@ def check_motion(
     return angle
 
 
-@on_both
-def test_a_hooke_joint_between_two_shafts(backend: str) -> None:
-    """tan a = tan b cos(beta): the driven shaft runs unevenly, twice per turn."""
-    beta, Ia, Ib = 0.6, 0.3, 0.2
+BETA, SHAFTS = 0.6, (0.3, 0.2)
+
+
+def hooke_joint() -> srm.Mechanism:
+    """Two shafts (kg m^2) at the angle BETA."""
+    beta, (Ia, Ib) = BETA, SHAFTS
     bent = Rotation.from_euler("z", beta).as_matrix()
     tree = Tree().body("a", pin.JointModelRX(), inertia=Ia)
     tree.body("b", pin.JointModelRX(), turned=bent, inertia=Ib)
@@ -97,7 +102,14 @@ def test_a_hooke_joint_between_two_shafts(backend: str) -> None:
         axis_b=(0.0, 0.0, 1.0),
         name="cross",
     )
-    mechanism = tree.closed(loop, {"a": 3.0})
+    return tree.closed(loop, {"a": 3.0})
+
+
+@on_both
+def test_a_hooke_joint_between_two_shafts(backend: str) -> None:
+    """tan a = tan b cos(beta): the driven shaft runs unevenly, twice per turn."""
+    beta, (Ia, Ib) = BETA, SHAFTS
+    mechanism = hooke_joint()
     assert mechanism.degrees_of_freedom == 1
     assert mechanism.redundant_rows == ("cross.x", "cross.y", "cross.z")
     run = srm.simulate(mechanism, 5.0, rtol=RTOL, backend=backend)
@@ -112,17 +124,22 @@ def test_a_hooke_joint_between_two_shafts(backend: str) -> None:
     assert_close(b_rate, ratio(a) * run.joint("a")[1], atol=1e-8)
 
 
-@on_both
-def test_a_slider_crank_whose_block_slides_in_a_prismatic_guide(backend: str) -> None:
+def guided_slider_crank() -> srm.Mechanism:
     """Crank r, rod l, block m on an inclined guide through the crank's axis."""
     r, length, guide = 0.4, 1.0, 0.3
     tree = Tree().body("crank", pin.JointModelRY(), inertia=0.05)
     tree.body("rod", pin.JointModelRY(), "crank", (r, 0, 0), mass=2.0, lever=(0.5, 0, 0))
     tree.body("block", pin.JointModelRY(), "rod", (length, 0, 0), mass=3.0)
-    along = (np.cos(guide), 0.0, -np.sin(guide))
     turned = srm.Anchor("world", rpy=(0.0, guide, 0.0))
     loop = srm.LoopClosure("prismatic", srm.Anchor("block"), turned, (1.0, 0.0, 0.0), "guide")
-    mechanism = tree.closed(loop, {"crank": 6.0}, crank=0.9, rod=-0.8, block=0.2)
+    return tree.closed(loop, {"crank": 6.0}, crank=0.9, rod=-0.8, block=0.2)
+
+
+@on_both
+def test_a_slider_crank_whose_block_slides_in_a_prismatic_guide(backend: str) -> None:
+    r, length, guide = 0.4, 1.0, 0.3
+    along = (np.cos(guide), 0.0, -np.sin(guide))
+    mechanism = guided_slider_crank()
     assert mechanism.degrees_of_freedom == 1
     assert len(mechanism.redundant_rows) == 3
     run = srm.simulate(mechanism, 2.5, rtol=RTOL, backend=backend)
@@ -155,9 +172,8 @@ def test_a_slider_crank_whose_block_slides_in_a_prismatic_guide(backend: str) ->
         assert_close(data.oMi[3].translation, distance * np.array(along), atol=1e-9)
 
 
-@on_both
-def test_a_scotch_yoke_with_a_block_flat_in_its_slot(backend: str) -> None:
-    """x = r cos(a): the block, hinged to the crank, stays parallel to the slot."""
+def scotch_yoke() -> srm.Mechanism:
+    """A block, hinged to the crank, flat in the slot of a yoke that slides along gravity."""
     r, g = 0.5, 9.81
     tree = Tree((-g, 0.0, 0.0)).body("yoke", pin.JointModelPX(), mass=2.0)
     tree.body("crank", pin.JointModelRY(), inertia=0.4)
@@ -165,7 +181,14 @@ def test_a_scotch_yoke_with_a_block_flat_in_its_slot(backend: str) -> None:
     loop = srm.LoopClosure(
         "planar", srm.Anchor("block"), srm.Anchor("yoke"), (1.0, 0.0, 0.0), "slot"
     )
-    mechanism = tree.closed(loop, {"crank": 9.0}, crank=0.3)
+    return tree.closed(loop, {"crank": 9.0}, crank=0.3)
+
+
+@on_both
+def test_a_scotch_yoke_with_a_block_flat_in_its_slot(backend: str) -> None:
+    """x = r cos(a), and the block stays parallel to the slot."""
+    r, g = 0.5, 9.81
+    mechanism = scotch_yoke()
     assert mechanism.degrees_of_freedom == 1
     assert len(mechanism.redundant_rows) == 1
     run = srm.simulate(mechanism, 2.0, rtol=RTOL, backend=backend)
@@ -180,8 +203,7 @@ def test_a_scotch_yoke_with_a_block_flat_in_its_slot(backend: str) -> None:
     assert_close(run.joint("block")[0], -crank, atol=1e-9)
 
 
-@on_both
-def test_a_bent_pin_that_slides_in_two_shafts_turns_them_alike(backend: str) -> None:
+def elbow_coupling() -> srm.Mechanism:
     """The elbow coupling: a pin with legs along x and y in holes at radius r of two shafts.
 
     Leg x turns and slides in shaft a (about x), leg y in shaft b (about y) by the closure.  The pin
@@ -200,7 +222,13 @@ def test_a_bent_pin_that_slides_in_two_shafts_turns_them_alike(backend: str) -> 
         (0.0, 1.0, 0.0),
         "hole",
     )
-    mechanism = tree.closed(loop, {"a": 4.0}, a=0.2, sleeve=-0.2, pin=r, b=-0.2)
+    return tree.closed(loop, {"a": 4.0}, a=0.2, sleeve=-0.2, pin=r, b=-0.2)
+
+
+@on_both
+def test_a_bent_pin_that_slides_in_two_shafts_turns_them_alike(backend: str) -> None:
+    r, m = 0.4, 1.5
+    mechanism = elbow_coupling()
     assert mechanism.degrees_of_freedom == 1
     run = srm.simulate(mechanism, 2.0, rtol=RTOL, backend=backend)
     a = check_motion(run, "a", lambda a: 0.5 + m * r**2 * (1.0 + np.sin(a) ** 2))
@@ -272,6 +300,33 @@ def test_a_four_bar_whose_coupler_is_a_distance(backend: str) -> None:
     assert_close(run.reaction_multipliers["rod"][:, 0], tension, atol=1e-7)
     assert_close(np.linalg.norm(run.reactions["rod"][:, :3], axis=1), np.abs(tension), atol=1e-7)
     assert not run.reactions["rod"][:, 3:].any()
+
+
+def geared_pair() -> srm.Mechanism:
+    """A heavy arm geared to a wheel."""
+    tree = Tree((0.0, 0.0, -9.81)).body("arm", pin.JointModelRY(), lever=(0.4, 0, 0))
+    tree.body("wheel", pin.JointModelRY(), at=(1, 0, 0))
+    loop = srm.LoopClosure("coupling", joints=("arm", "wheel"), ratio=-0.7, offset=0.2)
+    return tree.closed(loop, {"arm": 1.0}, arm=0.3)
+
+
+@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+@pytest.mark.parametrize(
+    "make",
+    [
+        hooke_joint,
+        guided_slider_crank,
+        scotch_yoke,
+        elbow_coupling,
+        geared_pair,
+        lambda: distance_four_bar()[0],
+    ],
+    ids=["universal", "prismatic", "planar", "cylindrical", "coupling", "distance"],
+)
+def test_the_kernel_repeats_every_attempt_of_the_reference(
+    make: Callable[[], srm.Mechanism],
+) -> None:
+    agree(compare(make(), 1.0, rtol=1e-8))
 
 
 # --- assembly -----------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from srm_mbs.actions import Event, Switch, impact
     from srm_mbs.analysis.energy_balance import EnergyBalance
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
     from srm_mbs.analysis.following import FollowedPath, follow
@@ -68,6 +69,7 @@ _HOME = {
     "Drive": "drives",
     "EnergyBalance": "analysis.energy_balance",
     "Equilibrium": "analysis.equilibrium",
+    "Event": "actions",
     "FORCE_TYPES": "forces",
     "FollowedPath": "analysis.following",
     "ForceElement": "mechanism",
@@ -92,6 +94,7 @@ _HOME = {
     "SpringDamper": "forces",
     "SrmError": "errors",
     "SrmWarning": "errors",
+    "Switch": "actions",
     "TABLEAUS": "methods.tableaus",
     "Table": "laws",
     "TorsionSpring": "forces",
@@ -105,6 +108,7 @@ _HOME = {
     "follow": "analysis.following",
     "inverse_dynamics": "analysis.inverse_dynamics",
     "linearise": "analysis.linearisation",
+    "impact": "actions",
     "load": "loading",
     "load_solution": "storage",
     "mobility_map": "analysis.mobility",
@@ -132,6 +136,7 @@ __all__ = [
     "Drive",
     "EnergyBalance",
     "Equilibrium",
+    "Event",
     "FollowedPath",
     "ForceElement",
     "InputError",
@@ -152,6 +157,7 @@ __all__ = [
     "SpringDamper",
     "SrmError",
     "SrmWarning",
+    "Switch",
     "Table",
     "TorsionSpring",
     "Wrench",
@@ -162,6 +168,7 @@ __all__ = [
     "convert",
     "equilibrium",
     "follow",
+    "impact",
     "inverse_dynamics",
     "linearise",
     "load",

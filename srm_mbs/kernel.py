@@ -231,6 +231,8 @@ class CompiledRun:
         As for :func:`~srm_mbs.stepping.loop.integrate`.
     pieces
         Of the run; its end is that of the last one.
+    t0
+        Its start (s).
     step, first_step, max_step
         Fixed step or None, first and longest step of step-size control (s).
     placed
@@ -246,13 +248,14 @@ class CompiledRun:
         state: FloatArray,
         pieces: Pieces,
         *,
+        t0: float = 0.0,
         step: float | None,
         first_step: float,
         max_step: float,
         placed: str,
     ) -> None:
         self.twin, self.method, self.norm = twin, method, norm
-        self.start, self.t_end = state.copy(), float(pieces.ends[-1])
+        self.start, self.t0, self.t_end = state.copy(), t0, float(pieces.ends[-1])
         self.adaptive = step is None
         scheme = method.scheme
         gaps = np.array(scheme.gaps)
@@ -279,7 +282,7 @@ class CompiledRun:
                 "memory": _memory(memory),
                 "eps": None if eps is None else (eps.factor, eps.power),
                 "state": np.ascontiguousarray(state),
-                "t0": 0.0,
+                "t0": t0,
                 "ends": pieces.ends,
                 "first": pieces.first,
                 "last": pieces.last,
@@ -433,14 +436,14 @@ def integrate(
         What happens at breakpoints, if there are any.
     """
     state = run.start
-    record = CompiledRecord(0.0, state)
+    record = CompiledRecord(run.t0, state)
     record.run = run
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
     start = state
     try:
         if events is not None:
-            events.begin(0.0, state)
+            events.begin(run.t0, state)
         reason = CHUNK_FULL
         while reason in (CHUNK_FULL, BREAKPOINT):
             made = run.count

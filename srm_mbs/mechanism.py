@@ -235,6 +235,32 @@ class Mechanism:
             )
         set_(self, "friction_speed", speed)
 
+    def with_loop(self, loop: LoopClosure) -> Mechanism:
+        """The same mechanism with one more closure, for :class:`srm_mbs.Switch`.
+
+        Its initial state may violate the closure; a switch brings its own.
+
+        Raises
+        ------
+        InputError
+            As for the mechanism itself: a name that is there, an anchor that is not.
+        """
+        return replace(self, loops=(*self.loops, loop))
+
+    def without_loop(self, name: str) -> Mechanism:
+        """The same mechanism without the closure ``name``.
+
+        Raises
+        ------
+        InputError
+            If there is none; the message lists those there are.
+        """
+        kept = tuple(loop for loop in self.loops if loop.name != name)
+        if len(kept) == len(self.loops):
+            known = ", ".join(repr(loop.name) for loop in self.loops) or "none"
+            raise InputError(f"there is no loop {name!r}", remedy=f"Known: {known}")
+        return replace(self, loops=kept)
+
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
         changed = copy(self)

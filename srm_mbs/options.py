@@ -206,8 +206,24 @@ def check_avoidable(singular_times: FloatArray, breakpoints: FloatArray, t_end: 
         )
 
 
-def checked_samples(sample_time: Any, controller: Any, t_end: float) -> FloatArray:
-    """Times (s) after 0 and before ``t_end`` at which a controller is sampled; often none."""
+def checked_span(t0: Any, t_end: Any) -> tuple[float, float]:
+    """Start and end (s) of a run."""
+    (start,) = numbers([t0], "t0", "Give a number of seconds").tolist()
+    if start == 0.0:
+        return 0.0, positive(t_end, "t_end", " of seconds")
+    (end,) = numbers([t_end], "t_end", "Give a number of seconds").tolist()
+    if not end > start:
+        raise InputError(
+            f"the run ends at {end:g} s, before it starts at {start:g} s",
+            element="t_end",
+            remedy="Give a time after t0",
+        )
+    return start, end
+
+
+def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) -> FloatArray:
+    """Multiples (s) of ``sample_time`` within a run, at which a controller is sampled; often
+    none."""
     if sample_time is None:
         return np.zeros(0)
     period = positive(sample_time, "sample_time", " of seconds")
@@ -217,14 +233,15 @@ def checked_samples(sample_time: Any, controller: Any, t_end: float) -> FloatArr
             element="sample_time",
             remedy="Give controller=, a function of (t, q, v)",
         )
-    count: int = math.ceil(t_end / period - SAMPLED)
-    if count > MOST_SAMPLES:
+    first: int = math.floor(t0 / period + SAMPLED) + 1
+    end: int = math.ceil(t_end / period - SAMPLED)
+    if end - first > MOST_SAMPLES:
         raise InputError(
-            f"sample_time = {period:g} s makes {count} samples",
+            f"sample_time = {period:g} s makes {end - first} samples",
             element="sample_time",
-            remedy=f"Give at least {t_end / MOST_SAMPLES:.1e} s for a run of this length",
+            remedy=f"Give at least {(t_end - t0) / MOST_SAMPLES:.1e} s for a run of this length",
         )
-    return np.arange(1, count, dtype=np.float64) * np.float64(period)
+    return np.arange(first, end, dtype=np.float64) * np.float64(period)
 
 
 def check_embedded(scheme: ButcherTableau, step: float | None) -> None:

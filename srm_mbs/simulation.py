@@ -29,6 +29,7 @@ from srm_mbs.options import (
     checked_rtol,
     checked_samples,
     checked_singular_times,
+    checked_span,
     checked_times,
     loosest_rtol,
     numbers,
@@ -40,7 +41,7 @@ from srm_mbs.records import ATTEMPT, Settings, Statistics
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.breakpoints import Passing, pieces_between
 from srm_mbs.stepping.dense import DenseOutput
-from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
+from srm_mbs.stepping.events import EventWatch, StateFunction, acting, prepare_events
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.loop import RunRecord, Tick, integrate
 from srm_mbs.stepping.remarks import drift, restarts, turns
@@ -66,6 +67,10 @@ TOLD = 2
 BACKENDS = ("auto", "python", "kernel")
 ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
+
+
+_NO_OPTIONS = ("mechanism", "t_end")
+"""Parameters of :func:`simulate` that are none of its options."""
 
 
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
@@ -122,6 +127,8 @@ def check_consistent(mechanism: Mechanism) -> bool:
     """Refuse a start that violates the closures, the drives or their rates; True for any other."""
     v0 = mechanism.v0
     g, c = mechanism.initial_errors
+    if not len(g):
+        return True
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
@@ -158,13 +165,14 @@ def placed_control(
     method: Method,
     step: float | None,
     first_step: Callable[[], float],
-    t_end: float,
+    span: tuple[float, float],
     placement: str,
     singular_times: FloatArray,
 ) -> tuple[StepSizeControl, Sequence[Placing]]:
     """The step-size control of a run, and the wrappers in it that count what they did."""
     scheme = method.scheme
-    control = step_size_control(scheme, 0.0, t_end, step, first_step)
+    t0, t_end = span
+    control = step_size_control(scheme, t0, t_end, step, first_step)
     control, wrappers = placed(
         control, scheme, placement if system.has_constraints else None, singular_times, t_end, step
     )
@@ -178,6 +186,7 @@ def simulate(
     mechanism: Mechanism,
     t_end: float,
     *,
+    t0: float = 0.0,
     q0: Any = None,
     v0: Any = None,
     method: str | Method = "psrm",
@@ -198,14 +207,16 @@ def simulate(
     backend: str = "auto",
     raise_on_failure: bool = False,
 ) -> Solution:
-    """Simulate ``mechanism`` from t = 0 to ``t_end`` (s).
+    """Simulate ``mechanism`` from ``t0`` to ``t_end`` (s).
 
     Parameters
     ----------
     mechanism
         From :func:`srm_mbs.load`, or built from a ``pin.Model``.
     t_end
-        End of the run (s), positive.
+        End of the run (s), after ``t0``.
+    t0
+        Start of the run (s).
     q0 : (nq,), v0 : (nv,)
         Initial state instead of the mechanism's own; must satisfy the closures.
     method
@@ -231,8 +242,9 @@ def simulate(
         A function (t, q, v) -> float or a list of them; an event is where it passes zero.  As in
         ``scipy.integrate.solve_ivp``, the attribute ``terminal`` of the function (a bool, or a
         number of occurrences) ends the run there with status ``event``, and ``direction`` (> 0
-        or < 0) counts only zeros passed upwards or downwards.  Zeros at t = 0 are no events.
-        Located on the dense output (:mod:`srm_mbs.stepping.events`).
+        or < 0) counts only zeros passed upwards or downwards.  Zeros at the start are no events.
+        Located on the dense output (:mod:`srm_mbs.stepping.events`).  The attribute ``action``
+        changes the state or the mechanism there (:class:`srm_mbs.Event`).
     controller
         (t, q, v) -> generalised forces (nv,), N and N m, called at every stage; with
         ``sample_time`` at 0, T, 2 T, ... only, and what it returned is held in between.
@@ -271,13 +283,14 @@ def simulate(
     SimulationError
         Only with ``raise_on_failure``.
     """
+    options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
     if not isinstance(mechanism, Mechanism):
         raise InputError(
             f"{mechanism!r} is not a mechanism",
             element="mechanism",
             remedy="Give srm.load(...) or srm.Mechanism(...)",
         )
-    t_end = positive(t_end, "t_end", " of seconds")
+    t0, t_end = checked_span(t0, t_end)
     for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
         if value is not None:
             positive(value, what, " of seconds")
@@ -293,15 +306,19 @@ def simulate(
             element="backend",
             remedy=f"Give one of {', '.join(BACKENDS)}",
         )
+    if acting(events):
+        from srm_mbs.segments import simulate_segments
+
+        return simulate_segments(mechanism, t_end, dict(options, events=events))
     placement = checked_placement(placement)
-    avoided = checked_singular_times(singular_times, 0.0, t_end)
+    avoided = checked_singular_times(singular_times, t0, t_end)
     method = mechanism_method(method, tableau)
     rtol = checked_rtol(rtol, loosest_rtol(method))
-    times = checked_times(t_eval, 0.0, t_end)
-    samples = checked_samples(sample_time, controller, t_end)
-    kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(0.0, t_end)])
-    pieces = pieces_between(kinks, samples, 0.0, t_end)
-    check_avoidable(avoided, pieces.ends, t_end)
+    times = checked_times(t_eval, t0, t_end)
+    samples = checked_samples(sample_time, controller, t0, t_end)
+    kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(t0, t_end)])
+    pieces = pieces_between(kinks, samples, t0, t_end)
+    check_avoidable(avoided, pieces.ends, t_end - t0)
     on_kernel = uses_kernel(backend, method, placement, avoided)
     mechanism, state = _initial_state(mechanism, q0, v0)
     norm = ErrorNorm(
@@ -324,14 +341,14 @@ def simulate(
         passing = Passing(pieces, system, method, norm, evaluator)
         if held is not None and controller is not None:
             passing.sample = _sampler(system, held, controller, twin)
-            passing.sample(0.0, state)
-        memory = start(system, method, 0.0, state, norm, t_end, evaluator)
+            passing.sample(t0, state)
+        memory = start(system, method, t0, state, norm, t_end, evaluator)
 
         def chosen_first_step() -> float:
             if first_step is not None:
                 return first_step
             order = method.scheme.controller_order or 1
-            return initial_step(evaluator, state, memory, norm, t_end, order)
+            return initial_step(evaluator, state, memory, norm, t_end - t0, order, t0)
 
         longest = np.inf if max_step is None else max_step
         with progress_of(progress, system, t_end) as tick:
@@ -344,6 +361,7 @@ def simulate(
                     memory,
                     state,
                     pieces,
+                    t0=t0,
                     step=step,
                     first_step=chosen_first_step() if step is None else 0.0,
                     max_step=longest,
@@ -352,7 +370,7 @@ def simulate(
                 record = kernel.integrate(system, run, tick=tick, events=watch, passing=passing)
             else:
                 control, wrappers = placed_control(
-                    system, method, step, chosen_first_step, t_end, placement, avoided
+                    system, method, step, chosen_first_step, (t0, t_end), placement, avoided
                 )
                 record = integrate(
                     system,
@@ -361,7 +379,7 @@ def simulate(
                     norm,
                     memory,
                     state,
-                    0.0,
+                    t0,
                     t_end,
                     max_step=longest,
                     tick=tick,
@@ -370,8 +388,8 @@ def simulate(
                 )
         passing.done()
     except (EvaluationError, ControllerError) as error:
-        record = RunRecord(0.0, state.copy())
-        record.status, record.message = "failed", f"Stopped at t = 0 s: {error}."
+        record = RunRecord(t0, state.copy())
+        record.status, record.message = "failed", f"Stopped at t = {t0:.6g} s: {error}."
     settings = Settings(
         type(method).__name__,
         method.scheme.name,

@@ -120,7 +120,7 @@ class Simulator:
                 norm,
                 self._max_step,
                 lambda first: placed_control(
-                    system, method, self._step, lambda: first, np.inf, self._placement, _NONE
+                    system, method, self._step, lambda: first, (0.0, np.inf), self._placement, _NONE
                 ),
             )
         self._nq = mechanism.model.nq

@@ -7,9 +7,10 @@ Nothing is pickled.
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pinocchio as pin
@@ -56,8 +57,9 @@ _STEP_ARRAYS = (
 )
 
 
-def save_solution(solution: Solution, path: Path) -> None:
-    """Write ``solution`` to ``path``; see :meth:`srm_mbs.solution.Solution.save`.
+def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
+    """Write ``solution`` to ``path``, a file name or an open file; see
+    :meth:`srm_mbs.solution.Solution.save`.
 
     Raises
     ------
@@ -126,7 +128,8 @@ def save_solution(solution: Solution, path: Path) -> None:
         "kept": structure.kept,
         "coordinate_unit": structure.units.coordinate,
     }
-    with path.open("wb") as file:  # given a name, numpy would append ".npz" to it
+    opened = path.open("wb") if isinstance(path, Path) else nullcontext(path)
+    with opened as file:  # given a name, numpy would append ".npz" to it
         np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
 
 
@@ -248,14 +251,29 @@ def load_solution(path: str | Path) -> Solution:
     InputError
         If the file is missing, is no saved run, or is of another format.
     """
+    from srm_mbs.segment_storage import load_segments
+
     path = Path(path)
+    segments = load_segments(path) if path.is_file() else None
+    return load_plain(path, str(path)) if segments is None else segments
+
+
+def load_plain(path: Path | IO[bytes], name: str) -> Solution:
+    """A run without segments from a file name or an open file, which messages call ``name``.
+
+    Raises
+    ------
+    InputError
+        As :func:`load_solution`.
+    """
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        opened = path.open("rb") if isinstance(path, Path) else nullcontext(path)
+        with opened as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("meta")))
         if meta["format"] != FORMAT:
             raise InputError(
-                f"it has format {meta['format']}, this version reads {FORMAT}", file=str(path)
+                f"it has format {meta['format']}, this version reads {FORMAT}", file=name
             )
         mechanism = _mechanism(meta["mechanism"], arrays)
         structure = meta["structure"]
@@ -303,12 +321,12 @@ def load_solution(path: str | Path) -> Solution:
             settings=settings,
         )
     except FileNotFoundError as error:
-        raise InputError("there is no such file", file=str(path)) from error
+        raise InputError("there is no such file", file=name) from error
     except InputError as error:
-        raise error.located(str(path)) from error
+        raise error.located(name) from error
     except Exception as error:  # a damaged file makes NumPy and zipfile raise almost anything
         raise InputError(
             f"it is no saved run: {error}",
-            file=str(path),
+            file=name,
             remedy="Give a file written by solution.save or srm-mbs simulate --out",
         ) from error

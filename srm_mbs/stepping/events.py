@@ -46,6 +46,8 @@ from srm_mbs.systems.base import System
 
 AT_START = 1e-10
 """A zero within this fraction of the first step after the start counts as lying on it."""
+RETURNS = 30
+"""Halvings of the first part of a step within which a value that departs from zero may return."""
 NEAR_ZERO = 0.5
 """A vertex is examined if it is nearer to zero than this fraction of its neighbours."""
 
@@ -67,12 +69,21 @@ class Event:
         Number of occurrences that ends the run; infinite if it is not terminal.
     direction
         > 0 for zeros passed upwards, < 0 downwards, 0 for both.
+    acts
+        Whether every occurrence ends the run, because something is to be done there.
+    departs
+        Whether the run starts at an occurrence, from where the value moves away.
+    floor
+        Size of values that count as zero: of an event that closures hold at zero, the rounding.
     """
 
     name: str
     function: StateFunction
     occurrences: float
     direction: float
+    acts: bool = False
+    departs: bool = False
+    floor: float = 0.0
 
     def __call__(self, t: float, state: FloatArray) -> float:
         """The value at ``t``; ``state`` must not be needed any more, the user may write to it.
@@ -92,6 +103,10 @@ class Event:
                 "it must return one finite number"
             )
         return float(value.item())
+
+    def sign(self, value: float) -> float:
+        """Sign of a value; 0 at the floor."""
+        return 0.0 if abs(value) <= self.floor else math.copysign(1.0, value)
 
     def counts(self, rising: bool) -> bool:
         """Whether a zero passed upwards (``rising``) or downwards is an event."""
@@ -147,7 +162,17 @@ def _prepared(event: Any, i: int, adapt: Callable[[Callable[..., Any]], StateFun
             remedy="Give 1 (upwards), -1 (downwards) or 0 (both)",
         )
     label = place if name == "<lambda>" else repr(name)
-    return Event(label, adapt(event), occurrences, _number(direction))
+    acts, departs = (bool(getattr(event, name, False)) for name in ("acts", "departs"))
+    floor = float(getattr(event, "floor", 0.0))
+    return Event(label, adapt(event), occurrences, _number(direction), acts, departs, floor)
+
+
+def acting(events: Any) -> bool:
+    """Whether any of what a user gives as events has an action."""
+    given = [events] if callable(events) else events
+    return isinstance(given, Iterable) and any(
+        getattr(event, "action", None) is not None for event in given
+    )
 
 
 def _number(value: Any) -> float:
@@ -204,7 +229,10 @@ class EventWatch:
         """
         self._start = t
         self._values = [event(t, state.copy()) for event in self._events]
-        self._signs = [float(np.sign(value)) for value in self._values]
+        self._signs = [
+            0.0 if event.departs else event.sign(value)
+            for event, value in zip(self._events, self._values)
+        ]
 
     def after_step(self, state: FloatArray, result: StepResult, t_new: float) -> Stop | None:
         """Record the events of an accepted step from ``state`` to ``t_new``.
@@ -231,23 +259,42 @@ class EventWatch:
         for i, event in enumerate(self._events):
             values = [event(at, x.copy()) for at, x in zip(times, states)]
             nodes = [(t, self._values[i]), *zip(times, values)]
-            found += [
-                (time, i) for time in self._zeros(i, _with_vertices(event, dense, nodes), dense)
-            ]
+            early = None
+            if event.departs and t == self._start and event.counts(rising=values[0] > 0.0):
+                early = self._departing(i, dense, nodes)
+            nodes = _with_vertices(event, dense, nodes)
+            if early is not None:
+                nodes = [early, *(node for node in nodes[1:] if node[0] > early[0])]
+            found += [(time, i) for time in self._zeros(i, nodes, dense)]
             self._values[i] = values[-1]
         if not found:
             return None
         return self._record(sorted(found), dense)
 
+    def _departing(
+        self, i: int, dense: DenseOutput, nodes: list[tuple[float, float]]
+    ) -> tuple[float, float] | None:
+        """A node of the first step between the start and the first of ``nodes`` where the value
+        still has the sign with which it departs, if it returns to zero that soon; else None."""
+        event, (t, _), (after, value) = self._events[i], *nodes[:2]
+        length = after - t
+        for _ in range(RETURNS):
+            length *= 0.5
+            now = _value_at(event, dense, t + length)
+            if now * value < 0.0:
+                self._signs[i] = float(np.sign(now))
+                return t + length, now
+        return None
+
     def _zeros(self, i: int, nodes: list[tuple[float, float]], dense: DenseOutput) -> list[float]:
         """Times at which event ``i`` occurs, given its values at ``nodes``."""
         event = self._events[i]
         earliest = -math.inf
-        if nodes[0][0] == self._start:
+        if nodes[0][0] == self._start and not event.departs:
             earliest = self._start + AT_START * (nodes[-1][0] - self._start)
         zeros = []
         for left, right in pairwise(nodes):
-            before, now = self._signs[i], float(np.sign(right[1]))
+            before, now = self._signs[i], event.sign(right[1])
             self._signs[i] = now
             if before == 0.0 or now == before:
                 continue
@@ -264,7 +311,7 @@ class EventWatch:
             self._times[i].append(time)
             self._states[i].append(dense(np.array([time]))[0])
             event, count = self._events[i], len(self._times[i])
-            if stop is None and count >= event.occurrences:
+            if stop is None and (event.acts or count >= event.occurrences):
                 which = f" (occurrence {count})" if count > 1 else ""
                 message = f"The event {event.name}{which} ended the run at t = {time:.9g} s."
                 stop = Stop(time, message)

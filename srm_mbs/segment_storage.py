@@ -1,0 +1,81 @@
+"""Saved runs of several segments: the files of the segments in one archive."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from srm_mbs.errors import InputError
+from srm_mbs.segmented import SegmentedSolution
+from srm_mbs.storage import load_plain, save_solution
+
+if TYPE_CHECKING:
+    from srm_mbs.solution import Solution
+
+CONTENTS = "segments.json"
+FORMAT = 1
+
+
+def save_segments(solution: SegmentedSolution, path: Path) -> None:
+    """Write ``solution`` to ``path``.
+
+    Raises
+    ------
+    InputError
+        As :func:`srm_mbs.storage.save_solution`.
+    OSError
+        If the file cannot be written.
+    """
+    contents = {
+        "format": FORMAT,
+        "count": len(solution.segments),
+        "status": solution.status,
+        "message": solution.message,
+        "t_eval": None if solution.t_eval is None else solution.t_eval.tolist(),
+    }
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(CONTENTS, json.dumps(contents))
+        for k, segment in enumerate(solution.segments):
+            kept = io.BytesIO()
+            save_solution(segment, kept)
+            archive.writestr(f"{k}.npz", kept.getvalue())
+
+
+def load_segments(path: Path) -> Solution | None:
+    """The run in ``path``; None if it is no archive of segments.
+
+    Raises
+    ------
+    InputError
+        If it is one, but damaged or of another format.
+    """
+    if not zipfile.is_zipfile(path):
+        return None
+    with zipfile.ZipFile(path) as archive:
+        if CONTENTS not in archive.namelist():
+            return None
+        try:
+            contents = json.loads(archive.read(CONTENTS))
+            if contents["format"] != FORMAT:
+                raise InputError(
+                    f"its segments have format {contents['format']}, this version reads {FORMAT}"
+                )
+            t_eval = contents["t_eval"]
+            return SegmentedSolution(
+                [
+                    load_plain(io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}")
+                    for k in range(contents["count"])
+                ],
+                t_eval=None if t_eval is None else np.array(t_eval),
+                status=contents["status"],
+                message=contents["message"],
+            )
+        except InputError as error:
+            raise error.located(str(path)) from error
+        except Exception as error:
+            raise InputError(f"it is no saved run: {error}", file=str(path)) from error

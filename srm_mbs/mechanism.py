@@ -261,6 +261,28 @@ class Mechanism:
             raise InputError(f"there is no loop {name!r}", remedy=f"Known: {known}")
         return replace(self, loops=kept)
 
+    def without_drive(self, name: str) -> Mechanism:
+        """The same mechanism without the drive ``name``.
+
+        Raises
+        ------
+        InputError
+            If there is none; the message lists those there are.
+        """
+        kept = tuple(drive for drive in self.drives if drive.name != name)
+        if len(kept) == len(self.drives):
+            known = ", ".join(repr(drive.name) for drive in self.drives) or "none"
+            raise InputError(f"there is no drive {name!r}", remedy=f"Known: {known}")
+        return replace(self, drives=kept)
+
+    def moved(self, q: Any, v: Any) -> Mechanism:
+        """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with
+        :meth:`with_state`, drives go on as they were."""
+        changed = self.with_state(q, v)
+        if self.drives:
+            changed.__dict__["drive_curves"] = self.drive_curves
+        return changed
+
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
         changed = copy(self)

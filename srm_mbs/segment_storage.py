@@ -54,11 +54,14 @@ def load_segments(path: Path) -> Solution | None:
     InputError
         If it is one, but damaged or of another format.
     """
-    if not zipfile.is_zipfile(path):
+    try:
+        with zipfile.ZipFile(path) as archive:
+            segmented = CONTENTS in archive.namelist()
+    except Exception:  # what is damaged is named by the reader of plain runs
+        return None
+    if not segmented:
         return None
     with zipfile.ZipFile(path) as archive:
-        if CONTENTS not in archive.namelist():
-            return None
         try:
             contents = json.loads(archive.read(CONTENTS))
             if contents["format"] != FORMAT:

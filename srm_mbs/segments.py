@@ -76,6 +76,12 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
     given = options["events"]
     events = [given] if callable(given) else list(given)
     prepared = prepare_events(given, lambda event: lambda t, x: 0.0)
+    if options["t0"] == 0.0 and not (options["q0"] is None and options["v0"] is None):
+        # Drives begin with this state.
+        q0, v0 = options["q0"], options["v0"]
+        mechanism = mechanism.with_state(
+            mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
+        )
     t_eval = checked_times(options["t_eval"], options["t0"], t_end)
     asked = options["raise_on_failure"]
     here = options | {"t_eval": None, "raise_on_failure": False}
@@ -165,8 +171,8 @@ def _after(
                 mechanism, q, v = _switched(mechanism, answer, t, q, v)
             else:
                 q, v = (np.asarray(part, dtype=float) for part in answer)
-                moved = mechanism.with_state(q, v)
-                check_consistent(moved)
+                moved = mechanism.moved(q, v)
+                check_consistent(moved, t)
                 q, v = moved.q0, moved.v0
         except (InputError, EvaluationError, TypeError, ValueError) as error:
             raise EventError(
@@ -181,11 +187,16 @@ def _switched(
     new = switch.mechanism
     if not isinstance(new, Mechanism) or list(new.model.names) != list(mechanism.model.names):
         raise InputError("a switch must be to a mechanism with the same joints")
+    curves = dict(new.drive_curves)
+    for drive in new.drives:
+        if drive in mechanism.drives:  # it goes on
+            curves[drive.name] = mechanism.drive_curves[drive.name]
     new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
+    new.__dict__["drive_curves"] = curves
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)
     if system.size(system.difference(given, x)) > SNAPS:
-        check_consistent(new)
+        check_consistent(new, t)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

@@ -52,6 +52,7 @@ from srm_mbs.stepping.stepsize import (
     Verdict,
     initial_step,
 )
+from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, called, make_system
 from srm_mbs.systems.units import constraint_units
@@ -114,19 +115,27 @@ def _event_watch(
     return EventWatch(system, method.scheme, prepare_events(events, adapt), state.size)
 
 
-def _initial_state(mechanism: Mechanism, q0: Any, v0: Any) -> tuple[Mechanism, FloatArray]:
-    """The mechanism with the requested start, and the state (q, v)."""
+def _initial_state(
+    mechanism: Mechanism, t0: float, q0: Any, v0: Any
+) -> tuple[Mechanism, FloatArray]:
+    """The mechanism with the requested start, and the state (q, v).
+
+    Drives begin with the state at 0; a later start is one of the motion from there.
+    """
     if q0 is not None or v0 is not None:
-        mechanism = mechanism.with_state(
-            mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
-        )
+        start_at = mechanism.with_state if t0 == 0.0 else mechanism.moved
+        mechanism = start_at(mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0)
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def check_consistent(mechanism: Mechanism) -> bool:
-    """Refuse a start that violates the closures, the drives or their rates; True for any other."""
-    v0 = mechanism.v0
-    g, c = mechanism.initial_errors
+def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
+    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates; True for
+    any other."""
+    q0, v0 = mechanism.q0, mechanism.v0
+    if t == 0.0:
+        g, c = mechanism.initial_errors
+    else:
+        g, c = (e[0] for e in constraint_errors(mechanism, np.array([t]), q0[None], v0[None]))
     if not len(g):
         return True
     units = mechanism.structure.units
@@ -216,7 +225,8 @@ def simulate(
     t_end
         End of the run (s), after ``t0``.
     t0
-        Start of the run (s).
+        Start of the run (s).  Drives count from 0: ``q0`` and ``v0`` are then a state of the
+        motion that they prescribe from the mechanism's own initial state.
     q0 : (nq,), v0 : (nv,)
         Initial state instead of the mechanism's own; must satisfy the closures.
     method
@@ -320,7 +330,7 @@ def simulate(
     pieces = pieces_between(kinks, samples, t0, t_end)
     check_avoidable(avoided, pieces.ends, t_end - t0)
     on_kernel = uses_kernel(backend, method, placement, avoided)
-    mechanism, state = _initial_state(mechanism, q0, v0)
+    mechanism, state = _initial_state(mechanism, t0, q0, v0)
     norm = ErrorNorm(
         absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
     )
@@ -328,7 +338,7 @@ def simulate(
     system = make_system(mechanism, controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
-        mechanism.at_start("consistent", lambda: check_consistent(mechanism))
+        mechanism.at_start(f"consistent at {t0!r}", lambda: check_consistent(mechanism, t0))
 
     watch = _event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()

@@ -35,6 +35,8 @@ from srm_mbs.systems.consistent import onto_closures
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import make_system
 
+NEAR = 1e-14
+"""Distance of a breakpoint from the end of a step that is rounding, over the time."""
 _NONE = np.zeros(0)
 
 
@@ -193,7 +195,9 @@ class Simulator:
         t = run.t
         end = t + dt
         try:
-            kinks = self._mechanism.breakpoints(t, end)
+            # Those at the ends count, too: what acts just before and behind them differs.
+            beside = NEAR * (abs(t) + dt)
+            kinks = self._mechanism.breakpoints(t - beside, end + beside)
             if len(kinks):
                 trouble = self._piecewise(np.asarray(kinks, dtype=float), t, end, force)
             else:
@@ -297,7 +301,7 @@ class Simulator:
     def _consistent(self, q: Any, v: Any, t: float, project: bool) -> FloatArray:
         if project:
             try:
-                given = self._mechanism.with_state(q, v)
+                given = self._mechanism.moved(q, v)
                 state = np.concatenate([given.q0, given.v0])
                 state = onto_closures(self._system, t, state)
             except EvaluationError as error:
@@ -307,8 +311,8 @@ class Simulator:
                     remedy="Use srm.assemble(mechanism, q=..., v=...)",
                 ) from error
             q, v = state[: self._nq], state[self._nq :]
-        moved = self._mechanism.with_state(q, v)
-        check_consistent(moved)
+        moved = self._mechanism.moved(q, v)
+        check_consistent(moved, t)
         return np.concatenate([moved.q0, moved.v0])
 
     def clone(self) -> Simulator:

@@ -187,6 +187,37 @@ def test_a_closure_lets_go_and_the_mechanism_falls_on_freely(backend: str) -> No
     assert len(solution.crossings) == len(before.crossings)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_drive_lets_go(backend: str) -> None:
+    """The crank turns at constant speed, passes a singular configuration, and is then free."""
+    free = srm.load("slider_crank")
+    speed = 4.0
+    driven = srm.Mechanism(
+        free.model,
+        free.loops,
+        drives=(srm.Drive(srm.ConstantSpeed(speed), joint="crank"),),
+        q0=free.q0,
+        v0=[speed, -2.0 * speed],
+    )
+    event = srm.Event(clock(0.6), action=lambda t, q, v: srm.Switch(driven.without_drive("crank")))
+    options: dict[str, Any] = {"rtol": 1e-10, "backend": backend}
+    solution = srm.simulate(driven, 1.2, events=[event], **options)
+    assert solution.success
+    angle = float(free.q0[0]) + speed * 0.6
+    q, v = solution(0.6)
+    assert q[0] == pytest.approx(angle, abs=1e-12)
+    assert v[0] == pytest.approx(speed, abs=1e-9)
+    after = srm.simulate(free, 0.6, q0=q, v0=v, **options)
+    assert np.abs(solution.q[-1] - after.q[-1]).max() < 1e-8
+    with pytest.raises(srm.InputError, match="there is no drive"):
+        free.without_drive("crank")
+    # Another event leaves the drive as it was: it goes on, not from the new state.
+    nothing = srm.Event(clock(0.3), action=lambda t, q, v: None)
+    on = srm.simulate(driven, 0.9, events=[nothing], **options)
+    assert on.success
+    assert on.q[-1, 0] == pytest.approx(float(free.q0[0]) + speed * 0.9, abs=1e-11)
+
+
 def test_an_impact_in_a_loop_keeps_the_loop_and_loses_the_energy_it_should() -> None:
     """The crank hits a stop: with one degree of freedom the whole velocity turns, times e."""
     mechanism = srm.load("slider_crank")

@@ -202,6 +202,28 @@ def test_joints_of_many_degrees_are_stepped() -> None:
     assert np.abs(simulator.v - after.v[-1]).max() < 1e-7
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("dt", [0.1, 0.07])
+def test_drives_have_their_knots_between_steps_and_on_them(backend: str, dt: float) -> None:
+    """The crank follows a table with kinks in its acceleration."""
+    free = srm.load("slider_crank")
+    start = float(free.q0[0])
+    law = srm.Table([0.0, 0.3, 0.5, 2.0], [0.0, 0.2, 0.5, 1.5])
+    drive = srm.Drive(law, joint="crank")
+    rest = srm.Mechanism(free.model, free.loops, drives=(drive,), q0=free.q0)
+    state = srm.assemble(rest)
+    mechanism = rest.with_state(state.q, state.v)
+    simulator = srm.Simulator(mechanism, backend=backend, tableau="dopr54", rtol=1e-9)
+    run = srm.simulate(mechanism, 1.0, backend=backend, tableau="dopr54", rtol=1e-9)
+    for _ in range(round(0.98 / dt)):
+        q, v = simulator.step(dt)
+        exact = run(simulator.t)
+        assert np.abs(q - exact[0]).max() < 1e-8
+        assert np.abs(v - exact[1]).max() < 1e-7
+    assert simulator.stats.rejected <= 3
+    assert abs(q[0] - start) > 0.5
+
+
 @needs_kernel
 def test_a_step_costs_little_more_than_its_integration(slider_crank: srm.Mechanism) -> None:
     simulator = srm.Simulator(slider_crank)

@@ -162,6 +162,13 @@ def test_an_older_axis_may_be_in_the_parent_models_frame() -> None:
     np.testing.assert_allclose(turned, pin.rpy.rpyToMatrix(0.0, 0.0, 0.7), atol=1e-12)
 
 
+def test_a_joint_and_a_link_of_an_older_file_may_have_one_name() -> None:
+    text = sdf(link("arm", ONE), joint("arm", "revolute", "world", "arm"), version="1.6")
+    assert list(tree(text).names)[1:] == ["arm"]
+    with pytest.raises(srm.InputError, match="are called 'arm'"):
+        tree(text.replace("1.6", "1.9"))
+
+
 @pytest.mark.parametrize("angle", [0.5 * np.pi, 0.5 * np.pi - 1e-9, 1.5708, -0.5 * np.pi, 0.3])
 def test_roll_pitch_and_yaw_are_accurate_at_any_pitch(angle: float) -> None:
     rotation = pin.rpy.rpyToMatrix(0.4, angle, -1.3)

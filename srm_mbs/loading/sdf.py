@@ -20,8 +20,8 @@ from srm_mbs.loading.graph_translation import GraphTranslator
 from srm_mbs.loading.joint_graph import Body, Joint
 from srm_mbs.loading.safe_xml import parse_urdf
 from srm_mbs.loading.sdf_joints import JointReader
-from srm_mbs.loading.sdf_links import read_link
-from srm_mbs.loading.sdf_poses import MODEL, RESERVED, SEPARATOR, Frames, pose
+from srm_mbs.loading.sdf_links import PlaceOf, read_link
+from srm_mbs.loading.sdf_poses import MODEL, RESERVED, SEPARATOR, Frames, joint_frame, pose
 from srm_mbs.loading.translation import Options, Translation
 from srm_mbs.loading.xml_values import XmlValues
 from srm_mbs.mechanism import WORLD
@@ -77,6 +77,7 @@ class SdfReader:
         self.frames = Frames(file)
         self.bodies: dict[str, Body] = {}
         self.fixed: list[str] = []
+        self._has_model = True  # not a world around several
         self.reader = JointReader(self.values, self.frames)
         self._joint_nodes: list[tuple[Element, _Scope]] = []
 
@@ -98,7 +99,7 @@ class SdfReader:
         placement = pose(self.values, child.text, where, in_degrees, form == "quat_xyzw")
         return placement, child.get("frame" if older else "relative_to", "").strip()
 
-    def own_place(self, scope: _Scope) -> Any:
+    def own_place(self, scope: _Scope) -> PlaceOf:
         """Reads poses that are relative to what they stand in, and to nothing else."""
 
         def place_of(node: Element, where: str) -> pin.SE3:
@@ -198,8 +199,6 @@ class SdfReader:
         )
         self.frames.add(name, to, placement, where, attached_to=held)
 
-    _has_model = True
-
     def joint_frame(self, node: Element, scope: _Scope) -> None:
         """Place a joint's frame; the joint is read when all frames are known."""
         name = self.name(node, scope)
@@ -209,7 +208,8 @@ class SdfReader:
         reference = relative_to or child
         full = WORLD if reference == WORLD else scope.prefix + reference
         held = WORLD if child == WORLD else scope.prefix + child
-        self.frames.add(name, full, placement, where, attached_to=held)
+        own = joint_frame(name, scope.version)
+        self.frames.add(own, full, placement, where, attached_to=held)
         self._joint_nodes.append((node, scope))
 
     def include(self, node: Element, scope: _Scope) -> str:

@@ -13,7 +13,7 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.loading.joint_graph import UNLIMITED, Body, Direction, Joint
-from srm_mbs.loading.sdf_poses import Frames
+from srm_mbs.loading.sdf_poses import Frames, joint_frame
 from srm_mbs.loading.xml_values import XmlValues
 from srm_mbs.mechanism import WORLD
 
@@ -85,6 +85,7 @@ class JointReader:
         self.values, self.frames = values, frames
         self.joints: list[Joint] = []
         self.between: dict[str, Body] = {}
+        self._frame_of: dict[str, str] = {}
         self._gearboxes: list[Gearbox] = []
         self._mimics: list[tuple[str, str, Element]] = []
 
@@ -99,6 +100,7 @@ class JointReader:
         name = prefix + node.get("name", "")
         where = f"joint {name!r}"
         values = self.values
+        self._frame_of[name] = joint_frame(name, version)
         values.attributes(node, where, ("name", "type"))
         values.children(node, where, JOINT_READ, JOINT_IGNORED)
         kind = node.get("type", "")
@@ -123,13 +125,17 @@ class JointReader:
         if kind == "gearbox":
             self._gearboxes.append(self._gearbox(node, name, prefix, (ends[0], ends[1]), axes))
             return
-        at = self.frames.placement(name, where)
+        at = self._placement(name)
         in_parent, in_child = (self.frames.placement(end, where).actInv(at) for end in ends)
         joint = Joint(name, "fixed", ends[0], ends[1], in_parent, in_child)
         self._add(joint, kind, axes, node)
         for axis in axes:
             if axis.mimic is not None:
                 self._mimics.append((name, prefix, axis.mimic))
+
+    def _placement(self, name: str) -> pin.SE3:
+        """Of a joint's frame, in the world."""
+        return self.frames.placement(self._frame_of[name], f"joint {name!r}")
 
     def end(self, node: Element, side: str, prefix: str, name: str) -> str:
         """The link that a joint's parent or child belongs to."""
@@ -229,7 +235,7 @@ class JointReader:
             )
         if frame:
             turn = self.frames.placement(prefix + frame, where).rotation
-            direction = self.frames.placement(name, where).rotation.T @ turn @ direction
+            direction = self._placement(name).rotation.T @ turn @ direction
         start = node.find("initial_position")
         if start is not None and values.numbers(start.text, 1, where, "<initial_position>").any():
             raise values.fault(
@@ -290,7 +296,7 @@ class JointReader:
         )[0]
         if ratio == 0.0:
             raise self.fault(name, "<gearbox_ratio> is zero", "Give the ratio of the angles")
-        turn = self.frames.placement(name, where).rotation
+        turn = self._placement(name).rotation
         one, other = (turn @ np.array(axis.direction) for axis in axes)
         full = self.frames.body(WORLD if reference == WORLD else prefix + reference, where)
         return Gearbox(name, full, *ends, float(ratio), (one, other))

@@ -21,6 +21,11 @@ SEPARATOR = "::"
 RESERVED = ("world", "__model__", "__root__")
 
 
+def joint_frame(name: str, version: tuple[int, int]) -> str:
+    """Name of a joint's frame; before SDF 1.7 nothing names it, and links may be called alike."""
+    return name if version >= (1, 7) else f"{name}{SEPARATOR}__joint__"
+
+
 def pose(
     values: XmlValues, text: str | None, where: str, degrees: bool, quaternion: bool
 ) -> pin.SE3:

@@ -234,7 +234,8 @@ def assembled(description: Description, source: Source, notes: Sequence[str] = (
     mechanism, q, v = unassembled(description, source, notes)
     try:
         state = assemble(mechanism, q, v)
-        if np.array_equal(state.q, mechanism.q0):  # closed as it was: so is what was analysed
+        # What was analysed stays if nothing changed; the walk goes along the velocity, too.
+        if np.array_equal(state.q, mechanism.q0) and np.array_equal(state.v, mechanism.v0):
             mechanism = mechanism.with_state(state.q, state.v)
         else:  # a fresh mechanism: its structure is analysed from the assembled state
             mechanism = replace(mechanism, q0=state.q, v0=state.v)

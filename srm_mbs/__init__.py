@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from srm_mbs.methods.srm import SRM
     from srm_mbs.methods.tableaus import TABLEAUS
     from srm_mbs.motion import JointMotion
+    from srm_mbs.pinocchio_constraints import closures_from_pinocchio
     from srm_mbs.semi_explicit import SemiExplicitDAE
     from srm_mbs.simulation import simulate
     from srm_mbs.simulator import Simulator
@@ -108,6 +109,7 @@ _HOME = {
     "follow": "analysis.following",
     "inverse_dynamics": "analysis.inverse_dynamics",
     "linearise": "analysis.linearisation",
+    "closures_from_pinocchio": "pinocchio_constraints",
     "impact": "actions",
     "load": "loading",
     "load_solution": "storage",
@@ -165,6 +167,7 @@ __all__ = [
     "assembly_modes",
     "backend",
     "bundled_models",
+    "closures_from_pinocchio",
     "convert",
     "equilibrium",
     "follow",

@@ -24,6 +24,7 @@ from srm_mbs.loop_closure import LoopClosure
 if TYPE_CHECKING:
     from srm_mbs.drives import Drive
     from srm_mbs.laws import Curve
+    from srm_mbs.pinocchio_constraints import PinocchioConstraints
     from srm_mbs.systems.mobility import Mobility
     from srm_mbs.systems.structure import Structure
 
@@ -260,6 +261,35 @@ class Mechanism:
             known = ", ".join(repr(loop.name) for loop in self.loops) or "none"
             raise InputError(f"there is no loop {name!r}", remedy=f"Known: {known}")
         return replace(self, loops=kept)
+
+    @classmethod
+    def from_pinocchio(cls, model: pin.Model, constraint_models: Any, **options: Any) -> Mechanism:
+        """A mechanism whose closures are Pinocchio's constraint models.
+
+        Parameters
+        ----------
+        model
+            The tree.
+        constraint_models
+            As for :func:`srm_mbs.closures_from_pinocchio`.
+        options
+            Other parameters of the class.
+
+        Raises
+        ------
+        InputError
+            For a constraint model that is none of its closures.
+        """
+        from srm_mbs.pinocchio_constraints import closures_from_pinocchio
+
+        return cls(model, closures_from_pinocchio(model, constraint_models), **options)
+
+    def to_pinocchio(self) -> PinocchioConstraints:
+        """The closures as Pinocchio's constraint models, as far as it has them: point and frame;
+        the others are named."""
+        from srm_mbs.pinocchio_constraints import to_pinocchio
+
+        return to_pinocchio(self)
 
     def without_drive(self, name: str) -> Mechanism:
         """The same mechanism without the drive ``name``.

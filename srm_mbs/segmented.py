@@ -6,18 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
-from srm_mbs.errors import InputError
 from srm_mbs.records import Statistics
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.bifurcations import Bifurcation
 from srm_mbs.stepping.crossings import Crossing
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.held import HeldForce
+
+if TYPE_CHECKING:
+    from srm_mbs.analysis.energy_balance import EnergyBalance
 
 
 class SegmentedSolution(Solution):
@@ -173,18 +175,12 @@ class SegmentedSolution(Solution):
         return self._rows(lambda part: part.degrees_of_freedom)
 
     @cached_property
-    def energy_balance(self) -> Any:
-        """Only of a segment: impacts take energy away.
+    def energy_balance(self) -> EnergyBalance:
+        """See :attr:`~srm_mbs.Solution.energy_balance`; what actions change is in ``events``."""
+        from srm_mbs.analysis.energy_balance import joined_balance
 
-        Raises
-        ------
-        InputError
-            Always.
-        """
-        raise InputError(
-            "the energy is not balanced over the actions of events",
-            remedy="Read solution.segments[k].energy_balance",
-        )
+        order = None if self._parts is self.segments else self._order
+        return joined_balance(self.segments, self._parts, order)
 
     def _named(self, which: str) -> Mapping[str, FloatArray]:
         tables = [getattr(part, which) for part in self._parts]

@@ -190,6 +190,33 @@ def test_it_can_be_read_at_any_times_and_ends_at_a_terminal_event() -> None:
     )
 
 
+def test_impacts_take_what_restitution_says() -> None:
+    """A damped mass falls on a floor: at each impact 1 - e^2 of its kinetic energy is lost."""
+    model = pin.Model()
+    slide = model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(slide, rod(2.0), pin.SE3.Identity())
+    model.damping = np.array([0.5])
+    mechanism = srm.Mechanism(model, q0=[1.0])
+    floor = srm.Event(
+        lambda t, q, v: float(q[0]), direction=-1, action=lambda t, q, v: (q, -0.8 * v)
+    )
+    solution = srm.simulate(mechanism, 2.0, events=floor, rtol=1e-10)
+    assert solution.t_events is not None
+    speeds = solution.v_events[0][:, 0]
+    assert len(speeds) >= 3
+    balance = solution.energy_balance
+    assert balance.relative < 1e-10
+    lost = -0.5 * 2.0 * (1.0 - 0.8**2) * speeds**2
+    np.testing.assert_allclose(balance.works["events"][-1], lost.sum(), rtol=1e-10)
+    times = np.array([1.9, 0.2, 0.7])
+    some, again = solution.at(times).energy_balance, solution.at(np.sort(times)).energy_balance
+    np.testing.assert_array_equal(some.t, times)
+    for name in ("events", "joint damping"):
+        np.testing.assert_allclose(some.works[name], again.works[name][[2, 0, 1]], rtol=1e-12)
+    assert some.works["events"][1] == 0.0
+    assert np.abs(some.residual).max() < 1e-9
+
+
 def test_a_loaded_run_with_a_controller_says_why_it_has_none(tmp_path: Path) -> None:
     solution = srm.simulate(srm.load("slider_crank_regular"), 0.1, controller=push)
     solution.save(tmp_path / "run.npz")

@@ -10,13 +10,13 @@ step by step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.solution import Solution
 from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
@@ -40,7 +40,8 @@ class EnergyBalance:
         Of the bodies; of gravity, springs and bushings.
     works : {name: (n,) J}
         Work done on the mechanism since the start of the run, by what does it: ``controller``,
-        ``joint damping``, ``joint friction``, ``force NAME``, ``drive NAME``.
+        ``joint damping``, ``joint friction``, ``force NAME``, ``drive NAME``; and ``events``, what
+        their actions changed at once.
     start
         Energy (J) at the start of the run.
     """
@@ -159,4 +160,45 @@ def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
         solution.energy - kinetic,
         works,
         float(system.energy(solution.steps.states[0])),
+    )
+
+
+def joined_balance(
+    segments: Sequence[Solution], parts: Sequence[Solution], order: IndexArray | None
+) -> EnergyBalance:
+    """The balance of a run of several segments, with what happened between them as ``events``.
+
+    Parameters
+    ----------
+    segments
+        The whole segments.
+    parts
+        The same ones, read at the times that are wanted.
+    order
+        Where the rows of all parts go; None where they stay.
+    """
+    balances = [part.energy_balance for part in parts]
+    ends = [segment.at([segment.steps.end]).energy_balance for segment in segments]
+    names = dict.fromkeys(name for end in ends for name in end.works)
+    rows: dict[str, list[FloatArray]] = {name: [] for name in (*names, "events")}
+    before, jumped = dict.fromkeys(names, 0.0), 0.0
+    for k, (balance, end) in enumerate(zip(balances, ends)):
+        nothing = np.zeros(len(balance.t))
+        for name in names:
+            rows[name].append(before[name] + balance.works.get(name, nothing))
+            before[name] += float(end.works.get(name, np.zeros(1))[-1])
+        rows["events"].append(nothing + jumped)
+        if k + 1 < len(ends):
+            jumped += ends[k + 1].start - float(end.kinetic[-1] + end.potential[-1])
+
+    def joined(pieces: Sequence[FloatArray]) -> FloatArray:
+        whole = np.concatenate(pieces)
+        return whole if order is None else whole[order]
+
+    return EnergyBalance(
+        joined([balance.t for balance in balances]),
+        joined([balance.kinetic for balance in balances]),
+        joined([balance.potential for balance in balances]),
+        {name: joined(pieces) for name, pieces in rows.items()},
+        ends[0].start,
     )

@@ -368,3 +368,22 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
             theirs = getattr(terms, what)
             theirs = theirs if what == "sigma" else theirs()
             np.testing.assert_allclose(found[what], theirs, rtol=1e-9, atol=1e-10)
+
+
+def test_a_rod_between_wheels_takes_its_length_from_the_guess_and_keeps_it(tmp_path: Path) -> None:
+    """Held and guessed angles count; a saved run has the length, not a new guess."""
+    text = (
+        '[[loop]]\ntype = "distance"\nname = "rod"\n'
+        'a = { link = "b", xyz = [0.2, 0.0, 0.0] }\nb = { link = "a", xyz = [0.3, 0.0, 0.0] }\n'
+        "[initial]\nq = { a_joint = 0.5 }\nguess = { b_joint = -0.4 }\nv = { a_joint = 1.0 }\n"
+    )
+    mechanism = load(tmp_path, GEARS, text)
+    tips = [1.0 + 0.2 * np.exp(-0.4j), 0.3 * np.exp(0.5j)]
+    (rod,) = mechanism.loops
+    assert rod.length == pytest.approx(abs(tips[0] - tips[1]), rel=1e-15)
+    assert mechanism.q0[mechanism.joint("b_joint").idx_q] == pytest.approx(np.cos(0.4))
+    run = srm.simulate(mechanism, 0.5)
+    run.save(tmp_path / "run.npz")
+    assert srm.load_solution(tmp_path / "run.npz").mechanism.loops == (rod,)
+    with pytest.raises(srm.InputError, match=r"wheels\.toml: loop 'rod': a distance of 0 has no"):
+        load(tmp_path, GEARS, text.replace('name = "rod"', 'name = "rod"\nlength = 0.0'))

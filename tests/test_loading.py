@@ -16,6 +16,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
+from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.loading import rebuild
 from srm_mbs.loading.bundled import models_folder
@@ -172,6 +173,11 @@ CLOSURES = {
     "point": 3,
     "frame": 6,
     "revolute": 5,
+    "prismatic": 5,
+    "cylindrical": 4,
+    "universal": 4,
+    "planar": 3,
+    "distance": 1,
     "point_on_line": 2,
     "point_on_plane": 1,
 }
@@ -192,11 +198,17 @@ def rows_by_hand(kind: str, between: pin.SE3) -> tuple[FloatArray, int]:
     """What vanishes when the closure is closed, and how many values of it are positions."""
     p, R = between.translation, between.rotation
     n = np.array(AXIS) / 3.0
+    across, tilt, turns = p - n * (n @ p), R @ n - n * (n @ R @ n), [R[2, 1], R[0, 2], R[1, 0]]
     return {
         "point": (p, 3),
-        "frame": (np.concatenate([p, [R[2, 1], R[0, 2], R[1, 0]]]), 3),
-        "revolute": (np.concatenate([p, R @ n - n * (n @ R @ n)]), 3),
-        "point_on_line": (p - n * (n @ p), 3),
+        "frame": (np.concatenate([p, turns]), 3),
+        "revolute": (np.concatenate([p, tilt]), 3),
+        "prismatic": (np.concatenate([across, turns]), 3),
+        "cylindrical": (np.concatenate([across, tilt]), 3),
+        "universal": (np.concatenate([p, [R[2, 1]]]), 3),
+        "planar": (np.concatenate([[n @ p], tilt]), 1),
+        "distance": (np.array([np.linalg.norm(p) - 0.6]), 1),
+        "point_on_line": (across, 3),
         "point_on_plane": (np.array([n @ p]), 1),
     }[kind]
 
@@ -206,7 +218,11 @@ def test_a_closure_is_what_it_says_between_the_anchors_of_the_file(
     kind: str, tmp_path: Path
 ) -> None:
     """g against the placements of a model built by hand: anchors on a welded link, with rpy."""
-    axis = f"axis = {list(AXIS)}\n" if "point_" in kind or kind == "revolute" else ""
+    axis = f"axis = {list(AXIS)}\n" if "axis" in CLOSURE_TYPES[kind].needs else ""
+    axis += {
+        "universal": "axis_a = [0, 3, 0]\naxis_b = [0.0, 0.0, 0.1]\n",
+        "distance": "length = 0.6\n",
+    }.get(kind, "")
     loop = (
         f'[[loop]]\nname = "ring"\ntype = "{kind}"\n{axis}'
         f'a = {{ link = "badge", xyz = {list(ANCHOR_A[0])}, rpy = {list(ANCHOR_A[1])} }}\n'
@@ -227,7 +243,7 @@ def test_a_closure_is_what_it_says_between_the_anchors_of_the_file(
         ours = closure(mechanism, q, v)[: CLOSURES[kind]]
         theirs, positions = rows_by_hand(kind, relative(model, q))
         # Up to the choice of two directions across the axis.
-        split = len(closure_of_file.rows.directions)
+        split = closure_of_file.rows.blocks[0].stop
         assert np.linalg.norm(ours[:split]) == pytest.approx(
             np.linalg.norm(theirs[:positions]), abs=1e-13
         )

@@ -1,6 +1,7 @@
 """Force elements as immutable descriptions; :mod:`srm_mbs.systems.forces` evaluates them.
 
 The energy of springs and bushings is part of ``solution.energy``; torques and wrenches have none.
+Torques and wrenches may follow a law over time (:mod:`srm_mbs.laws`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,12 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
+from srm_mbs.laws import Law
 from srm_mbs.mechanism import Anchor, ForceElement, finite_numbers, resolve_apart
+
+
+OPEN = 1e30
+"""Limits (rad, m) beyond this are none; Pinocchio has the largest number there."""
 
 
 def _in(unit: str, default: Any) -> Any:
@@ -117,9 +123,23 @@ class SpringDamper(ForceElement):
         resolve_apart(model, self.a, self.b, f"force {self.name!r}")
 
 
+def _take_law(force: ForceElement, count: int) -> bool:
+    """Check the law of ``force``, one or ``count`` of them; whether there is any."""
+    law = getattr(force, "law")  # noqa: B009 - the fields of subclasses
+    if law is None:
+        return False
+    laws = tuple(law) if isinstance(law, list | tuple) else (law,)
+    if len(laws) not in (1, count) or not all(isinstance(each, Law) for each in laws):
+        raise _fault(
+            force, "law is not a law", f"Give srm.Sine(...) or alike, or a list of {count} of them"
+        )
+    object.__setattr__(force, "law", laws[0] if len(laws) == 1 else laws)
+    return True
+
+
 @dataclass(frozen=True)
 class JointTorque(ForceElement):
-    """A constant generalised force on a joint.
+    """A generalised force on a joint, constant or over time.
 
     Parameters
     ----------
@@ -127,9 +147,11 @@ class JointTorque(ForceElement):
         Its name.
     torque
         N m (prismatic: N), in the positive sense of the joint; for a joint of several degrees of
-        freedom one number for each, in Pinocchio's order.
+        freedom one number for each, in Pinocchio's order.  By default 1 with a law, else 0.
     name
         Unique name.
+    law
+        What ``torque`` is multiplied by over time: one law, or one for each number.
 
     Raises
     ------
@@ -139,17 +161,22 @@ class JointTorque(ForceElement):
 
     type: ClassVar[str] = "torque"
     joint: str
-    torque: float | tuple[float, ...] = _in("N m, N", 0.0)
+    torque: float | tuple[float, ...] | None = _in("N m, N", None)
     name: str = ""
+    law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
         _take_name(self, self.joint)
-        several = np.ndim(self.torque) > 0
-        _take(self, "torque", np.size(self.torque) if several else 0)
+        given: Any = self.torque
+        follows = _take_law(self, max(1, np.size(given)))
+        if given is None:
+            object.__setattr__(self, "torque", 1.0 if follows else 0.0)
+        _take(self, "torque", np.size(given) if np.ndim(given) else 0)
 
     def check(self, model: pin.Model) -> None:
         joint = _joint(self, model, self.joint)
-        if np.size(self.torque) != joint.nv:
+        numbers: Any = self.torque
+        if np.size(numbers) != joint.nv:
             raise _fault(
                 self,
                 f"torque = {self.torque!r} does not fit the {joint.nv} degrees of freedom of "
@@ -211,7 +238,7 @@ class TorsionSpring(ForceElement):
 
 @dataclass(frozen=True)
 class Wrench(ForceElement):
-    """A constant force and moment on a link.
+    """A force and moment on a link, constant or over time.
 
     Parameters
     ----------
@@ -223,6 +250,9 @@ class Wrench(ForceElement):
         ``"world"``, or ``"link"`` for the axes of the anchor, which turn with the link.
     name
         Unique name.
+    law
+        What force and moment are multiplied by over time: one law, or six, one for each number;
+        with six, the numbers are 1 by default.
 
     Raises
     ------
@@ -236,9 +266,14 @@ class Wrench(ForceElement):
     moment: tuple[float, float, float] = _in("N m", (0.0, 0.0, 0.0))
     frame: Literal["world", "link"] = "world"
     name: str = ""
+    law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
         _take_name(self, self.at.where)
+        several = _take_law(self, 6) and not isinstance(self.law, Law)
+        if several and not np.any([self.force, self.moment]):
+            object.__setattr__(self, "force", (1.0, 1.0, 1.0))
+            object.__setattr__(self, "moment", (1.0, 1.0, 1.0))
         if not np.any([_take(self, "force", 3), _take(self, "moment", 3)]):
             raise _fault(
                 self, "force and moment are zero", "Give one of them, or remove the element"
@@ -300,7 +335,84 @@ class Bushing(ForceElement):
         resolve_apart(model, self.a, self.b, f"force {self.name!r}")
 
 
+@dataclass(frozen=True)
+class LimitSpring(ForceElement):
+    """Springs where a joint leaves its limits: tau = -(k d + c dq/dt) S(d / depth).
+
+    d is how far the joint is beyond a limit (its sign that of the excess).  S rises smoothly from 0
+    to 1 over the depth, S(x) = x^3 (10 - 15 x + 6 x^2), so that the force is three times
+    differentiable at the limit and the schemes keep their order.
+
+    Parameters
+    ----------
+    joint
+        Name of a revolute or prismatic joint.
+    stiffness, damping
+        k in N m/rad and c in N m s/rad (prismatic: N/m, N s/m), not negative, k positive.
+    lower, upper
+        Limits (rad, m); by default the model's.
+    depth
+        rad or m, positive; by default a hundredth of the range, or 0.01 where one limit is open.
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For a value that is missing, negative or not finite, or a joint without limits.
+    """
+
+    type: ClassVar[str] = "limit_spring"
+    has_potential: ClassVar[bool] = True
+    joint: str
+    stiffness: float = _in("N m/rad, N/m", 0.0)
+    damping: float = _in("N m s/rad, N s/m", 0.0)
+    lower: float | None = _in("rad, m", None)
+    upper: float | None = _in("rad, m", None)
+    depth: float | None = _in("rad, m", None)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _take_name(self, self.joint)
+        _take(self, "damping", 0, 0.0)
+        if not _take(self, "stiffness", 0, 0.0) > 0.0:
+            raise _fault(self, "a limit needs a stiffness", "Give a positive stiffness")
+        for key in ("lower", "upper", "depth"):
+            if getattr(self, key) is not None:
+                _take(self, key)
+        if self.depth is not None and not self.depth > 0.0:
+            raise _fault(self, f"depth = {self.depth:g} is not positive", "Give a positive depth")
+
+    def resolved(self, model: pin.Model) -> tuple[float, float, float]:
+        """Lower and upper limit, infinite where open, and depth."""
+        joint = _joint(self, model, self.joint)
+        low = float(model.lowerPositionLimit[joint.idx_q]) if self.lower is None else self.lower
+        high = float(model.upperPositionLimit[joint.idx_q]) if self.upper is None else self.upper
+        low, high = (x if abs(x) < OPEN else float(np.copysign(np.inf, x)) for x in (low, high))
+        width = high - low if np.isfinite([low, high]).all() else 1.0
+        return low, high, 0.01 * width if self.depth is None else self.depth
+
+    def check(self, model: pin.Model) -> None:
+        joint = _joint(self, model, self.joint)
+        if not joint.nq == joint.nv == 1:
+            raise _fault(
+                self,
+                f"the position of joint {self.joint!r} is not one number",
+                "Limits are for revolute and prismatic joints",
+            )
+        low, high, _ = self.resolved(model)
+        if not low < high or not np.isfinite([low, high]).any():
+            raise _fault(
+                self,
+                f"joint {self.joint!r} has no limits ({low:g} to {high:g})",
+                "Give lower or upper, or limits in the model",
+            )
+
+
 FORCE_TYPES: Mapping[str, Callable[..., ForceElement]] = MappingProxyType(
-    {kind.type: kind for kind in (SpringDamper, JointTorque, TorsionSpring, Wrench, Bushing)}
+    {
+        kind.type: kind
+        for kind in (SpringDamper, JointTorque, TorsionSpring, Wrench, Bushing, LimitSpring)
+    }
 )
 """The force elements by their type in a description."""

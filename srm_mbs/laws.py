@@ -350,6 +350,33 @@ LAW_TYPES: Mapping[str, type[Law]] = MappingProxyType(
 """The laws by their type in a description."""
 
 
+def _cells(path: Path) -> list[list[str]]:
+    """Lines of a CSV file that are not empty, the header first."""
+    import csv
+
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise InputError(
+            f"the table cannot be read: {error}",
+            file=str(path),
+            remedy="Give a CSV file of numbers",
+        ) from error
+    return rows or [[]]
+
+
+def table_columns(path: Path) -> tuple[str, ...]:
+    """Names of the columns of a CSV file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    return tuple(cell.strip() for cell in _cells(path)[0])
+
+
 def read_table(path: Path, columns: Sequence[str]) -> FloatArray:
     """Columns (n, k) of a CSV file with a header line.
 
@@ -365,17 +392,9 @@ def read_table(path: Path, columns: Sequence[str]) -> FloatArray:
     InputError
         Naming the file, and the line or column that is wrong.
     """
-    import csv
-
     file = str(path)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
-        raise InputError(
-            f"the table cannot be read: {error}", file=file, remedy="Give a CSV file of numbers"
-        ) from error
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    rows = _cells(path)
+    header = [cell.strip() for cell in rows[0]]
     for name in columns:
         if header.count(name) != 1:
             raise InputError(

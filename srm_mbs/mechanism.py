@@ -23,7 +23,7 @@ from srm_mbs.loop_closure import LoopClosure
 
 if TYPE_CHECKING:
     from srm_mbs.drives import Drive
-    from srm_mbs.laws import Curve
+    from srm_mbs.laws import Curve, Law
     from srm_mbs.pinocchio_constraints import PinocchioConstraints
     from srm_mbs.systems.mobility import Mobility
     from srm_mbs.systems.structure import Structure
@@ -421,6 +421,16 @@ class Mechanism:
         starts = positions(self.model, self.drives, self.q0)
         return {drive.name: drive.curve(starts[drive.name]) for drive in self.drives}
 
+    @cached_property
+    def _laws(self) -> tuple[tuple[str, Law], ...]:
+        """Every law over time, and the element that follows it."""
+        found = [(f"drive {drive.name!r}", drive.law) for drive in self.drives]
+        for force in self.forces:
+            given = getattr(force, "law", None) or ()
+            laws = given if isinstance(given, tuple) else (given,)
+            found += [(f"force {force.name!r}", law) for law in laws]
+        return tuple(found)
+
     def check_covers(self, t_end: float) -> None:
         """Refuse a run to ``t_end`` (s) that is longer than a table.
 
@@ -429,19 +439,19 @@ class Mechanism:
         InputError
             Naming what has the table.
         """
-        for drive in self.drives:
-            last = drive.law.span[1]
+        for element, law in self._laws:
+            last = law.span[1]
             if last < t_end:
                 raise InputError(
                     f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
-                    element=f"drive {drive.name!r}",
+                    element=element,
                     remedy="Continue the table, or end the run earlier",
                 )
 
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
         """Times (s) between ``t0`` and ``t_end`` at which a part of it that depends on time is not
         smooth: knots of tables, switches of drives.  Runs take no step across them."""
-        times = {knot for drive in self.drives for knot in drive.law.knots}
+        times = {knot for _, law in self._laws for knot in law.knots}
         return tuple(sorted(knot for knot in times if t0 < knot < t_end))
 
     @property

@@ -16,6 +16,7 @@ from srm_mbs.errors import (
     InputError,
     SimulationError,
 )
+from srm_mbs.forces import LimitSpring
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
@@ -508,9 +509,10 @@ def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatA
     """Names, indices in q (k,) and limits (2, k) of the one-degree joints that have limits."""
     model = mechanism.model
     names, indices, limits = [], [], []
+    sprung = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
-        if joint.nq == 1:
+        if joint.nq == 1 and name not in sprung:
             low = float(model.lowerPositionLimit[joint.idx_q])
             high = float(model.upperPositionLimit[joint.idx_q])
             if low < high and (np.isfinite(low) or np.isfinite(high)):

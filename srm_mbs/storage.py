@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,7 +20,7 @@ from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
 from srm_mbs.kernel import dense_output
-from srm_mbs.laws import LAW_TYPES
+from srm_mbs.laws import LAW_TYPES, Law
 from srm_mbs.loading import rebuild
 from srm_mbs.mechanism import (
     Anchor,
@@ -85,8 +85,8 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
             "source": None if mechanism.source is None else asdict(mechanism.source),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
             "loops": [asdict(loop) for loop in mechanism.loops],
-            "forces": [_force_entry(force) for force in mechanism.forces],
-            "drives": [_drive_entry(drive) for drive in mechanism.drives],
+            "forces": [{"type": f.type} | _values(f) for f in mechanism.forces],
+            "drives": [_values(drive) for drive in mechanism.drives],
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
             "notes": mechanism.notes,
@@ -138,30 +138,37 @@ def _loop(entry: dict[str, Any]) -> LoopClosure:
     return LoopClosure(**entry | anchors)
 
 
-def _force_entry(force: ForceElement) -> dict[str, Any]:
-    return {"type": force.type} | asdict(force)  # type: ignore[call-overload,no-any-return]
+def _entry(value: Any) -> Any:
+    """A description of laws, anchors and numbers as JSON has it; laws with their type."""
+    if isinstance(value, Law):
+        return {"type": value.type} | asdict(value)  # type: ignore[call-overload]
+    if isinstance(value, Anchor):
+        return asdict(value)
+    return [_entry(part) for part in value] if isinstance(value, tuple) else value
+
+
+def _from_entry(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_from_entry(part) for part in value)
+    if not isinstance(value, dict):
+        return value
+    if "type" not in value:
+        return Anchor(**value)
+    values = dict(value)
+    return LAW_TYPES[values.pop("type")](**values)
+
+
+def _values(element: Any) -> dict[str, Any]:
+    return {key.name: _entry(getattr(element, key.name)) for key in fields(element)}
 
 
 def _force(entry: dict[str, Any]) -> ForceElement:
-    values = {
-        key: Anchor(**value) if isinstance(value, dict) else value
-        for key, value in entry.items()
-        if key != "type"
-    }
+    values = {key: _from_entry(value) for key, value in entry.items() if key != "type"}
     return FORCE_TYPES[entry["type"]](**values)
 
 
-def _drive_entry(drive: Drive) -> dict[str, Any]:
-    law = {"type": drive.law.type} | asdict(drive.law)  # type: ignore[call-overload]
-    return asdict(drive) | {"law": law}
-
-
 def _drive(entry: dict[str, Any]) -> Drive:
-    law = dict(entry["law"])
-    values = entry | {"law": LAW_TYPES[law.pop("type")](**law)}
-    for side in "ab":
-        values[side] = None if entry[side] is None else Anchor(**entry[side])
-    return Drive(**values)
+    return Drive(**{key: _from_entry(value) for key, value in entry.items()})
 
 
 def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:

@@ -154,8 +154,14 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
             elif key.name == "joint":
                 places.append(value)
             elif key.name != "name":
+                if value is None:
+                    continue
                 text = f"{value:.6g}" if isinstance(value, float) else value
-                text = _vector(value) if isinstance(value, tuple) else text
+                if key.name == "law":
+                    laws = value if isinstance(value, tuple) else (value,)
+                    text = ", ".join(dict.fromkeys(law.type for law in laws))
+                elif isinstance(value, tuple):
+                    text = _vector(value)
                 values.append(f"{key.name} {text} {key.metadata.get('unit', '')}".rstrip())
         yield force.name, force.type, ", ".join(places), ", ".join(values)
 

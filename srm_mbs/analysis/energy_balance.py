@@ -100,13 +100,13 @@ def _elements(run: Solution, system: _System) -> Powers:
     elements = [ForceKinematics(model, [force]) for force in mechanism.forces]
     names = [f"force {force.name}" for force in mechanism.forces]
     powers = {name: np.zeros(len(run.t)) for name in names}
-    for i, (q, v) in enumerate(zip(run.q, run.v)):
+    for i, (t, q, v) in enumerate(zip(run.t, run.q, run.v)):
         pin.computeJointJacobians(model, data, q)
         for velocity, sign in ((v, 1.0), (rest, -1.0)):
             pin.forwardKinematics(model, data, q, velocity)
             for name, force, element in zip(names, mechanism.forces, elements):
                 if sign > 0.0 or force.has_potential:
-                    powers[name][i] += sign * (element.generalised(data, q, velocity) @ v)
+                    powers[name][i] += sign * (element.generalised(data, q, velocity, t) @ v)
     # An undamped spring does no other work.
     return {
         name: powers[name]

@@ -17,6 +17,7 @@ from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.loading.description import (
     Description,
+    LimitSpringEntry,
     TorqueEntry,
     TorsionSpringEntry,
     parse_description,
@@ -34,7 +35,7 @@ def _joints_that_must_move(description: Description) -> list[tuple[str, Sequence
         *(
             (f"force[{i}].joint", [force.joint])
             for i, force in enumerate(description.force)
-            if isinstance(force, TorqueEntry | TorsionSpringEntry)
+            if isinstance(force, TorqueEntry | TorsionSpringEntry | LimitSpringEntry)
         ),
         *((f"loop[{i}].joints", loop.joints or []) for i, loop in enumerate(description.loop)),
         *((f"drive[{i}].joint", [d.joint]) for i, d in enumerate(description.drive) if d.joint),
@@ -154,7 +155,7 @@ def _friction_note(mechanism: Mechanism) -> tuple[str, ...]:
 
 
 def unassembled(
-    description: Description, source: Source, notes: Sequence[str] = (), drives: bool = True
+    description: Description, source: Source, notes: Sequence[str] = (), tables: bool = True
 ) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
     """The mechanism with the guess as its q0, and the held positions and rates by joint.
 
@@ -164,8 +165,8 @@ def unassembled(
         The parsed description, and the texts it was parsed from.
     notes
         Sentences of the translator that wrote them.
-    drives
-        Whether to read the drives, which may need tables from other files.
+    tables
+        Whether to read the drives and forces that may need tables from other files.
 
     Raises
     ------
@@ -195,8 +196,8 @@ def unassembled(
         model,
         description.closures(),
         q0=start,
-        forces=description.force_elements(),
-        drives=description.drives(Path(file).parent) if drives else (),
+        forces=description.force_elements(Path(file).parent if tables else None),
+        drives=description.drives(Path(file).parent) if tables else (),
         friction_speed=description.friction_speed,
         name=description.name or model.name,
         source=source,
@@ -210,7 +211,7 @@ def rebuild(source: Source) -> Mechanism:
     """The mechanism of a saved run without its drives; its q0 is the guess of the description, not
     assembled."""
     description = parse_description(source.description, source.path)
-    return unassembled(description, source, drives=False)[0]
+    return unassembled(description, source, tables=False)[0]
 
 
 def _in_gimbal_lock(source: Source, why: str) -> InputError:

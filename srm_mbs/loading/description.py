@@ -27,7 +27,7 @@ from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
 from srm_mbs.forces import FORCE_TYPES
-from srm_mbs.loading.laws import LAW_KEYS, law_from
+from srm_mbs.loading.laws import LAW_KEYS, law_from, with_law
 from srm_mbs.loading.translation import MODEL_KEYS
 from srm_mbs.mechanism import FRICTION_SPEED, Anchor, ForceElement, LoopClosure
 
@@ -119,12 +119,37 @@ class SpringDamperEntry(ForceEntry):
     rest_length: Number | None = None
 
 
+class LawEntry(_Strict):
+    """A law over time; which keys it takes depends on its type."""
+
+    type: StrictStr
+    speed: Number | None = None
+    amplitude: Number | None = None
+    frequency_hz: Number | None = None
+    omega: Number | None = None
+    phase: Number | None = None
+    offset: Number | None = None
+    coefficients: list[Number] | None = None
+    target: Number | None = None
+    duration: Number | None = None
+    start: Number | None = None
+    t: list[Number] | None = None
+    values: list[Number] | None = None
+    table: StrictStr | None = None
+    time: StrictStr | None = None
+    value: StrictStr | None = None
+
+
 class TorqueEntry(ForceEntry):
-    """A ``[[force]]`` of type ``torque``."""
+    """A ``[[force]]`` of type ``torque``: a number, a law that multiplies it, or a table."""
 
     type: Literal["torque"]
     joint: StrictStr
-    torque: JointValue
+    torque: JointValue | None = None
+    law: LawEntry | None = None
+    table: StrictStr | None = None
+    time: StrictStr | None = None
+    value: StrictStr | None = None
 
 
 class TorsionSpringEntry(ForceEntry):
@@ -145,6 +170,21 @@ class WrenchEntry(ForceEntry):
     force: Vector = [0.0, 0.0, 0.0]
     moment: Vector = [0.0, 0.0, 0.0]
     frame: Literal["world", "link"] = "world"
+    law: LawEntry | None = None
+    table: StrictStr | None = None
+    time: StrictStr | None = None
+
+
+class LimitSpringEntry(ForceEntry):
+    """A ``[[force]]`` of type ``limit_spring``."""
+
+    type: Literal["limit_spring"]
+    joint: StrictStr
+    stiffness: Number
+    damping: Number = 0.0
+    lower: Number | None = None
+    upper: Number | None = None
+    depth: Number | None = None
 
 
 class BushingEntry(ForceEntry):
@@ -158,7 +198,12 @@ class BushingEntry(ForceEntry):
 
 
 AnyForceEntry = Annotated[
-    SpringDamperEntry | TorqueEntry | TorsionSpringEntry | WrenchEntry | BushingEntry,
+    SpringDamperEntry
+    | TorqueEntry
+    | TorsionSpringEntry
+    | WrenchEntry
+    | BushingEntry
+    | LimitSpringEntry,
     Field(discriminator="type"),
 ]
 FORCE_ENTRIES: dict[str, type[ForceEntry]] = {
@@ -167,28 +212,8 @@ FORCE_ENTRIES: dict[str, type[ForceEntry]] = {
     "torsion_spring": TorsionSpringEntry,
     "wrench": WrenchEntry,
     "bushing": BushingEntry,
+    "limit_spring": LimitSpringEntry,
 }
-
-
-class LawEntry(_Strict):
-    """A law over time; which keys it takes depends on its type."""
-
-    type: StrictStr
-    speed: Number | None = None
-    amplitude: Number | None = None
-    frequency_hz: Number | None = None
-    omega: Number | None = None
-    phase: Number | None = None
-    offset: Number | None = None
-    coefficients: list[Number] | None = None
-    target: Number | None = None
-    duration: Number | None = None
-    start: Number | None = None
-    t: list[Number] | None = None
-    values: list[Number] | None = None
-    table: StrictStr | None = None
-    time: StrictStr | None = None
-    value: StrictStr | None = None
 
 
 class DriveEntry(LawEntry):
@@ -273,18 +298,26 @@ class Description(_Strict):
                 if isinstance(value, AnchorEntry):
                     yield f"{where}.{key}", value
 
-    def force_elements(self) -> tuple[ForceElement, ...]:
-        """The force elements.
+    def force_elements(self, folder: Path | None) -> tuple[ForceElement, ...]:
+        """The force elements; tables are read from ``folder``, None leaves out those that have one.
 
         Raises
         ------
         InputError
-            For a value that an element cannot take, or an anchor without link or frame.
+            For a value that an element cannot take, an anchor without link or frame, or a table
+            that cannot be read.
         """
         out = []
         for i, entry in enumerate(self.force):
             with _labelled("force", i, entry.name) as label:
                 values = _with_anchors(label, entry)
+                law = values.get("law")
+                if law is not None:
+                    values["law"] = {key: getattr(law, key) for key in LAW_KEYS}
+                if folder is None and (values.get("law") or values.get("table")):
+                    continue
+                if isinstance(entry, TorqueEntry | WrenchEntry):
+                    values = with_law(values, folder or Path())
                 out.append(FORCE_TYPES[values.pop("type")](**values))
         return tuple(out)
 

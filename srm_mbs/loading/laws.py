@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from srm_mbs.errors import InputError
-from srm_mbs.laws import LAW_TYPES, Law, Table, read_table
+from srm_mbs.laws import LAW_TYPES, Law, Polynomial, Table, read_table, table_columns
 
 TABLE_KEYS = ("table", "time", "value")
 """Keys of a table in a file: its path, and the names of its columns, by default t and value."""
@@ -64,3 +64,48 @@ def law_from(entry: Mapping[str, Any], folder: Path) -> Law:
             remedy='Give them, or table = "file.csv"' if kind is Table else "Add it",
         )
     return kind(**given)
+
+
+COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+"""Columns of the table of a wrench; those that are not there are zero."""
+
+
+def with_law(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The keys of a torque or wrench with its law made, in place of ``table``, ``time`` and
+    ``value``.
+
+    Raises
+    ------
+    InputError
+        If law and table are both given, neither of them nor a torque, or a table is malformed.
+    """
+    out = {key: value for key, value in values.items() if key not in TABLE_KEYS}
+    table, time = values.get("table"), values.get("time")
+    named = [key for key in TABLE_KEYS[1:] if values.get(key) is not None]
+    if values["law"] is not None:
+        if table is not None or named:
+            raise InputError("law and table are given", remedy="Give one of them")
+        out["law"] = law_from(values["law"], folder)
+    elif table is None:
+        if named:
+            raise InputError(
+                f"{named[0]} names a column, but there is no table",
+                remedy='Give table = "file.csv"',
+            )
+        if values["type"] == "torque" and values["torque"] is None:
+            raise InputError("there is no torque", remedy="Give torque, law or table")
+    elif values["type"] == "torque":
+        columns = (time or "t", values["value"] or "value")
+        out["law"] = Table(*read_table(folder / table, columns).T.tolist())
+    else:
+        there = [name for name in COMPONENTS if name in table_columns(folder / table)]
+        if not there:
+            raise InputError(
+                f"the table has none of the columns {', '.join(COMPONENTS)}",
+                file=str(folder / table),
+                remedy="Name the columns of force and moment in the first line",
+            )
+        t, *columns_read = read_table(folder / table, (time or "t", *there)).T.tolist()
+        laws = {name: Table(t, column) for name, column in zip(there, columns_read)}
+        out["law"] = tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
+    return out

@@ -19,7 +19,15 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
-from srm_mbs.forces import Bushing, JointTorque, SpringDamper, TorsionSpring, Wrench
+from srm_mbs.forces import (
+    Bushing,
+    JointTorque,
+    LimitSpring,
+    SpringDamper,
+    TorsionSpring,
+    Wrench,
+)
+from srm_mbs.laws import Law
 from srm_mbs.mechanism import Anchor, ForceElement, Mechanism
 from srm_mbs.systems.loops import COINCIDENT, placement_numbers, support, world_jacobian
 from srm_mbs.systems.projection import cholesky, whiten
@@ -29,8 +37,8 @@ from srm_mbs.systems.vectors import cross
 class _Evaluator(Protocol):
     """One element, resolved against a model.  ``data`` holds placements, velocities and J."""
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
-        """Add the element's generalised forces to ``tau`` (nv,)."""
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        """Add the element's generalised forces at t (s) to ``tau`` (nv,)."""
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         """Its potential energy (J); ``data`` need hold the placements only."""
@@ -76,7 +84,7 @@ class _SpringDamper:
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_length = float(force.rest_length or 0.0)
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         at_a = self.a.placement(data).translation
         at_b = self.b.placement(data).translation
         apart = at_a - at_b
@@ -114,20 +122,40 @@ class _SpringDamper:
         }
 
 
+class _OverTime:
+    """Numbers (n,) that laws multiply over time: none, one for all of them, or one for each."""
+
+    def __init__(self, numbers: FloatArray, law: Law | Sequence[Law] | None) -> None:
+        self._numbers = numbers
+        laws = () if law is None else (law,) if isinstance(law, Law) else law
+        self._curves = [each.curve() for each in laws]
+
+    def at(self, t: float) -> FloatArray:
+        """The numbers at t (s)."""
+        if not self._curves:
+            return self._numbers
+        factors = [curve(t)[0] for curve in self._curves]
+        return self._numbers * (factors[0] if len(factors) == 1 else np.array(factors))
+
+    def constants(self) -> dict[str, Any]:
+        curves = [curve.constants() for curve in self._curves]
+        return {"numbers": self._numbers.astype(float), "curves": curves}
+
+
 class _JointTorque:
     def __init__(self, model: pin.Model, force: JointTorque) -> None:
         joint = model.joints[model.getJointId(force.joint)]
         self.own = slice(joint.idx_v, joint.idx_v + joint.nv)
-        self.torque = np.atleast_1d(np.array(force.torque))
+        self.torque = _OverTime(np.atleast_1d(np.array(force.torque, dtype=float)), force.law)
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
-        tau[self.own] += self.torque
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        tau[self.own] += self.torque.at(t)
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.0
 
     def constants(self) -> dict[str, Any]:
-        return {"kind": 1, "in_v": self.own.start, "numbers": self.torque.astype(float)}
+        return {"kind": 1, "in_v": self.own.start} | self.torque.constants()
 
 
 class _TorsionSpring:
@@ -137,7 +165,7 @@ class _TorsionSpring:
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_angle = force.rest_angle
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         turned = q[self.in_q] - self.rest_angle
         tau[self.in_v] -= self.stiffness * turned + self.damping * v[self.in_v]
 
@@ -159,11 +187,12 @@ class _Wrench:
     def __init__(self, model: pin.Model, force: Wrench) -> None:
         self.at = _Held(model, force.at)
         self.turns = force.frame == "link"
-        self.force, self.moment = np.array(force.force), np.array(force.moment)
+        self.wrench = _OverTime(np.array([*force.force, *force.moment]), force.law)
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         at = self.at.placement(data)
-        force, moment = self.force, self.moment
+        numbers = self.wrench.at(t)
+        force, moment = numbers[:3], numbers[3:]
         if self.turns:
             force, moment = at.rotation @ force, at.rotation @ moment
         wrench = _about_origin(force, moment, at.translation)
@@ -178,7 +207,43 @@ class _Wrench:
             "a": self.at.constants(),
             "support": self.at.support,
             "turns": self.turns,
-            "numbers": np.concatenate([self.force, self.moment]).astype(float),
+        } | self.wrench.constants()
+
+
+class _LimitSpring:
+    def __init__(self, model: pin.Model, force: LimitSpring) -> None:
+        joint = model.joints[model.getJointId(force.joint)]
+        self.in_q, self.in_v = joint.idx_q, joint.idx_v
+        self.stiffness, self.damping = force.stiffness, force.damping
+        self.lower, self.upper, self.depth = force.resolved(model)
+
+    def _beyond(self, q: FloatArray) -> float:
+        position = float(q[self.in_q])
+        return max(position - self.upper, 0.0) + min(position - self.lower, 0.0)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        beyond = self._beyond(q)
+        if beyond == 0.0:
+            return
+        x = min(abs(beyond) / self.depth, 1.0)
+        contact = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+        tau[self.in_v] -= contact * (self.stiffness * beyond + self.damping * v[self.in_v])
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        """The integral of k d S(d / depth)."""
+        beyond, depth = abs(self._beyond(q)), self.depth
+        x = min(beyond / depth, 1.0)
+        inside = depth**2 * x**5 * (2.0 + x * (6.0 / 7.0 * x - 2.5))
+        return self.stiffness * (inside + 0.5 * max(beyond**2 - depth**2, 0.0))
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 5,
+            "in_q": self.in_q,
+            "in_v": self.in_v,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "numbers": np.array([self.lower, self.upper, self.depth]),
         }
 
 
@@ -189,7 +254,7 @@ class _Bushing:
         self.stiffness, self.damping = np.array(force.stiffness), np.array(force.damping)
         self.damped = bool(np.any(self.damping))
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray) -> None:
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         relative = Tb.actInv(Ta)
         turn = pin.log3(relative.rotation)
@@ -251,6 +316,7 @@ _EVALUATORS = {
     TorsionSpring: _TorsionSpring,
     Wrench: _Wrench,
     Bushing: _Bushing,
+    LimitSpring: _LimitSpring,
 }
 
 
@@ -278,8 +344,8 @@ class ForceKinematics:
             _EVALUATORS[type(force)](model, force) for force in forces
         ]
 
-    def generalised(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
-        """tau (nv,) in N and N m at q (nq,), v (nv,).
+    def generalised(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """tau (nv,) in N and N m at q (nq,), v (nv,) and t (s).
 
         ``data`` must hold placements, velocities and the world Jacobian at that state: of crba in
         the WORLD convention and nonLinearEffects, or of forwardKinematics and
@@ -292,7 +358,7 @@ class ForceKinematics:
         """
         tau = np.zeros(self._nv)
         for element in self._elements:
-            element.add(tau, data, q, v)
+            element.add(tau, data, q, v, t)
         return tau
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:

@@ -348,7 +348,7 @@ class OpenSystem(_Mechanics):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            elements = self._forces.generalised(self.data, q, v)
+            elements = self._forces.generalised(self.data, q, v, t)
             force = elements if force is None else force + elements
         rate = self._terms._rate
         rate[: self.nv] = v
@@ -540,7 +540,7 @@ class ClosedSystem(_Mechanics):
         if force is not None:
             f += force
         if self._forces is not None:
-            f += self._forces.generalised(data, q, v)
+            f += self._forces.generalised(data, q, v, t)
         loops = self.loops
         self._update(t, q)
         projection = self.projection

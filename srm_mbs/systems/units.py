@@ -170,7 +170,7 @@ def _acceleration_by_forces(mechanism: Mechanism, q: FloatArray) -> FloatArray:
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, rest)
     try:
-        tau = forces.generalised(data, q, rest)
+        tau = forces.generalised(data, q, rest, 0.0)
         U = cholesky(data.M)
     except EvaluationError:  # a run from here says why
         return rest

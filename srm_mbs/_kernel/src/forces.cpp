@@ -1,5 +1,6 @@
 #include "forces.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 #include <pinocchio/spatial.hpp>
@@ -60,10 +61,27 @@ void spring_damper(const ForceElement& e, double coincident, const pinocchio::Da
     add_wrench(e, data, force, Vector3d::Zero(), at_a, tau);
 }
 
-void wrench(const ForceElement& e, const pinocchio::Data& data, double* tau) {
+// Number k of an element whose numbers may follow laws.
+double over_time(const ForceElement& e, std::size_t k, double t) {
+    if (e.curves.empty()) return e.numbers[k];
+    double s[3];
+    e.curves[e.curves.size() == 1 ? 0 : k].at(t, s);
+    return e.numbers[k] * s[0];
+}
+
+void limit_spring(const ForceElement& e, double position, double rate, double& tau) {
+    const double lower = e.numbers[0], upper = e.numbers[1], depth = e.numbers[2];
+    const double beyond = std::max(position - upper, 0.0) + std::min(position - lower, 0.0);
+    if (beyond == 0.0) return;
+    const double x = std::min(std::abs(beyond) / depth, 1.0);
+    const double contact = x * x * x * (10.0 + x * (6.0 * x - 15.0));
+    tau -= contact * (e.stiffness * beyond + e.damping * rate);
+}
+
+void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double* tau) {
     const SE3 at = placement(e.a, data);
-    Vector3d force(e.numbers[0], e.numbers[1], e.numbers[2]);
-    Vector3d moment(e.numbers[3], e.numbers[4], e.numbers[5]);
+    Vector3d force(over_time(e, 0, t), over_time(e, 1, t), over_time(e, 2, t));
+    Vector3d moment(over_time(e, 3, t), over_time(e, 4, t), over_time(e, 5, t));
     if (e.turns) {
         force = at.rotation() * force;
         moment = at.rotation() * moment;
@@ -98,8 +116,8 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, double* tau) {
 }  // namespace
 
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
-                const pinocchio_model::Workspace& work, const double* q, const double* v,
-                double* tau) {
+                const pinocchio_model::Workspace& work, double t, const double* q,
+                const double* v, double* tau) {
     for (const ForceElement& e : elements) {
         switch (e.kind) {
             case ForceKind::spring_damper:
@@ -107,16 +125,19 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 break;
             case ForceKind::joint_torque:
                 for (std::size_t k = 0; k < e.numbers.size(); ++k)
-                    tau[e.in_v + static_cast<int>(k)] += e.numbers[k];
+                    tau[e.in_v + static_cast<int>(k)] += over_time(e, k, t);
                 break;
             case ForceKind::torsion_spring:
                 tau[e.in_v] -= e.stiffness * (q[e.in_q] - e.rest) + e.damping * v[e.in_v];
                 break;
             case ForceKind::wrench:
-                wrench(e, work.data, tau);
+                wrench(e, t, work.data, tau);
                 break;
             case ForceKind::bushing:
                 bushing(e, work.data, tau);
+                break;
+            case ForceKind::limit_spring:
+                limit_spring(e, q[e.in_q], v[e.in_v], tau[e.in_v]);
                 break;
         }
     }

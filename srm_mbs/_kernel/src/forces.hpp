@@ -4,13 +4,15 @@
 #include <string>
 #include <vector>
 
+#include "curve.hpp"
+
 namespace pinocchio_model {
 struct Workspace;
 }
 
 namespace srm {
 
-enum class ForceKind { spring_damper, joint_torque, torsion_spring, wrench, bushing };
+enum class ForceKind { spring_damper, joint_torque, torsion_spring, wrench, bushing, limit_spring };
 
 // An anchor: a frame on a body.
 struct Held {
@@ -27,13 +29,15 @@ struct ForceElement {
     double stiffness = 0.0, damping = 0.0, rest = 0.0;
     int in_q = 0, in_v = 0;
     bool turns = false;           // a wrench in the axes of its link
-    std::vector<double> numbers;  // torque; force and moment; stiffness (6) and damping (6)
+    // torque; force and moment; stiffness (6) and damping (6); lower and upper limit, and depth
+    std::vector<double> numbers;
+    std::vector<Curve> curves;    // laws of the numbers: none, one for all, or one for each
 };
 
-// Adds the generalised forces at q, v to tau (nv,); placements, velocities and the world Jacobian
+// Adds the generalised forces at t, q, v to tau (nv,); placements, velocities and the world Jacobian
 // must be at hand.  Throws EvaluationError.
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
-                const pinocchio_model::Workspace& work, const double* q, const double* v,
-                double* tau);
+                const pinocchio_model::Workspace& work, double t, const double* q,
+                const double* v, double* tau);
 
 }  // namespace srm

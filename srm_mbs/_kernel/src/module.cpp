@@ -180,6 +180,10 @@ Held held_of(nb::handle item) {
     return out;
 }
 
+Curve curve_of(const nb::dict& d) {
+    return {vector_of(d["breaks"]), vector_of(d["pieces"]), vector_of(d["sines"])};
+}
+
 ForceElement force_of(const nb::dict& d) {
     ForceElement out;
     out.kind = static_cast<ForceKind>(whole(d, "kind"));
@@ -193,11 +197,10 @@ ForceElement force_of(const nb::dict& d) {
     if (d.contains("in_v")) out.in_v = whole(d, "in_v");
     if (d.contains("turns")) out.turns = nb::cast<bool>(d["turns"]);
     if (d.contains("numbers")) out.numbers = vector_of(d["numbers"]);
+    if (d.contains("curves"))
+        for (nb::handle curve : nb::cast<nb::list>(d["curves"]))
+            out.curves.push_back(curve_of(nb::cast<nb::dict>(curve)));
     return out;
-}
-
-Curve curve_of(const nb::dict& d) {
-    return {vector_of(d["breaks"]), vector_of(d["pieces"]), vector_of(d["sines"])};
 }
 
 struct PySystem {

@@ -268,7 +268,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
             pinocchio::computeJointJacobians(w.model, w.data);
-            add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
@@ -279,7 +279,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
     if (!data_.forces.empty())
-        add_forces(data_.forces, data_.coincident, w, state, v_.data(), f_.data());
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
     update_loops(state, true);
     update_drives(t, true);
     Projection& p = *projection_;

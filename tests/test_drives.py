@@ -592,3 +592,23 @@ def test_an_absolute_distance_places_the_start() -> None:
     )
     state = srm.assemble(replace(pendulum(), drives=(drive,)))
     assert np.hypot(np.cos(state.q[0]), np.sin(state.q[0]) - 1.0) == pytest.approx(1.2)
+
+
+# Stepped from outside
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_simulator_follows_the_drives_also_after_a_reset(backend: str) -> None:
+    mechanism = driven(
+        srm.load("five_bar"), srm.Drive(srm.MinimumJerk(2.3, 0.6, start=0.1), "crank_left")
+    )
+    whole = srm.simulate(mechanism, 1.0, rtol=1e-9)
+    simulator = srm.Simulator(mechanism, rtol=1e-9, backend=backend)
+    for _ in range(20):
+        q, v = simulator.step(0.05)
+    np.testing.assert_allclose(q, whole.q[-1], atol=1e-7)
+    q, v = whole(0.4)
+    simulator.reset(q, v, t=0.4)
+    np.testing.assert_allclose(simulator.step(0.6)[0], whole.q[-1], atol=1e-7)
+    with pytest.raises(srm.InputError, match="violates the drives: row crank_left"):
+        simulator.reset(q, v, t=0.5)

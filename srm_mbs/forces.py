@@ -18,7 +18,6 @@ from srm_mbs.errors import InputError
 from srm_mbs.laws import Law
 from srm_mbs.mechanism import Anchor, ForceElement, finite_numbers, resolve_apart
 
-
 OPEN = 1e30
 """Limits (rad, m) beyond this are none; Pinocchio has the largest number there."""
 

@@ -851,7 +851,7 @@ FAULTS = {
     "a key of another type": ("torque = 0.5", "torque = 1\na = 1", ("force[2].a", "joint, torque")),
     "an unknown key in an anchor": ("xyz = [1.2", "xzy = [1.2", ("force[0].a", "'xzy'", "xyz")),
     "no joint": ('joint = "crank"\n', "", ("force[2].joint", "missing", "Add it")),
-    "no torque": ("torque = 0.5\n", "", ("force[2].torque", "missing")),
+    "no torque": ("torque = 0.5\n", "", ("force[2]", "no torque", "law or table")),
     "no anchor": ('a = { frame = "crank" }\n', "", ("force[4].a", "missing")),
     "a text as stiffness": ("stiffness = 40", 'stiffness = "40"', ("force[0].stiffness", "finite")),
     "a nan": ("torque = 0.5", "torque = nan", ("force[2].torque", "nan", "finite number")),

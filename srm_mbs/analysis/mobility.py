@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.coordinates import coordinate_names
+from srm_mbs.errors import InputError
+from srm_mbs.segmented import SegmentedSolution
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.tangent import tangent_basis
 
@@ -82,7 +84,19 @@ class MobilityMap:
 
 def mobility_map(solution: Solution) -> MobilityMap:
     """Degrees of freedom, rank and what can move at the times of ``solution``; see
-    :meth:`srm_mbs.solution.Solution.at` for other times."""
+    :meth:`srm_mbs.solution.Solution.at` for other times.
+
+    Raises
+    ------
+    InputError
+        For a run of several segments, which may have different mechanisms.
+    """
+    if isinstance(solution, SegmentedSolution):
+        raise InputError(
+            "a run with event actions has no single map: its mechanism may change",
+            element="solution",
+            remedy="Give one of solution.segments",
+        )
     mechanism = solution.mechanism
     model = mechanism.model
     geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))

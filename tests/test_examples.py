@@ -41,3 +41,34 @@ def test_the_slider_crank_example_passes_singular_configurations(tmp_path: Path)
 def test_the_own_mechanism_is_the_bundled_four_bar(tmp_path: Path) -> None:
     output = run(ROOT / "examples" / "own_mechanism.py", tmp_path)
     assert "crank is at 27.0904" in output
+
+
+def test_the_loop_inside_a_urdf_is_read_and_converted(tmp_path: Path) -> None:
+    output = run(ROOT / "examples" / "loops_inside_a_urdf.py", tmp_path)
+    assert "read: ['tip (revolute)']" in output
+    assert "degrees of freedom: 1" in output
+    assert (tmp_path / "four_bar_converted.toml").is_file()
+
+
+def test_the_drift_of_scipy_grows_and_ours_does_not(tmp_path: Path) -> None:
+    rows = run(ROOT / "examples" / "drift_against_scipy.py", tmp_path).splitlines()[1:]
+    scipy, ours = zip(*(map(float, row.split()[1:]) for row in rows))
+    assert scipy[-1] > 1e-5
+    assert max(ours) < 1e-13
+
+
+def test_the_controller_holds_the_five_bar_on_its_path(tmp_path: Path) -> None:
+    output = run(ROOT / "examples" / "five_bar_controller.py", tmp_path)
+    assert float(output.split("error of the cranks ")[1].split()[0]) < 2e-2
+
+
+def test_the_feed_of_the_reactor_is_the_exact_one(tmp_path: Path) -> None:
+    output = run(ROOT / "examples" / "not_a_mechanism.py", tmp_path)
+    found, exact = (float(part.split()[-1]) for part in output.splitlines()[1].split(","))
+    assert abs(found - exact) < 1e-7
+
+
+def test_the_platform_has_six_damped_modes(tmp_path: Path) -> None:
+    output = run(ROOT / "examples" / "stewart_platform.py", tmp_path)
+    assert "stable: True" in output
+    assert len([line for line in output.splitlines() if line[:6].strip().isdigit()]) == 6

@@ -213,7 +213,7 @@ class Simulator:
 
     def _force(self, tau: Any) -> FloatArray:
         try:
-            force = np.ascontiguousarray(tau, dtype=float)
+            force = np.array(tau, dtype=float)  # the caller may change it afterwards
         except (TypeError, ValueError) as error:
             raise _bad_force(tau) from error
         if force.shape != self._no_force.shape:

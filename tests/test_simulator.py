@@ -107,6 +107,17 @@ def test_a_clone_continues_identically_and_independently(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_forces_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
+    simulator, other = (srm.Simulator(slider_crank, backend=backend) for _ in range(2))
+    tau = np.zeros(2)
+    for k in range(10):
+        tau[0] = k
+        simulator.step(0.05, tau)
+        other.step(0.05, [float(k), 0.0])
+    assert np.array_equal(simulator.q, other.q)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_reset_repeats_the_run_to_the_last_bit(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator = srm.Simulator(slider_crank, backend=backend)
     first = [simulator.step(0.05, [0.3, 0.0]) for _ in range(30)]

@@ -6,9 +6,12 @@ be right off the closure manifold too: stages and corrections live there.
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -727,3 +730,21 @@ def test_the_kernel_refuses_points_that_coincide_as_well() -> None:
     twin = kernel.compiled(system)
     with pytest.raises(ArithmeticError):
         twin.terms(0.0, np.concatenate([q, v]), -1.0)
+
+
+def test_the_page_of_closures_lists_every_type_with_its_rows_and_keys() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "closures.md").read_text(encoding="utf-8")
+    found = {
+        name: (int(rows), set(re.findall("`([a-z_]+)`", keys)))
+        for name, rows, keys in re.findall(r"^\| `(\w+)` \| (\d) \|([^|]*)\|", page, re.MULTILINE)
+    }
+    expected = {}
+    rng = np.random.default_rng(22)
+    for name, kind in CLOSURE_TYPES.items():
+        keys = {*kind.needs, *kind.takes} - {"a", "b"}
+        count = random_loop(name, "two branches", rng).rows.count if name in TYPES else 1
+        expected[name] = (count, keys)
+    assert found == expected
+    blocks = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    for entry in tomllib.loads("\n".join(blocks))["loop"]:
+        assert LoopClosure(**entry | {side: Anchor(side) for side in "ab" if side in entry}).rows

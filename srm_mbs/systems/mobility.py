@@ -113,6 +113,8 @@ def mobility(mechanism: Mechanism) -> Mobility:
             continue
         np.maximum(rates, np.linalg.norm(right[rank:], axis=0), out=rates)
         for k, (_, columns) in enumerate(compounds):
+            if not idle[k]:
+                continue
             moved = int(np.sum(np.linalg.svd(G[:, columns], compute_uv=False) > RANK))
             idle[k] = min(idle[k], len(columns) - moved)
         if driven.drives:

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from srm_mbs.simulator import Simulator
     from srm_mbs.solution import Solution
     from srm_mbs.storage import load_solution
+    from srm_mbs.user_forces import UserForce
 
 _HOME = {
     "AnalysisError": "errors",
@@ -101,6 +102,7 @@ _HOME = {
     "TABLEAUS": "methods.tableaus",
     "Table": "laws",
     "TorsionSpring": "forces",
+    "UserForce": "user_forces",
     "Wrench": "forces",
     "assemble": "assembly",
     "assembly_modes": "analysis.modes",
@@ -165,6 +167,7 @@ __all__ = [
     "Switch",
     "Table",
     "TorsionSpring",
+    "UserForce",
     "Wrench",
     "assemble",
     "assembly_modes",

@@ -116,7 +116,8 @@ CONSTANTS = {
 def compiled(system: ClosedSystem | OpenSystem) -> Any:
     """The kernel's twin of ``system``, with a workspace of its own."""
     held = system.held
-    controller = system.controlled_force if system.controlled and held is None else None
+    calls = system.calls_forces or (system.controlled and held is None)
+    controller = system.called_force if calls else None
     twin = core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
     if held is not None:
         for t, force in zip(held.times, held.values):

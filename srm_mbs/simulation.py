@@ -407,7 +407,7 @@ def simulate(
         rtol,
         tuple(norm.atol.tolist()),
         step,
-        controller is not None,
+        controller is not None or system.calls_forces,
         placement,
         tuple(avoided.tolist()),
         "kernel" if on_kernel else "python",

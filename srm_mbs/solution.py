@@ -281,7 +281,8 @@ class Solution:
         return energy_balance(self, self._system)
 
     def _need_controller(self, what: str) -> None:
-        if self.settings.controlled and not self._system.controlled:
+        acting = self._system.controlled or self._system.calls_forces
+        if self.settings.controlled and not acting:
             raise InputError(
                 f"the {what} of a loaded run with a controller cannot be computed: "
                 "controllers are not saved",

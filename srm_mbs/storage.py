@@ -85,7 +85,9 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
             "source": None if mechanism.source is None else asdict(mechanism.source),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
             "loops": [asdict(loop) for loop in mechanism.loops],
-            "forces": [{"type": f.type} | _values(f) for f in mechanism.forces],
+            "forces": [
+                {"type": f.type} | _values(f) for f in mechanism.forces if f.type in FORCE_TYPES
+            ],
             "drives": [_values(drive) for drive in mechanism.drives],
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),

@@ -162,6 +162,8 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
                     text = ", ".join(dict.fromkeys(law.type for law in laws))
                 elif isinstance(value, tuple):
                     text = _vector(value)
+                elif callable(value):
+                    text = getattr(value, "__name__", "of the user")
                 values.append(f"{key.name} {text} {key.metadata.get('unit', '')}".rstrip())
         yield force.name, force.type, ", ".join(places), ", ".join(values)
 

@@ -19,7 +19,7 @@ LAYERS = (
     ("anchors", "closures", "laws"),
     ("loop_closure",),
     ("mechanism",),
-    ("coordinates", "drives", "pinocchio_constraints", "forces", "systems"),
+    ("coordinates", "drives", "pinocchio_constraints", "forces", "user_forces", "systems"),
     ("methods",),
     ("stepping",),
     ("closing", "kernel"),

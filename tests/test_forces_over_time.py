@@ -247,3 +247,80 @@ lower = -1.0
 def test_malformed_forces_over_time_are_refused(tmp_path: Path, force: str, words: str) -> None:
     with pytest.raises(srm.InputError, match=words):
         srm.load(written(tmp_path, "[[force]]\n" + force + "\n"))
+
+
+# Functions of the user
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_function_acts_as_the_element_that_it_copies(backend: str) -> None:
+    mechanism = bead()
+    at = srm.Anchor("bead", xyz=(0.3, 0.1, 0.0))
+    law = srm.Sine(2.0, omega=3.0, phase=0.4)
+    element = srm.Wrench(at, (1.0, 2.0, 0.0), (0.0, 0.0, 0.5), law=law)
+    torque = srm.JointTorque("x", 0.7, law=law)
+
+    def wrench(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return 2.0 * np.sin(3.0 * t + 0.4) * np.array([1.0, 2.0, 0.0, 0.0, 0.0, 0.5])
+
+    def push(t: float, q: np.ndarray, v: np.ndarray) -> list[float]:
+        return [1.4 * np.sin(3.0 * t + 0.4), 0.0, 0.0, 0.0]
+
+    by_user = (srm.UserForce(wrench, at), srm.UserForce(push))
+    assert [force.name for force in by_user] == ["user_wrench", "user_push"]
+    a, b = (
+        srm.simulate(replace(mechanism, forces=forces), 2.0, rtol=1e-9, backend=backend)
+        for forces in ((element, torque), by_user)
+    )
+    assert b.settings.backend == backend
+    np.testing.assert_allclose(a.q[-1], b.q[-1], atol=1e-12)
+    assert b.energy_balance.relative < 1e-8
+    assert set(b.energy_balance.works) == {"force user_wrench", "force user_push"}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_function_acts_beside_controllers_held_or_not(backend: str) -> None:
+    def brake(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return -0.3 * v
+
+    def hold(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array([2.0])
+
+    mechanism = replace(pendulum(), forces=(srm.UserForce(brake),))
+    damped = replace(
+        pendulum(), forces=(srm.TorsionSpring("a", damping=0.3), srm.JointTorque("a", 2.0))
+    )
+    wanted = srm.simulate(damped, 1.0, rtol=1e-10).q[-1]
+    for options in ({}, {"sample_time": 0.1}):
+        run = srm.simulate(mechanism, 1.0, rtol=1e-10, controller=hold, backend=backend, **options)
+        np.testing.assert_allclose(run.q[-1], wanted, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_function_that_fails_ends_the_run_with_its_name(backend: str) -> None:
+    def broken(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if t > 0.5:
+            raise ValueError("no more")
+        return np.zeros(1)
+
+    for function, words in ((broken, "no more"), (lambda t, q, v: np.zeros(3), "must return 1")):
+        mechanism = replace(pendulum(), forces=(srm.UserForce(function, name="mine"),))
+        run = srm.simulate(mechanism, 1.0, backend=backend)
+        assert not run.success
+        assert "'mine'" in run.message
+        assert words in run.message
+
+
+def test_a_saved_run_says_that_its_function_is_missing(tmp_path: Path) -> None:
+    mechanism = replace(
+        srm.load("slider_crank_regular"),
+        forces=(srm.UserForce(lambda t, q, v: np.array([np.sin(t), 0.0])),),
+    )
+    run = srm.simulate(mechanism, 0.5)
+    assert np.isfinite(run.reactions["pin"]).all()
+    run.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    with pytest.raises(srm.InputError, match="not saved"):
+        loaded.reactions  # noqa: B018
+    with pytest.raises(srm.InputError, match="cannot be called"):
+        srm.UserForce(3.0)  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
-from srm_mbs.errors import EvaluationError
+from srm_mbs.errors import ControllerError, EvaluationError
 from srm_mbs.forces import (
     Bushing,
     JointTorque,
@@ -32,6 +32,7 @@ from srm_mbs.mechanism import Anchor, ForceElement, Mechanism
 from srm_mbs.systems.loops import COINCIDENT, placement_numbers, support, world_jacobian
 from srm_mbs.systems.projection import cholesky, whiten
 from srm_mbs.systems.vectors import cross
+from srm_mbs.user_forces import UserForce
 
 
 class _Evaluator(Protocol):
@@ -247,6 +248,37 @@ class _LimitSpring:
         }
 
 
+class _UserForce:
+    def __init__(self, model: pin.Model, force: UserForce) -> None:
+        self.name, self.function = force.name, force.function
+        self.at = None if force.at is None else _Held(model, force.at)
+        self.size = model.nv if force.at is None else 6
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        try:
+            given = np.asarray(self.function(t, q.copy(), v.copy()), dtype=float)
+        except Exception as error:
+            raise ControllerError(
+                f"the force {self.name!r} raised {error!r} at t = {t:.6g} s"
+            ) from error
+        if given.shape != (self.size,) or not np.isfinite(given).all():
+            raise ControllerError(
+                f"the force {self.name!r} returned shape {given.shape} or non-finite values at "
+                f"t = {t:.6g} s; it must return {self.size} finite numbers"
+            )
+        if self.at is None:
+            tau += given
+            return
+        wrench = _about_origin(given[:3], given[3:], self.at.placement(data).translation)
+        tau += (world_jacobian(data).T @ wrench) * self.at.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.0
+
+    def constants(self) -> dict[str, Any]:
+        raise TypeError("the compiled kernel calls back for it")
+
+
 class _Bushing:
     def __init__(self, model: pin.Model, force: Bushing) -> None:
         self.a, self.b = _Held(model, force.a), _Held(model, force.b)
@@ -317,6 +349,7 @@ _EVALUATORS = {
     Wrench: _Wrench,
     Bushing: _Bushing,
     LimitSpring: _LimitSpring,
+    UserForce: _UserForce,
 }
 
 
@@ -339,7 +372,7 @@ class ForceKinematics:
     """
 
     def __init__(self, model: pin.Model, forces: Sequence[ForceElement]) -> None:
-        self._nv = model.nv
+        self._model, self._nv = model, model.nv
         self._elements: list[_Evaluator] = [
             _EVALUATORS[type(force)](model, force) for force in forces
         ]
@@ -355,6 +388,8 @@ class ForceKinematics:
         ------
         EvaluationError
             If the points of a spring with a rest length coincide.
+        ControllerError
+            If a function of the user raises, or returns anything but finite numbers.
         """
         tau = np.zeros(self._nv)
         for element in self._elements:
@@ -365,6 +400,23 @@ class ForceKinematics:
         """Potential energy (J) of springs and bushings; ``data`` must hold the placements."""
         return sum(element.energy(data, q) for element in self._elements)
 
+    @property
+    def calls(self) -> bool:
+        """Whether there are functions of the user among the elements."""
+        return any(isinstance(element, _UserForce) for element in self._elements)
+
+    def called(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """tau (nv,) of those functions alone; ``data`` is a workspace."""
+        pin.forwardKinematics(self._model, data, q, v)
+        pin.computeJointJacobians(self._model, data, q)
+        tau = np.zeros(self._nv)
+        for element in self._elements:
+            if isinstance(element, _UserForce):
+                element.add(tau, data, q, v, t)
+        return tau
+
     def constants(self) -> list[dict[str, Any]]:
-        """What the compiled kernel needs of each element."""
-        return [element.constants() for element in self._elements]
+        """What the compiled kernel needs of each element but the functions of the user."""
+        return [
+            element.constants() for element in self._elements if not isinstance(element, _UserForce)
+        ]

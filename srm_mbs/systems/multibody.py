@@ -128,6 +128,19 @@ class _Mechanics:
         return self._controller is not None
 
     @property
+    def calls_forces(self) -> bool:
+        """Whether force elements are functions of the user."""
+        return self._forces is not None and self._forces.calls
+
+    def called_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) of the Python functions that act: the controller, unless its
+        output is held, and those among the force elements."""
+        tau = np.zeros(self.nv) if self.held is not None else self.controlled_force(t, q, v)
+        if self._forces is not None and self._forces.calls:
+            tau = tau + self._forces.called(self.data, q, v, t)
+        return tau
+
+    @property
     def held(self) -> HeldForce | None:
         """The controller, if it is one whose output is held between samples."""
         return self._controller if isinstance(self._controller, HeldForce) else None

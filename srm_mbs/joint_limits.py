@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.closing import ClosureProblem, close_from
+from srm_mbs.forces import OPEN, LimitSpring
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.units import coordinate_units
 
 SLACK = 1e-9
 """What rounding may take a joint beyond its limit, rad or m."""
+CONTACT = 100.0
+"""Angular frequency of a default contact over the mechanism's characteristic rate."""
+DAMPING_RATIO = 0.1
+SMALLEST_INERTIA = 1e-3
+"""Least inertia that a default contact is made for, over the largest of the tree."""
 STARTS = 24
 SPREAD = 1.5
 """Size of the restarts, rad or scene diagonals."""
@@ -66,3 +74,23 @@ def close_within_limits(
         if problem.closed(closed) and not beyond_limits(mechanism, closed):
             found.append(closed)
     return min(found, key=problem.distance, default=None)
+
+
+def limit_springs(mechanism: Mechanism) -> tuple[LimitSpring, ...]:
+    """Springs at all position limits that have none yet, as stiff as the mechanism is fast.
+
+    k = M_jj (100 w)^2 and c = 0.2 sqrt(k M_jj), with the inertia M_jj that the joint moves in the
+    open tree at q0 and the mechanism's characteristic rate w
+    (:class:`~srm_mbs.systems.units.Units`): a contact takes about a hundredth of its time.
+    """
+    there = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
+    rate = coordinate_units(mechanism, mechanism.q0, mechanism.v0).rate
+    inertia = np.diag(pin.crba(mechanism.model, mechanism.model.createData(), mechanism.q0))
+    out = []
+    for name, _, j, low, high in _limited(mechanism):
+        moved = max(float(inertia[j]), SMALLEST_INERTIA * float(inertia.max()))
+        stiffness = moved * (CONTACT * rate) ** 2
+        if name not in there and min(abs(low), abs(high)) < OPEN:
+            damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * moved))
+            out.append(LimitSpring(name, stiffness, damping, name=f"limit_{name}"))
+    return tuple(out)

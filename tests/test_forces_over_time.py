@@ -324,3 +324,29 @@ def test_a_saved_run_says_that_its_function_is_missing(tmp_path: Path) -> None:
         loaded.reactions  # noqa: B018
     with pytest.raises(srm.InputError, match="cannot be called"):
         srm.UserForce(3.0)  # type: ignore[arg-type]
+
+
+def test_springs_at_all_limits_on_request(tmp_path: Path) -> None:
+    urdf = """<robot name="arm"><link name="base"/><link name="arm"><inertial><mass value="2"/>
+    <origin xyz="0.5 0 0"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>
+    </inertial></link><joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="0.3" effort="0" velocity="0"/></joint></robot>"""
+    (tmp_path / "arm.urdf").write_text(urdf)
+    path = tmp_path / "arm.toml"
+    path.write_text('format = 1\nurdf = "arm.urdf"\nlimits = "spring"\n')
+    mechanism = srm.load(path)
+    (spring,) = mechanism.forces
+    assert isinstance(spring, srm.LimitSpring)
+    rate = mechanism.structure.units.rate
+    assert spring.stiffness == pytest.approx(0.6 * (100.0 * rate) ** 2)
+    assert spring.damping == pytest.approx(0.2 * 0.6 * 100.0 * rate)
+    assert any(f"hinge {spring.stiffness:.3g}" in note for note in mechanism.notes)
+    solution = srm.simulate(mechanism, 4.0)
+    assert solution.success, solution.message
+    angle, rate_ = solution.joint("hinge")
+    assert 0.3 < angle.max() < 0.35  # it falls on the upper limit and comes to rest there
+    assert abs(rate_[-1]) < 0.1
+    assert "limits" not in solution.message
+    path.write_text('format = 1\nurdf = "arm.urdf"\nlimits = "stop"\n')
+    with pytest.raises(srm.InputError, match="limits"):
+        srm.load(path)

@@ -15,6 +15,7 @@ import pinocchio as pin
 from srm_mbs.assembly import assemble
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.joint_limits import limit_springs
 from srm_mbs.loading.description import (
     Description,
     LimitSpringEntry,
@@ -204,7 +205,22 @@ def unassembled(
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
         notes=(*notes, *built.notes),
     )
-    return replace(mechanism, notes=mechanism.notes + _friction_note(mechanism)), q, v
+    mechanism = replace(mechanism, notes=mechanism.notes + _friction_note(mechanism))
+    if description.limits == "spring":
+        mechanism = _with_limit_springs(mechanism)
+    return mechanism, q, v
+
+
+def _with_limit_springs(mechanism: Mechanism) -> Mechanism:
+    springs = limit_springs(mechanism)
+    values = ", ".join(f"{s.joint} {s.stiffness:.3g} and {s.damping:.3g}" for s in springs)
+    note = (
+        "springs act at the joint limits, stiffness (N m/rad, N/m) and damping (per second): "
+        f"{values}; give [[force]] entries of type limit_spring for others"
+        if springs
+        else "no joint has limits at which a spring could act"
+    )
+    return replace(mechanism, forces=(*mechanism.forces, *springs), notes=(*mechanism.notes, note))
 
 
 def rebuild(source: Source) -> Mechanism:

@@ -256,6 +256,7 @@ class Description(_Strict):
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]
     lock: list[StrictStr] = []
+    limits: Literal["reported", "spring"] = "reported"
     friction_speed: Annotated[Number, Field(gt=0)] = FRICTION_SPEED
     loop: list[LoopEntry] = []
     force: list[AnyForceEntry] = []

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import srm_mbs as srm
 from srm_mbs.cli import app
 from srm_mbs.systems.forces import ForceKinematics
-from tests import sdf_files
+from tests import mjcf_files, sdf_files
 from tests.test_joint_types import urdf as extended_joints
 from tests.test_loading import closure, mass_matrix
 from tests.test_urdf_loops import (
@@ -44,6 +44,7 @@ INPUTS: dict[str, tuple[str, str, dict[str, str]]] = {
         {"robot.urdf": tree(PAIR)},
     ),
     "SDF": ("robot.sdf", sdf_files.four_bar(), {}),
+    "MJCF": ("robot.xml", mjcf_files.FOUR_BAR, {}),
     "a description": (
         "robot.toml",
         'format = 1\nurdf = "model/tree.urdf"\nbase = "floating"\ngravity = [0, 0, -1.6]\n'
@@ -85,7 +86,7 @@ def assert_same(ours: srm.Mechanism, theirs: srm.Mechanism) -> None:
             force = pin.nonLinearEffects(tree, data, q, v).copy()
             if mechanism.forces:
                 elements = ForceKinematics(tree, mechanism.forces)
-                force -= elements.generalised(data, q, v)
+                force -= elements.generalised(data, q, v, 0.0)
             forces.append(force)
         np.testing.assert_allclose(forces[0], forces[1], atol=1e-12)
 
@@ -130,6 +131,17 @@ def test_meshes_are_found_from_the_new_place(tmp_path: Path) -> None:
     text = written.read_text()
     for name in ("../meshes/a.stl", "package://robot/b.stl", "/somewhere/c.stl"):
         assert f'"{name}"' in text
+
+
+def test_tables_are_found_from_the_new_place(tmp_path: Path) -> None:
+    (tmp_path / "motion.csv").write_text("t,value\n0,0\n1,0.3\n2,0.5\n3,0.6\n")
+    (tmp_path / "robot.urdf").write_text(tree())
+    path = tmp_path / "robot.toml"
+    drive = '[[drive]]\njoint = "hip"\ntype = "table"\ntable = "motion.csv"\n'
+    path.write_text(f'format = 1\nurdf = "robot.urdf"\n{drive}')
+    (tmp_path / "deep").mkdir()
+    description, _, _ = srm.convert(path, tmp_path / "deep" / "out.toml")
+    assert srm.load(description).drives == srm.load(path).drives != ()
 
 
 def test_nothing_is_overwritten_unless_asked_for(tmp_path: Path) -> None:

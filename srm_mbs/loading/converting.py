@@ -7,6 +7,7 @@ import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import tomli_w
@@ -66,6 +67,7 @@ def convert(
                 "the file exists", file=str(target), remedy="Give another name, or --force"
             )
     entries = tomllib.loads(source.description) | {"urdf": urdf.name}
+    _move_tables(entries, Path(source.path), description)
     tree = _with_meshes_from(source.urdf, Path(source.urdf_path), urdf)
     try:
         urdf.write_text(tree, encoding="utf-8")
@@ -77,6 +79,25 @@ def convert(
     return description, urdf, mechanism.notes
 
 
+def _seen_from(name: str, original: Path, written: Path) -> str:
+    """The relative path ``name`` beside ``original`` as seen from beside ``written``."""
+    target = (original.parent / name).resolve()
+    return Path(os.path.relpath(target, written.parent.resolve())).as_posix()
+
+
+def _move_tables(entries: Any, original: Path, written: Path) -> None:
+    """Correct, in place, the relative paths of the tables that laws are read from."""
+    if isinstance(entries, list):
+        for entry in entries:
+            _move_tables(entry, original, written)
+    elif isinstance(entries, dict):
+        for key, value in entries.items():
+            if key == "table" and isinstance(value, str) and not Path(value).is_absolute():
+                entries[key] = _seen_from(value, original, written)
+            else:
+                _move_tables(value, original, written)
+
+
 def _with_meshes_from(text: str, original: Path, written: Path) -> str:
     """The URDF ``text`` with the relative paths of its mesh files as seen from ``written``."""
     root = parse_urdf(text, str(original))
@@ -85,7 +106,6 @@ def _with_meshes_from(text: str, original: Path, written: Path) -> str:
         name = mesh.get("filename", "")
         if not name or urlsplit(name).scheme or Path(name).is_absolute():
             continue
-        target = (original.parent / name).resolve()
-        mesh.set("filename", Path(os.path.relpath(target, written.parent.resolve())).as_posix())
+        mesh.set("filename", _seen_from(name, original, written))
         changed = True
     return ET.tostring(root, encoding="unicode") + "\n" if changed else text

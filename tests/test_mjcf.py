@@ -42,7 +42,7 @@ class Twins:
         self.model.gravity.linear = np.array(made.entries["gravity"])
         keys = {key: value for key, value in made.entries.items() if key != "loop"}
         toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})
-        forces = parse_description(toml, "x.toml").force_elements()
+        forces = parse_description(toml, "x.toml").force_elements(None)
         self.forces = ForceKinematics(self.model, forces)
         self.theirs = mujoco.MjModel.from_xml_string(text)
         self.theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -140,7 +140,7 @@ def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
                 own = slice(joint.idx_v, joint.idx_v + 3)
                 turning[own] = np.cross(v[own.stop : own.stop + 3], v[own])
         bias = T.T @ (state.qfrc_bias - state.qfrc_passive) + ours @ turning
-        mine = twins.data.nle + model.damping * v - twins.forces.generalised(twins.data, q, v)
+        mine = twins.data.nle + model.damping * v - twins.forces.generalised(twins.data, q, v, 0.0)
         np.testing.assert_allclose(mine, bias, rtol=1e-9, atol=1e-10)
 
 

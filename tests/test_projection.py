@@ -367,7 +367,7 @@ def dense_terms(system: ClosedSystem, state: FloatArray) -> tuple[FloatArray, ..
     M = np.triu(pin.crba(system.model, data, q, pin.Convention.WORLD))
     M = M + np.triu(M, 1).T
     f = -pin.nonLinearEffects(system.model, data, q, v) - system.model.damping * v
-    f += ForceKinematics(system.model, system.mechanism.forces).generalised(data, q, v)
+    f += ForceKinematics(system.model, system.mechanism.forces).generalised(data, q, v, 0.0)
     return M, system.loops.G.copy(), f, system.loops.bias.copy()
 
 

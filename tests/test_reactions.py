@@ -272,7 +272,7 @@ def test_multipliers_of_a_run_balance_the_equations_of_motion(name: str) -> None
         pin.crba(model, data, q, pin.Convention.WORLD)
         rows.update(data, q, with_bias=False)
         pin.nonLinearEffects(model, data, q, v)
-        elements = forces.generalised(data, q, v)
+        elements = forces.generalised(data, q, v, 0.0)
         inverse_dynamics = pin.rnea(model, data, q, v, a) - elements + model.damping * v
         scale = max(1.0, float(np.abs(inverse_dynamics).max()))
         assert_close(inverse_dynamics, -rows.G.T @ lam[i], atol=1e-10 * scale)

@@ -34,7 +34,7 @@ def fingerprint(mechanism: srm.Mechanism) -> dict[str, Any]:
         pin.nonLinearEffects(model, data, q, v)
         rows.update(data, q)
         force = data.nle + model.damping * v + model.friction * np.tanh(v)
-        force -= forces.generalised(data, q, v)
+        force -= forces.generalised(data, q, v, 0.0)
         tree += [np.triu(data.M).ravel().tolist(), force.tolist()]
         loops += [rows.g.tolist(), rows.G.ravel().tolist(), rows.bias.tolist()]
     defaults = mechanism.defaults

@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -543,6 +544,10 @@ class CompiledDenseOutput(DenseOutput):
         :class:`~srm_mbs.stepping.dense.DenseOutput`."""
         if self._steps.count < 2:  # a single step has no neighbours, but perhaps a zone
             return super().__call__(t)
+        if self._lone_zones:
+            return super().__call__(t)
+        if len(self._extension.extra_c) and self._steps.rates.shape[1] == self._extension.n_rates:
+            return super().__call__(t)  # loaded without the controller: no stage is to be evaluated
         self.check(t)
         if self._compiled is None:
             self._compiled = self._compile()
@@ -554,6 +559,13 @@ class CompiledDenseOutput(DenseOutput):
         finally:
             done = self._twin.evaluations - before[0], self._twin.factorisations - before[1]
             self._mechanism_system.count(*done)
+
+    @cached_property
+    def _lone_zones(self) -> bool:
+        """Whether a step with a zone has a breakpoint on both sides: the kernel's extra stages have
+        no zone."""
+        pieces = (self._steps.piece(step) for step in self._steps.zones)
+        return any(last - first < 2 for first, last in pieces)
 
     def _compile(self) -> Any:
         steps, extension = self._steps, self._extension

@@ -108,6 +108,13 @@ class Solution:
         """What a sampled controller held; None without one."""
         return self._system.held
 
+    @property
+    def steps_to_save(self) -> StepData:
+        """The steps; complete where the controller, which is not saved, would be needed to read
+        between them."""
+        called = self.settings.controlled and self._system.controlled and self.held is None
+        return self._dense.complete() if called else self.steps
+
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output: q and v at time ``t`` (s), a scalar or an array of any order.
 

@@ -110,7 +110,8 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
         "stop": solution.steps.stop,
         "events": None if solution.t_events is None else len(solution.t_events),
     }
-    arrays: dict[str, Any] = {name: getattr(solution.steps, name) for name in _STEP_ARRAYS}
+    steps = solution.steps_to_save
+    arrays: dict[str, Any] = {name: getattr(steps, name) for name in _STEP_ARRAYS}
     for k, (_, history) in enumerate(zones.values()):
         arrays[f"zone_{k}_times"] = history.times
         arrays[f"zone_{k}_values"] = history.values

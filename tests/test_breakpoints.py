@@ -181,6 +181,28 @@ def test_a_breakpoint_next_to_a_singular_configuration_changes_nothing(
     assert np.abs(cut(t)[0] - smooth(t)[0]).max() < 2e-9
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_step_in_the_zone_between_breakpoints_is_read(
+    slider_crank: srm.Mechanism, backend: str
+) -> None:
+    """It has no neighbours to be interpolated from."""
+    smooth = srm.simulate(slider_crank, 1.5, rtol=1e-12)
+    time = smooth.crossings[0].time
+    h = 0.01
+    cut = srm.simulate(
+        slider_crank,
+        1.5,
+        breakpoints=time + h * np.arange(-5, 6),
+        step=h,
+        placement="off",
+        backend=backend,
+    )
+    assert cut.success
+    assert cut.stats.zone_steps > 0
+    t = np.linspace(time - 3.0 * h, time + 3.0 * h, 61)
+    assert np.abs(cut(t)[0] - smooth(t)[0]).max() < 1e-6
+
+
 def test_a_torque_may_jump_on_a_singular_configuration(slider_crank: srm.Mechanism) -> None:
     """The multiplier jumps there with the torque; the reduced equation is regular."""
     (passage,) = srm.simulate(slider_crank, 2.0, rtol=1e-12).crossings

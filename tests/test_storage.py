@@ -222,3 +222,22 @@ def test_a_run_of_another_format_is_refused_as_such(tmp_path: Path) -> None:
     np.savez(tmp_path / "old.npz", **arrays)
     with pytest.raises(srm.InputError, match=r"old\.npz: it has format 1, this version reads 4"):
         srm.load_solution(tmp_path / "old.npz")
+
+
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+def test_a_controlled_run_is_read_between_its_steps_without_its_controller(
+    tmp_path: Path, tableau: str
+) -> None:
+    solution = srm.simulate(
+        srm.load("slider_crank"),
+        2.0,
+        controller=lambda t, q, v: [5.0 * np.sin(9.0 * t) - 3.0 * v[0], 0.0],
+        tableau=tableau,
+    )
+    solution.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    t = np.linspace(0.0, 2.0, 201)
+    assert np.abs(loaded(t)[0] - solution(t)[0]).max() < 1e-13
+    loaded.save(tmp_path / "again.npz")
+    again = srm.load_solution(tmp_path / "again.npz")
+    assert np.array_equal(again(t)[0], loaded(t)[0])

@@ -12,7 +12,7 @@ tolerance of the closures.  The extra stages of dop853 are evaluated only when a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -206,12 +206,30 @@ class DenseOutput:
         times[-1], states[-1] = data.stop, self(np.array([data.stop]))[0]
         return times, states
 
+    def complete(self) -> StepData:
+        """The steps with the rates of all stages that reading between them needs: for a reader
+        that does not have the controller."""
+        data, count = self._steps, self._extension.n_rates
+        if not data.count or data.rates.shape[1] == count:
+            return data
+        rates = np.zeros((data.count, count, data.rates.shape[2]))
+        rates[:, : data.rates.shape[1]] = data.rates
+        for step, h in enumerate(np.diff(data.times)):
+            if not self._between_neighbours(step):
+                rates[step] = self._all_rates(step, h)
+        return replace(data, rates=rates)
+
+    def _between_neighbours(self, step: int) -> bool:
+        """Whether a step is read from its neighbours (:mod:`.hermite`), not from its stages."""
+        data = self._steps
+        first, last = data.piece(step)
+        return last - first > 1 and (
+            step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
+        )
+
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
         data, system = self._steps, self._system
-        first, last = data.piece(step)
-        if last - first > 1 and (
-            step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
-        ):
+        if self._between_neighbours(step):
             if step not in self._smooth:
                 self._smooth[step] = HermiteStep(system, data, step)
             return self._smooth[step](theta)

@@ -7,6 +7,7 @@ Exit status: 0; 1 when a run did not reach its end; 2 for bad input.
 from __future__ import annotations
 
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +16,9 @@ from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+
+# Before NumPy is loaded: on matrices of this size the threads of BLAS cost many times their work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 

@@ -511,3 +511,20 @@ def test_reader_that_closes_the_pipe_early_causes_no_complaint() -> None:
     ) as process:
         process.stdout.close()
         assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("3", "3")])
+def test_the_command_line_keeps_blas_to_one_thread_unless_told_otherwise(
+    given: str | None, used: str
+) -> None:
+    code = (
+        "import sys, srm_mbs.cli, os\n"
+        "assert 'numpy' not in sys.modules, 'too late'\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    plain = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+    environment = plain if given is None else plain | {"OPENBLAS_NUM_THREADS": given}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == used

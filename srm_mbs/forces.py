@@ -351,7 +351,7 @@ class LimitSpring(ForceElement):
     lower, upper
         Limits (rad, m); by default the model's.
     depth
-        rad or m, positive; by default a hundredth of the range, or 0.01 where one limit is open.
+        rad or m, positive; by default a hundredth of the range, at most 0.01.
     name
         Unique name.
 
@@ -388,7 +388,7 @@ class LimitSpring(ForceElement):
         low = float(model.lowerPositionLimit[joint.idx_q]) if self.lower is None else self.lower
         high = float(model.upperPositionLimit[joint.idx_q]) if self.upper is None else self.upper
         low, high = (x if abs(x) < OPEN else float(np.copysign(np.inf, x)) for x in (low, high))
-        width = high - low if np.isfinite([low, high]).all() else 1.0
+        width = min(high - low, 1.0)
         return low, high, 0.01 * width if self.depth is None else self.depth
 
     def check(self, model: pin.Model) -> None:

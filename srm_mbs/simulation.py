@@ -492,10 +492,19 @@ def _collect(
         + turns(suspects, "the velocity turned", MENDED)
         + restarts(record.steps)
         + drift(record.steps, norm)
-        + _limits_left(mechanism, dense),
+        + _limits_left(mechanism, dense)
+        + _driven_too_far(mechanism, record),
         stats=stats,
         settings=settings,
     )
+
+
+def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
+    """What else may be the cause where a driven mechanism cannot go on."""
+    if record.status != "failed" or not mechanism.drives:
+        return ""
+    names = ", ".join(drive.name for drive in mechanism.drives)
+    return f" A drive ({names}) may lead where the mechanism cannot follow."
 
 
 def _bifurcations(solution: Solution) -> str:

@@ -182,7 +182,10 @@ def test_limits_of_the_model_are_the_default() -> None:
     model.lowerPositionLimit[:] = -0.5
     model.upperPositionLimit[:] = 1.5
     spring = srm.LimitSpring("a", 10.0)
-    assert spring.resolved(model) == (-0.5, 1.5, 0.02)
+    assert spring.resolved(model) == (-0.5, 1.5, 0.01)
+    model.upperPositionLimit[:] = -0.3
+    assert spring.resolved(model) == pytest.approx((-0.5, -0.3, 0.002))
+    assert srm.LimitSpring("a", 10.0, upper=1e40).resolved(model)[1] == np.inf
 
 
 # Descriptions and saved runs

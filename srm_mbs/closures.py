@@ -248,3 +248,4 @@ CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType(
         )
     }
 )
+"""The closures by their type in a description."""

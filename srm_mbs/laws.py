@@ -129,7 +129,7 @@ def _take_list(law: Law, key: str, least: int) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class ConstantSpeed:
+class ConstantSpeed(Law):
     """s = s_0 + speed t.
 
     Parameters
@@ -162,7 +162,7 @@ class ConstantSpeed:
 
 
 @dataclass(frozen=True)
-class Sine:
+class Sine(Law):
     """s = offset + amplitude sin(omega t + phase), omega = 2 pi frequency_hz.
 
     Parameters
@@ -213,7 +213,7 @@ class Sine:
 
 
 @dataclass(frozen=True)
-class Polynomial:
+class Polynomial(Law):
     """s = c_0 + c_1 t + c_2 t^2 + ...
 
     Parameters
@@ -246,7 +246,7 @@ class Polynomial:
 
 
 @dataclass(frozen=True)
-class MinimumJerk:
+class MinimumJerk(Law):
     """From rest to rest: s = s_0 + (target - s_0)(10 x^3 - 15 x^4 + 6 x^5).
 
     x = (t - start)/duration.  It holds s_0 before ``start`` and ``target`` after start + duration.
@@ -297,7 +297,7 @@ class MinimumJerk:
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Law):
     """The cubic spline (C2, not-a-knot) through values over time.
 
     Parameters

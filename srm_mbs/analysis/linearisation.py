@@ -77,6 +77,7 @@ class Linearisation:
 
     @property
     def eigenvalues(self) -> Any:
+        """Those of A (2 k,), complex, 1/s."""
         return self._eigen[0]
 
     @cached_property

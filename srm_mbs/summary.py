@@ -71,11 +71,14 @@ def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
     count = f"{found.joint_freedoms} - {found.rows} = {found.gruebler}"
     if found.planar_gruebler is not None:
         count += f", in the plane {found.planar_gruebler}"
+    freedom = f"{mechanism.degrees_of_freedom}"
+    if mechanism.drives:
+        freedom += f", {found.degrees_of_freedom} without the drives"
     idle = [f"{', '.join(motion.joints)} ({motion.directions})" for motion in found.idle]
     return [
         ("mechanism", mechanism.name),
         ("read from", "Python" if source is None else f"{source.path} ({source.format})"),
-        ("degrees of freedom", f"{mechanism.degrees_of_freedom}"),
+        ("degrees of freedom", freedom),
         ("Gruebler count", count),
         ("closure rows", f"{found.rows}"),
         *([("drives", f"{len(mechanism.drives)}")] if mechanism.drives else []),

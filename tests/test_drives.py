@@ -613,3 +613,21 @@ def test_a_simulator_follows_the_drives_also_after_a_reset(backend: str) -> None
     np.testing.assert_allclose(simulator.step(0.6)[0], whole.q[-1], atol=1e-7)
     with pytest.raises(srm.InputError, match="violates the drives: row crank_left"):
         simulator.reset(q, v, t=0.5)
+
+
+def test_info_and_tables_show_what_is_driven(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from srm_mbs.cli import app
+
+    path = written(
+        tmp_path,
+        '[[drive]]\njoint = "crank"\ntype = "sine"\namplitude = 0.25\nfrequency_hz = 2.0\n',
+    )
+    shown = CliRunner().invoke(app, ["info", str(path)])
+    assert shown.exit_code == 0, shown.output
+    assert "0, 1 without the drives" in shown.output
+    assert "amplitude 0.25, frequency_hz 2" in shown.output
+    solution = srm.simulate(srm.load(path), 0.2)
+    solution.to_csv(tmp_path / "run.csv")
+    assert "||g|| (m; rad)" in (tmp_path / "run.csv").read_text().splitlines()[0]

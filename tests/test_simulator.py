@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import time
 from typing import Any
 
 import numpy as np
@@ -233,29 +232,6 @@ def test_drives_have_their_knots_between_steps_and_on_them(backend: str, dt: flo
         assert np.abs(v - exact[1]).max() < 1e-7
     assert simulator.stats.rejected <= 3
     assert abs(q[0] - start) > 0.5
-
-
-@needs_kernel
-def test_a_step_costs_little_more_than_its_integration(slider_crank: srm.Mechanism) -> None:
-    simulator = srm.Simulator(slider_crank, backend="kernel")
-    simulator.step(1e-3)
-
-    def per_step(repeats: int) -> float:
-        started = time.process_time()
-        for _ in range(repeats):
-            simulator.step(1e-5)
-        return (time.process_time() - started) / repeats
-
-    each = min(per_step(300) for _ in range(15))
-    # The same steps in one call: what is left are the calls, and evaluations for the error.
-    whole = []
-    for _ in range(8):
-        inside = srm.Simulator(slider_crank, step=1e-5, backend="kernel")
-        inside.step(1e-3)
-        started = time.process_time()
-        inside.step(5e-3)
-        whole.append((time.process_time() - started) / 500)
-    assert each - min(whole) < 15e-6
 
 
 @needs_kernel

@@ -18,6 +18,7 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.closing import ClosureProblem, close_loops
 from srm_mbs.closing_failure import cannot_close, free_coordinates, limits_in_the_way, quoted
 from srm_mbs.coordinates import set_position, set_rate
+from srm_mbs.driven_start import with_absolute_drives
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.joint_limits import beyond_limits, close_within_limits
 from srm_mbs.mechanism import Mechanism
@@ -38,8 +39,6 @@ AT_REST = 1e-14
 """Part of the given rates up to which what remains of them is rounding."""
 EXACTLY, NEARLY = 1e-12, 1e-3
 """Singular values of G, rows over their usual size, between which rates come from the branch."""
-CONTRADICTS = 1e-9
-"""Difference (rad, m) between a held position and where a drive begins."""
 CURVATURE = 1e-7
 """Largest u^T (Gdot v) of consistent rates, over the square of the rates."""
 
@@ -268,44 +267,6 @@ def _onto_tangent(
     return None if best is None else bent(best)
 
 
-def _with_absolute_drives(
-    mechanism: Mechanism, start: FloatArray, held: tuple[str, ...]
-) -> tuple[tuple[str, ...], Mechanism]:
-    """Put what absolute drives begin with: joints into ``start`` and ``held``, points into the
-    loops of the mechanism.
-
-    Raises
-    ------
-    AssemblyError
-        If a held position contradicts a drive.
-    """
-    loops = list(mechanism.loops)
-    for drive in mechanism.drives:
-        if not drive.absolute:
-            continue
-        value = drive.curve(0.0)(0.0)[0]
-        if drive.joint is None:
-            loops.append(drive.frozen(value))
-            continue
-        wanted = start.copy()
-        set_position(mechanism, wanted, drive.joint, value)
-        if drive.joint in held and np.abs(wanted - start).max() > CONTRADICTS:
-            raise AssemblyError(
-                f"the held position of {drive.joint!r} contradicts the drive {drive.name!r}, "
-                f"which begins at {value:.6g}",
-                residuals={},
-                q=start,
-                held=(drive.joint,),
-                element="initial.q",
-                remedy="Free it, or remove absolute from the drive: its law then begins there",
-            )
-        start[:] = wanted
-        held = (*held, *(() if drive.joint in held else (drive.joint,)))
-    if len(loops) == len(mechanism.loops):
-        return held, mechanism
-    return held, replace(mechanism, loops=tuple(loops), drives=())
-
-
 def _vector(values: Any, size: int, what: str) -> FloatArray:
     try:
         array = np.array(values, dtype=float)
@@ -419,7 +380,7 @@ def assemble(
         rates = _vector(v, model.nv, "v")
     if not mechanism.constrained:
         return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
-    held, to_close = _with_absolute_drives(mechanism, start, held)
+    held, to_close = with_absolute_drives(mechanism, start, held)
     problem = ClosureProblem(to_close, start)
     closed = start.copy()
     if to_close.loops:

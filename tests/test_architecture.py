@@ -16,13 +16,13 @@ PACKAGE = Path(srm_mbs.__file__).parent
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
     ("_kernel", "arrays", "errors", "records", "semi_explicit"),
-    ("anchors", "closures", "laws"),
+    ("anchors", "closures", "csv_tables", "laws"),
     ("loop_closure",),
     ("mechanism",),
     ("coordinates", "drives", "pinocchio_constraints", "forces", "user_forces", "systems"),
     ("methods",),
     ("stepping",),
-    ("closing", "kernel"),
+    ("closing", "driven_start", "kernel"),
     ("closing_failure", "continuation", "joint_limits"),
     ("assembly", "motion", "segmented", "solution"),
     ("loading",),

@@ -9,7 +9,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import srm_mbs as srm
-from srm_mbs.laws import Law, read_table
+from srm_mbs.csv_tables import read_table
+from srm_mbs.laws import Law
 
 TIMES = [0.0, 0.2, 0.5, 0.9, 1.4, 2.0]
 VALUES = [0.3, -0.1, 0.4, 1.2, 0.7, 0.9]

@@ -7,8 +7,9 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
+from srm_mbs.csv_tables import read_table, table_columns
 from srm_mbs.errors import InputError
-from srm_mbs.laws import LAW_TYPES, Law, Polynomial, Table, read_table, table_columns
+from srm_mbs.laws import LAW_TYPES, Law, Polynomial, Table
 
 TABLE_KEYS = ("table", "time", "value")
 """Keys of a table in a file: its path, and the names of its columns, by default t and value."""

@@ -97,7 +97,7 @@ def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
         joint = mechanism.joint(name)
         kind = _kind(joint)
         v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
-        rate = f"{v[0]:.6g} {_unit(kind)}/s" if joint.nv == 1 else _vector(v)
+        rate = f"{_shown(v[0]):.6g} {_unit(kind)}/s" if joint.nv == 1 else _vector(map(_shown, v))
         yield name, kind, position_text(mechanism, name, mechanism.q0), rate
 
 
@@ -105,8 +105,13 @@ def position_text(mechanism: Mechanism, name: str, q: FloatArray) -> str:
     """Position of the joint ``name`` in q (nq,), with its unit where it has one degree."""
     joint = mechanism.joint(name)
     if joint.nv > 1:
-        return _vector(q[joint.idx_q : joint.idx_q + joint.nq])
-    return f"{position_of(mechanism, q, name):.6g} {_unit(_kind(joint))}"
+        return _vector(map(_shown, q[joint.idx_q : joint.idx_q + joint.nq]))
+    return f"{_shown(position_of(mechanism, q, name)):.6g} {_unit(_kind(joint))}"
+
+
+def _shown(value: float) -> float:
+    """``value`` without the rounding noise of assembly, which means zero."""
+    return round(float(value), 12) + 0.0
 
 
 def _kind(joint: Any) -> str:

@@ -10,11 +10,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs.cli import app
+from srm_mbs.summary import joint_rows
 from tests.urdf_files import tree
 
 ROOT = Path(srm.__file__).parents[1]
@@ -528,3 +530,11 @@ def test_the_command_line_keeps_blas_to_one_thread_unless_told_otherwise(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == used
+
+
+def test_rounding_of_the_assembly_is_shown_as_zero() -> None:
+    mechanism = srm.load("four_bar")
+    q = np.array([1.0, -3e-29, 2e-13])
+    noisy = srm.Mechanism(mechanism.model, q0=q, v0=np.array([1e-14, 0.5, -1e-20]))
+    shown = [row[2:] for row in joint_rows(noisy)]
+    assert shown == [("1 rad", "0 rad/s"), ("0 rad", "0.5 rad/s"), ("0 rad", "0 rad/s")]

@@ -631,3 +631,23 @@ def test_info_and_tables_show_what_is_driven(tmp_path: Path) -> None:
     solution = srm.simulate(srm.load(path), 0.2)
     solution.to_csv(tmp_path / "run.csv")
     assert "||g|| (m; rad)" in (tmp_path / "run.csv").read_text().splitlines()[0]
+
+
+def test_a_delta_robot_moves_from_rest_to_rest_with_the_torques_of_inverse_dynamics() -> None:
+    robot = srm.load("delta_robot")
+    arms = ["arm_1", "arm_2", "arm_3"]
+    starts = [robot.q0[robot.joint(name).idx_q] for name in arms]
+    drives = [
+        srm.Drive(srm.MinimumJerk(start + 0.06 * (k + 1), 0.5, start=0.1), name)
+        for k, (start, name) in enumerate(zip(starts, arms))
+    ]
+    mechanism = driven(robot, *drives, v=0.0 * robot.v0)
+    assert mechanism.degrees_of_freedom == 0
+    solution = srm.simulate(mechanism, 0.7, rtol=1e-9)
+    assert solution.success, solution.message
+    for k, (start, name) in enumerate(zip(starts, arms)):
+        assert solution.joint(name)[0][-1] == pytest.approx(start + 0.06 * (k + 1), abs=1e-12)
+    found = srm.inverse_dynamics(mechanism, solution, actuated=arms)
+    forces = np.column_stack([solution.drive_forces[name] for name in arms])
+    np.testing.assert_allclose(found.torques, forces, atol=1e-10)
+    assert solution.energy_balance.relative < 1e-10

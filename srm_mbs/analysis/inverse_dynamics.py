@@ -218,7 +218,9 @@ def _check_motion(
 ) -> None:
     """Refuse positions, rates u and accelerations a, in units, that the closures forbid."""
     g, G = geometry.closure(q)
-    speed = float(np.abs(u).max(initial=0.0))
+    # At rest what is left is rounding: it counts against the mechanism's own rate.
+    rate = geometry.mechanism.structure.units.rate
+    speed = max(float(np.abs(u).max(initial=0.0)), rate)
     bias = geometry.bias(q, u) * geometry.row_size
     checks = (
         ("positions", g, 1.0),

@@ -56,6 +56,9 @@ if TYPE_CHECKING:
     from srm_mbs.simulator import Simulator
     from srm_mbs.solution import Solution
     from srm_mbs.storage import load_solution
+    from srm_mbs.sweeps.results import Sweep
+    from srm_mbs.sweeps.running import sweep
+    from srm_mbs.sweeps.tasks import standard_measures
     from srm_mbs.user_forces import UserForce
 
 _HOME = {
@@ -98,6 +101,7 @@ _HOME = {
     "SpringDamper": "forces",
     "SrmError": "errors",
     "SrmWarning": "errors",
+    "Sweep": "sweeps.results",
     "Switch": "actions",
     "TABLEAUS": "methods.tableaus",
     "Table": "laws",
@@ -121,6 +125,8 @@ _HOME = {
     "n_four_bar": "loading",
     "simulate": "simulation",
     "solve_dae": "dae",
+    "standard_measures": "sweeps.tasks",
+    "sweep": "sweeps.running",
 }
 
 __all__ = [
@@ -164,6 +170,7 @@ __all__ = [
     "SpringDamper",
     "SrmError",
     "SrmWarning",
+    "Sweep",
     "Switch",
     "Table",
     "TorsionSpring",
@@ -186,6 +193,8 @@ __all__ = [
     "n_four_bar",
     "simulate",
     "solve_dae",
+    "standard_measures",
+    "sweep",
 ]
 
 

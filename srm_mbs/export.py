@@ -17,9 +17,12 @@ Reactions are left out: there are six per loop, and they are better taken from
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.mechanism import Mechanism
@@ -56,7 +59,7 @@ def write_csv(solution: Solution, path: Path) -> None:
     write_table(columns, path)
 
 
-def write_table(columns: dict[str, FloatArray], path: Path) -> None:
+def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
     """Write ``columns``, header -> values (n,), to ``path``.
 
     Raises
@@ -68,7 +71,7 @@ def write_table(columns: dict[str, FloatArray], path: Path) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         # Python's own floats: the csv module writes them with repr.
-        writer.writerows(np.column_stack(list(columns.values())).tolist())
+        writer.writerows(zip(*(column.tolist() for column in columns.values())))
 
 
 def _columns(solution: Solution) -> dict[str, FloatArray]:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -315,7 +314,8 @@ class Mechanism:
 
     def with_state(self, q0: Any, v0: Any) -> Mechanism:
         """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
-        changed = copy(self)
+        changed = object.__new__(type(self))
+        changed.__dict__.update(self.__dict__)
         for kept in ("initial_errors", "drive_curves", "_of_start", "structure"):
             changed.__dict__.pop(kept, None)
         changed._take_start(q0, v0)
@@ -323,6 +323,16 @@ class Mechanism:
             changed.__dict__["structure"] = self.structure.at(changed)
         changed.__dict__["_derived"] = self._derived
         return changed
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a pickle holds: the fields, and the analysis, which other processes then share."""
+        names = [*(entry.name for entry in fields(self)), "structure"]
+        return {name: self.__dict__[name] for name in names if name in self.__dict__}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for array in (self.q0, self.v0):
+            array.setflags(write=False)
 
     def _take_start(self, q0: Any, v0: Any) -> None:
         model = self.model

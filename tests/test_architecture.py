@@ -29,7 +29,7 @@ LAYERS = (
     ("segment_storage", "storage"),
     ("options", "progress"),
     ("dae", "simulation"),
-    ("actions", "segments", "simulator", "stepwise"),
+    ("actions", "segments", "simulator", "stepwise", "sweeps"),
     ("analysis",),
     ("plots", "visuals", "scene", "playback", "rendering", "summary", "export"),
     ("findings",),

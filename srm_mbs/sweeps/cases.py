@@ -1,0 +1,120 @@
+"""The cases of a sweep: what the caller may give, as a list of named parameter sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.errors import InputError
+from srm_mbs.mechanism import Mechanism
+
+STARTS = ("q0", "v0", "q", "v")
+"""Parameters that say where a given mechanism starts."""
+RESERVED = ("case", "success", "status", "message")
+"""Columns that every table has."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of a sweep.
+
+    Attributes
+    ----------
+    index
+        Its place among the cases.
+    name
+        Its key in a mapping of cases; otherwise ``index``.
+    parameters
+        What it was given.
+    """
+
+    index: int
+    name: int | str
+    parameters: Mapping[str, Any]
+
+    @property
+    def where(self) -> str:
+        """For messages."""
+        return f"cases[{self.name!r}]"
+
+
+def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) -> tuple[Case, ...]:
+    """``cases`` in order, checked; ``free``: parameters of any name are allowed.
+
+    Raises
+    ------
+    InputError
+        Naming the case.
+    """
+    if isinstance(cases, Mapping):
+        found = _from_mapping(cases)
+    elif isinstance(cases, Iterable) and not isinstance(cases, str | bytes):
+        found = list(enumerate(cases))
+    else:
+        found = []
+    out = []
+    for index, (name, parameters) in enumerate(found):
+        case = Case(index, name, parameters)
+        if not isinstance(parameters, Mapping) or not all(isinstance(k, str) for k in parameters):
+            raise InputError(
+                f"{parameters!r} is no set of parameters",
+                element=case.where,
+                remedy="Give a dictionary: name of a parameter -> value",
+            )
+        _check_names(case, isinstance(source, Mechanism), free)
+        out.append(Case(index, name, dict(parameters)))
+    if not out:
+        raise InputError(
+            f"there are no cases in {cases!r}",
+            element="cases",
+            remedy="Give a list of dictionaries, a mapping of names to them, or one of columns",
+        )
+    return tuple(out)
+
+
+def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
+    """Named cases, or the rows of columns."""
+    if all(isinstance(value, Mapping) for value in cases.values()):
+        return [(name if isinstance(name, int) else str(name), cases[name]) for name in cases]
+    columns = {name: values for name, values in cases.items() if not np.isscalar(values)}
+    try:
+        lengths = {name: len(values) for name, values in columns.items()}
+    except TypeError:
+        lengths = {}
+    if len(lengths) < len(cases) or len(set(lengths.values())) != 1:
+        raise InputError(
+            f"the columns have the lengths {lengths}" if lengths else "these are no columns",
+            element="cases",
+            remedy="Give every parameter an array with one entry, or row, per case",
+        )
+    count = next(iter(lengths.values()))
+    return [(k, {name: values[k] for name, values in columns.items()}) for k in range(count)]
+
+
+def _check_names(case: Case, mechanism_given: bool, free: bool) -> None:
+    names = set(case.parameters)
+    if taken := sorted(names & set(RESERVED)):
+        raise InputError(
+            f"{taken[0]!r} is a column of every table",
+            element=case.where,
+            remedy="Give the parameter another name",
+        )
+    if not mechanism_given:
+        return
+    unknown = sorted(names - set(STARTS))
+    if unknown and not free:
+        raise InputError(
+            f"a given mechanism has no parameter {unknown[0]!r}",
+            element=case.where,
+            remedy=f"Give {', '.join(STARTS)}; for others a function that makes the mechanism "
+            "of a case instead of the mechanism, or options=",
+        )
+    if names & {"q", "v"} and names & {"q0", "v0"}:
+        raise InputError(
+            "it has a complete state (q0, v0) and values to assemble one from (q, v)",
+            element=case.where,
+            remedy="Give one of the two",
+        )

@@ -1,0 +1,114 @@
+"""A hash of anything that can be pickled, the same in every process: is this the same sweep?
+
+Pickles themselves do not do: their bytes depend on which equal objects are identical.  Here a value
+is taken apart as pickle would, and every part is hashed by its contents.  A function counts by its
+name, code, defaults and the variables that it encloses; what it calls is not followed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.mechanism import Mechanism
+
+_NOT_COMPARED = ("name", "source", "defaults", "notes")
+"""Fields of a mechanism that change nothing in a run."""
+
+
+def fingerprint(value: Any) -> str:
+    """32 hexadecimal digits.
+
+    Raises
+    ------
+    TypeError, pickle.PicklingError
+        If ``value`` has a part that cannot be pickled.
+    """
+    hashed = hashlib.blake2b(digest_size=16)
+    _add(value, hashed.update, [])
+    return hashed.hexdigest()
+
+
+def _add(value: Any, put: Any, inside: list[int]) -> None:
+    """Hash ``value``, a part of the objects with the ids ``inside``."""
+    if id(value) in inside:
+        put(b"<again>%d" % inside.index(id(value)))
+        return
+    tag, parts = _parts(value)
+    head = tag.encode()
+    put(struct.pack("<q", len(head)) + head)
+    if isinstance(parts, bytes):
+        put(struct.pack("<q", len(parts)) + parts)
+        return
+    put(struct.pack("<q", len(parts)))
+    inside.append(id(value))
+    for part in parts:
+        _add(part, put, inside)
+    inside.pop()
+
+
+def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
+    """A name for the kind of ``value``, and its contents: bytes, or further values."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    kind = type(value).__qualname__
+    match value:
+        case None | bool() | int() | str():
+            return kind, repr(value).encode()
+        case float():
+            return kind, struct.pack("<d", value)
+        case bytes():
+            return kind, value
+        case list() | tuple() if type(value) in (list, tuple):
+            return "sequence", list(value)
+        case set() | frozenset():
+            return kind, sorted(fingerprint(part).encode() for part in value)
+        case Mapping():
+            # In the order of their keys' hashes: a dictionary is the same in any order.
+            items = sorted(value.items(), key=lambda item: fingerprint(item[0]))
+            return "mapping", [part for item in items for part in item]
+        case np.ndarray() if value.dtype != object:
+            return "array", [str(value.dtype), value.shape, np.ascontiguousarray(value).tobytes()]
+        case np.ndarray():
+            return "objects", [value.shape, value.tolist()]
+        case Mechanism():
+            names = [field.name for field in fields(value) if field.name not in _NOT_COMPARED]
+            return kind, [getattr(value, name) for name in names]
+        case pin.Model():
+            return kind, value.saveToString().encode()
+        case type() | ModuleType() | BuiltinFunctionType():
+            return "named", _name(value).encode()
+        case FunctionType():
+            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+            defaults = [value.__defaults__, value.__kwdefaults__]
+            return "function", [_name(value), value.__code__, *defaults, *cells]
+        case MethodType():
+            return "method", [value.__func__, value.__self__]
+        case CodeType():
+            return "code", [value.co_code, value.co_names, *value.co_consts]
+    if is_dataclass(value):  # without what it keeps beside its fields
+        parts = [getattr(value, field.name) for field in fields(value)]
+    else:
+        parts = _reduced(value)
+    return f"object {_name(type(value))}", parts
+
+
+def _name(value: Any) -> str:
+    return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', value.__name__)}"
+
+
+def _reduced(value: Any) -> list[Any]:
+    """What pickle would keep of an object."""
+    reduced = value.__reduce_ex__(4)
+    if isinstance(reduced, str):
+        return [reduced]
+    make, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
+    state = dict(state) if isinstance(state, Mapping) else state
+    return [make, arguments, state, list(items or ()), list(pairs or ())]

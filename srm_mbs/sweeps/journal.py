@@ -1,0 +1,167 @@
+"""The file of a sweep that can be resumed: one JSON line per finished case.
+
+The first line says which sweep it is: a fingerprint of each part that decides what a run gives.  A
+case is known by the fingerprint of its parameters, and equal cases by their number, so that cases
+may be added, left out or put in another order when the sweep is resumed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from io import TextIOWrapper
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import srm_mbs
+from srm_mbs.errors import InputError
+from srm_mbs.sweeps.cases import Case
+from srm_mbs.sweeps.fingerprint import fingerprint
+from srm_mbs.sweeps.tasks import Outcome, Task
+
+FORMAT = 1
+
+
+class Journal:
+    """Finished cases of a sweep, read from and appended to a file; a context manager.
+
+    Parameters
+    ----------
+    path
+        Of the file; made if there is none.
+    task, cases
+        Of the sweep.
+
+    Attributes
+    ----------
+    known
+        Index of a case -> outcome, of those in the file.
+
+    Raises
+    ------
+    InputError
+        If the file is of another sweep, is damaged elsewhere than in its last line, or cannot be
+        written.
+    """
+
+    def __init__(self, path: Path, task: Task, cases: Sequence[Case]) -> None:
+        self._path = path
+        self._keys = _keys(cases)
+        self.known: dict[int, Outcome] = {}
+        head = {"format": FORMAT, "version": srm_mbs.__version__, "sweep": _parts(task)}
+        try:
+            whole = self._read(head) if path.exists() else 0
+            self._file: TextIOWrapper = path.open("r+" if whole else "w", encoding="utf-8")
+            # A line that was cut off when the process died.
+            self._file.seek(whole)
+            self._file.truncate()
+            if not whole:
+                self._write(head)
+        except OSError as error:
+            raise InputError(
+                f"it cannot be used: {error.strerror}",
+                file=str(path),
+                element="resume",
+                remedy="Give a file in a folder that can be written",
+            ) from error
+
+    def _read(self, head: Mapping[str, Any]) -> int:
+        """Take what is known; the length of the whole lines."""
+        data = self._path.read_bytes()
+        whole = data.rfind(b"\n") + 1
+        lines = data[:whole].splitlines()
+        if not lines:
+            if data and not json.dumps(head).encode().startswith(data):
+                raise self._fault("it is no file of a sweep")
+            return 0
+        entries = []
+        for number, line in enumerate(lines, 1):
+            try:
+                entries.append(json.loads(line))
+                if number > 1:
+                    entries[-1] = entries[-1]["case"], Outcome(**entries[-1]["outcome"])
+            except (ValueError, KeyError, TypeError) as error:
+                raise self._fault(f"line {number} is damaged: {error}") from error
+        self._check(entries[0], head)
+        index = {key: k for k, key in enumerate(self._keys)}
+        for key, outcome in entries[1:]:
+            if key in index:
+                self.known.setdefault(index[key], outcome)
+        return whole
+
+    def _check(self, found: Any, head: Mapping[str, Any]) -> None:
+        """Refuse the file of another sweep."""
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise self._fault("it is no file of a sweep, or of another format")
+        own, other = head["sweep"], found.get("sweep", {})
+        different = [name for name in own if other.get(name) != own[name]]
+        if found.get("version") != head["version"]:
+            different.append(f"version of srm_mbs ({found.get('version')})")
+        if different:
+            raise self._fault(f"it is of a sweep with another {', '.join(different)}")
+
+    def _fault(self, problem: str) -> InputError:
+        return InputError(
+            problem,
+            file=str(self._path),
+            element="resume",
+            remedy="Give another file, or remove this one to begin anew",
+        )
+
+    def add(self, case: Case, outcome: Outcome) -> None:
+        """Keep the outcome of a case; what was raised is not kept, so that it is tried again."""
+        if outcome.traceback:
+            return
+        kept = {key: value for key, value in asdict(outcome).items() if key != "traceback"}
+        self._write({"case": self._keys[case.index], "outcome": kept})
+
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        self._file.write(json.dumps(entry) + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+
+def _parts(task: Task) -> dict[str, str]:
+    """Fingerprints of what decides what the runs give."""
+    options = [task.options, task.simulate_options]
+    parts = {
+        "mechanism": task.source,
+        "t_end": task.t_end,
+        "measure": task.measure,
+        "options": options,
+    }
+    return {name: _known(value, name) for name, value in parts.items()}
+
+
+def _known(value: Any, what: str) -> str:
+    try:
+        return fingerprint(value)
+    except Exception as error:  # objects may raise anything when they are taken apart
+        raise InputError(
+            f"what it holds cannot be compared with a later sweep: {error}",
+            element=what,
+            remedy="Leave resume= out, or give functions and values that can be pickled",
+        ) from error
+
+
+def _keys(cases: Sequence[Case]) -> list[str]:
+    seen: Counter[str] = Counter()
+    out = []
+    for case in cases:
+        key = _known(case.parameters, case.where)
+        seen[key] += 1
+        out.append(key if seen[key] == 1 else f"{key}-{seen[key]}")
+    return out

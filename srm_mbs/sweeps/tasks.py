@@ -1,0 +1,183 @@
+"""One run of a sweep, wherever it happens: made, simulated and measured."""
+
+from __future__ import annotations
+
+import pickle
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.errors import InputError
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.simulation import simulate
+from srm_mbs.solution import Solution
+from srm_mbs.sweeps.cases import RESERVED, STARTS
+
+Value = bool | int | float | str | None
+Measure = Callable[[Solution], Mapping[str, Any]]
+
+ERROR = "error"
+"""Status of a case in which something was raised."""
+
+
+def standard_measures(solution: Solution) -> dict[str, Value]:
+    """What a sweep measures by default, at the ends of a run only: long runs stay cheap.
+
+    ``t_end`` (s) is where it ended, ``drift`` the closure error ||g|| (m, rad) there,
+    ``energy_change`` (J) kinetic plus potential energy there minus that of the start, ``steps`` the
+    accepted ones, ``wall_time`` in seconds.
+    """
+    ends = solution.at(solution.span)
+    return {
+        "t_end": solution.span[1],
+        "drift": float(ends.drift[1, 0]),
+        "energy_change": float(ends.energy[1] - ends.energy[0]),
+        "steps": solution.stats.steps,
+        "wall_time": solution.stats.wall_time,
+    }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is known of a run afterwards.
+
+    Attributes
+    ----------
+    success, status, message
+        Of the solution; False, ``"error"`` and the last line of the traceback if something was
+        raised.
+    measures
+        Name -> number, text or None; empty if something was raised.
+    traceback
+        Text of it; empty if nothing was raised.
+    """
+
+    success: bool
+    status: str
+    message: str
+    measures: Mapping[str, Value]
+    traceback: str = ""
+
+
+def raised(error: BaseException) -> Outcome:
+    """The outcome of a case that ``error`` ended."""
+    message = "".join(traceback.format_exception_only(error)).strip()
+    return Outcome(False, ERROR, message, {}, "".join(traceback.format_exception(error)))
+
+
+@dataclass(frozen=True)
+class Task:
+    """What all runs of a sweep have in common; see :func:`srm_mbs.sweep`."""
+
+    source: Mechanism | Callable[..., Any]
+    t_end: float
+    measure: Measure
+    options: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None
+    simulate_options: Mapping[str, Any]
+
+    def run(self, parameters: Mapping[str, Any]) -> Outcome:
+        """The outcome of one case; never raises an ``Exception``.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If the run was interrupted.
+        """
+        try:
+            mechanism, chosen = self._made(parameters)
+            if self.options is not None:
+                chosen |= self.options(parameters)
+            solution = simulate(mechanism, chosen.pop("t_end", self.t_end), **chosen)
+            if solution.status == "interrupted":
+                raise KeyboardInterrupt
+            measures = checked_measures(self.measure(solution), parameters)
+            return Outcome(solution.success, solution.status, solution.message, measures)
+        except Exception as error:  # of the user's functions as well; the other cases go on
+            return raised(error)
+
+    def _made(self, parameters: Mapping[str, Any]) -> tuple[Mechanism, dict[str, Any]]:
+        """The mechanism of a case, and its options."""
+        chosen = dict(self.simulate_options)
+        if not isinstance(self.source, Mechanism):
+            made = self.source(**parameters)
+            mechanism, more = made if isinstance(made, tuple) else (made, {})
+            return mechanism, chosen | more
+        start = {name: parameters[name] for name in STARTS if name in parameters}
+        if "q" in start or "v" in start:
+            from srm_mbs.assembly import assemble
+
+            state = assemble(self.source, **start)
+            return self.source.with_state(state.q, state.v), chosen
+        return self.source, chosen | start
+
+
+def checked_measures(
+    measures: Mapping[str, Any], parameters: Mapping[str, Any]
+) -> dict[str, Value]:
+    """``measures`` as plain Python values.
+
+    Raises
+    ------
+    InputError
+        If they are no such values, or have the name of another column.
+    """
+    remedy = "Let measure= return a dictionary of numbers: name of a column -> number"
+    if not isinstance(measures, Mapping):
+        raise InputError(f"it returned {measures!r}", element="measure", remedy=remedy)
+    out: dict[str, Value] = {}
+    for name, value in measures.items():
+        if name in parameters or name in RESERVED:
+            raise InputError(
+                f"it returned {name!r}, which is a column already",
+                element="measure",
+                remedy="Give the measure another name",
+            )
+        plain = (
+            value.item() if isinstance(value, np.generic | np.ndarray) and not value.ndim else value
+        )
+        if not isinstance(name, str) or not isinstance(plain, Value):
+            raise InputError(f"it returned {name!r}: {value!r}", element="measure", remedy=remedy)
+        out[name] = plain
+    return out
+
+
+def packed(task: Task) -> bytes:
+    """``task`` as bytes for another process.
+
+    cloudpickle, which comes with Dask, also sends functions of the main script and lambdas.
+
+    Raises
+    ------
+    InputError
+        If it cannot be sent.
+    """
+    try:
+        from cloudpickle import dumps
+    except ImportError:
+        from pickle import dumps
+    try:
+        return dumps(task)  # type: ignore[no-any-return]
+    except Exception as error:
+        raise InputError(
+            f"the runs cannot be sent to other processes: {error}",
+            element="executor",
+            remedy="Define the functions at the top of a module, install cloudpickle, or use a "
+            "ThreadPoolExecutor",
+        ) from error
+
+
+@lru_cache(maxsize=2)
+def _unpacked(data: bytes) -> Task:
+    """Once in every process: a mechanism takes longer to make than a short run."""
+    task: Task = pickle.loads(data)
+    return task
+
+
+def run_chunk(task: Task | bytes, chunk: Sequence[Mapping[str, Any]]) -> list[Outcome]:
+    """The outcomes of several cases, in order; what an executor is given."""
+    known = _unpacked(task) if isinstance(task, bytes) else task
+    return [known.run(parameters) for parameters in chunk]

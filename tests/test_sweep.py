@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import logging
 import multiprocessing
 import os
 import pickle
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -22,6 +24,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from benchmarks import sweep_throughput as throughput
 from srm_mbs.sweeps.fingerprint import fingerprint
 from tests.sweeping import deadly, dying_once, lowest, pendulum, period, states
 
@@ -446,3 +449,44 @@ def test_a_dask_cluster_that_loses_a_worker_loses_no_run_and_repeats_none(
     single = [srm.simulate(pendulum(length=length), 0.5) for length in lengths]
     assert sweep.table["q_0"].tolist() == [solution.q[-1, 0] for solution in single]
     assert len(file.read_text(encoding="utf-8").splitlines()) == 1 + count
+
+
+def test_the_blocks_of_the_page_run_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    pytest.importorskip("pandas")
+    page = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) == 7
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(block, names)
+    assert (names["again"].resumed, len(names["again"])) == (4, 6)
+    assert not names["sweep"].failures
+    assert not names["swings"].failures
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_shows_how_many_cases_are_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    srm.sweep(pendulum, {"length": [1.0, 2.0, 3.0]}, 0.1, progress=True)
+    assert "3 / 3 cases" in terminal.getvalue()
+
+
+def test_throughput_is_measured_on_equal_rows() -> None:
+    rows = throughput.measure(0.05, seconds=0.01, repeats=1, workers=[1])
+    assert [(row.executor, row.chunk) for row in rows] == [
+        ("serial", 1),
+        ("threads", 1),
+        ("processes", 1),
+        ("processes", throughput.CHUNK),
+    ]
+    assert rows[0].of_serial == 1.0
+    assert all(row.runs_per_second > 0.0 for row in rows)

@@ -1,0 +1,153 @@
+"""Runs per second of a sweep against the number of workers.
+
+    python -m benchmarks.sweep_throughput [--seconds 2] [--repeats 3] [--workers 1 2] [--json FILE]
+
+Run from a checkout; BLAS runs on one thread.  Initial speeds of a four-bar are swept, with short
+runs and long ones; every executor has to give the rows of the serial sweep, to the last bit.
+Workers have been started, and have run, before the clock is.  The repeats go through all executors
+in turn, and the best of each counts; `--seconds` is about what one takes serially.  CPU time over
+wall time, of this process, says on a busy machine whether threads run beside each other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import srm_mbs as srm
+
+LENGTHS = (1.0, 10.0, 60.0)
+"""Ends of the runs, s."""
+CHUNK = 8
+
+
+@dataclass(frozen=True)
+class Row:
+    """Throughput of one executor.
+
+    ``of_serial`` is it over that of the serial sweep, ``busy`` CPU time over wall time of this
+    process; of worker processes it is not known.
+    """
+
+    t_end: float
+    executor: str
+    workers: int
+    chunk: int
+    cases: int
+    runs_per_second: float
+    of_serial: float
+    busy: float | None
+
+
+def cases(mechanism: srm.Mechanism, count: int) -> dict[str, Any]:
+    """``count`` initial states, the same positions at different speeds."""
+    return {
+        "q0": np.tile(mechanism.q0, (count, 1)),
+        "v0": np.outer(np.linspace(0.5, 1.5, count), mechanism.v0),
+    }
+
+
+def same(sweep: srm.Sweep, reference: srm.Sweep) -> bool:
+    """Whether two tables are equal but for the time that the runs took."""
+    return not sweep.failures and all(
+        np.array_equal(column, reference.table[name])
+        for name, column in sweep.table.items()
+        if name != "wall_time"
+    )
+
+
+def executors(stack: ExitStack, workers: list[int]) -> list[tuple[str, int, int, Executor | None]]:
+    """Name, workers, chunk and executor of each row."""
+    out: list[tuple[str, int, int, Executor | None]] = [("serial", 1, 1, None)]
+    for count in workers:
+        threads = stack.enter_context(ThreadPoolExecutor(count))
+        out.append(("threads", count, 1, threads))
+    for count in workers:
+        processes = stack.enter_context(ProcessPoolExecutor(count, mp_context=get_context("spawn")))
+        out += [("processes", count, chunk, processes) for chunk in (1, CHUNK)]
+    return out
+
+
+def timed(run: Callable[[], srm.Sweep]) -> tuple[float, float, srm.Sweep]:
+    """Wall time, CPU time of this process (s), and the sweep."""
+    start, cpu = time.perf_counter(), time.process_time()
+    sweep = run()
+    return time.perf_counter() - start, time.process_time() - cpu, sweep
+
+
+def measure(t_end: float, seconds: float, repeats: int, workers: list[int]) -> list[Row]:
+    mechanism = srm.load("four_bar")
+
+    def run(count: int, executor: Executor | None, chunk: int = 1) -> srm.Sweep:
+        return srm.sweep(
+            mechanism, cases(mechanism, count), t_end, executor=executor, chunk=chunk, rtol=1e-8
+        )
+
+    run(4, None)
+    took, *_ = timed(lambda: run(4, None))
+    count = max(4 * CHUNK, int(4 * seconds / took))
+    reference = run(count, None)
+    with ExitStack() as stack:
+        rows = executors(stack, workers)
+        for *_, chunk, executor in rows:
+            run(4 * CHUNK, executor, chunk)
+        best = [(np.inf, 0.0)] * len(rows)
+        for _ in range(repeats):
+            for k, (name, _, chunk, executor) in enumerate(rows):
+                took, cpu, sweep = timed(lambda e=executor, c=chunk: run(count, e, c))
+                if not same(sweep, reference):
+                    raise SystemExit(f"{name}: the rows differ from those of the serial sweep")
+                best[k] = min(best[k], (took, cpu / took))
+    return [
+        Row(
+            t_end,
+            name,
+            number,
+            chunk,
+            count,
+            count / took,
+            best[0][0] / took,
+            None if name == "processes" else busy,
+        )
+        for (name, number, chunk, _), (took, busy) in zip(rows, best)
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    print(f"{os.cpu_count()} cores, load {load}; backend {srm.backend()}\n")
+    print("| run (s) | executor | workers | chunk | cases | runs/s | of serial | CPU / wall |")
+    print("|---|---|---|---|---|---|---|---|")
+    rows = []
+    for t_end in LENGTHS:
+        for row in measure(t_end, arguments.seconds, arguments.repeats, arguments.workers):
+            rows.append(row)
+            busy = "" if row.busy is None else f"{row.busy:.2f}"
+            print(
+                f"| {row.t_end:g} | {row.executor} | {row.workers} | {row.chunk} | {row.cases} "
+                f"| {row.runs_per_second:.1f} | {row.of_serial:.2f} | {busy} |",
+                flush=True,
+            )
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -213,3 +213,11 @@ def test_the_joint_on_the_page_on_forces_and_drives_meets_its_stop(ran: Ran) -> 
 def test_the_page_on_closures_has_every_type() -> None:
     page = PAGES["closures.md"].read_text(encoding="utf-8")
     assert [name for name in srm.CLOSURE_TYPES if f"`{name}`" not in page] == []
+
+
+def test_the_sweeps_on_their_page_give_a_row_per_case(ran: Ran) -> None:
+    names, folder = ran("sweeps.md")
+    assert (names["again"].resumed, len(names["again"])) == (4, 6)
+    assert len(names["broken"].failures) == 1
+    assert not any(names[name].failures for name in ("sweep", "same", "swings", "on_dask"))
+    assert (folder / "swings.parquet").exists()

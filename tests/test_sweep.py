@@ -9,7 +9,6 @@ import logging
 import multiprocessing
 import os
 import pickle
-import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -449,23 +448,6 @@ def test_a_dask_cluster_that_loses_a_worker_loses_no_run_and_repeats_none(
     single = [srm.simulate(pendulum(length=length), 0.5) for length in lengths]
     assert sweep.table["q_0"].tolist() == [solution.q[-1, 0] for solution in single]
     assert len(file.read_text(encoding="utf-8").splitlines()) == 1 + count
-
-
-def test_the_blocks_of_the_page_run_in_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("distributed")
-    pytest.importorskip("pandas")
-    page = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(blocks) == 7
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    for block in blocks:
-        exec(block, names)
-    assert (names["again"].resumed, len(names["again"])) == (4, 6)
-    assert not names["sweep"].failures
-    assert not names["swings"].failures
 
 
 class Terminal(io.StringIO):

@@ -2,7 +2,7 @@
 
 Pickles themselves do not do: their bytes depend on which equal objects are identical.  Here a value
 is taken apart as pickle would, and every part is hashed by its contents.  A function counts by its
-name, code, defaults and the variables that it encloses; what it calls is not followed.
+name, code, defaults, attributes and the variables that it encloses; what it calls is not followed.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
         case FunctionType():
             cells = [cell.cell_contents for cell in value.__closure__ or ()]
             defaults = [value.__defaults__, value.__kwdefaults__]
-            return "function", [_name(value), value.__code__, *defaults, *cells]
+            return "function", [_name(value), value.__code__, value.__dict__, *defaults, *cells]
         case MethodType():
             return "method", [value.__func__, value.__self__]
         case CodeType():

@@ -14,7 +14,7 @@ from typing import Any
 
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.options import positive
+from srm_mbs.options import checked_span
 from srm_mbs.progress import Counted, counting
 from srm_mbs.simulation import mechanism_method, simulate
 from srm_mbs.sweeps.cases import Case, listed
@@ -56,7 +56,7 @@ def sweep(
     progress: bool | Counted = False,
     **simulate_options: Any,
 ) -> Sweep:
-    """Simulate many cases from t = 0 to ``t_end`` (s), and keep what ``measure`` says of each.
+    """Simulate many cases to ``t_end`` (s), and keep what ``measure`` says of each.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def sweep(
         ``v`` as :func:`srm_mbs.assemble` takes them, joint -> value; it assembles the case, and
         rates not given are the least-norm ones.
     t_end
-        End of the runs (s), positive.
+        End of the runs (s).
     measure
         Solution -> dictionary of numbers, texts or None, the columns of the table; only these come
         back from a worker.  By default :func:`srm_mbs.standard_measures`.
@@ -128,9 +128,8 @@ def sweep(
         )
     _check_options(simulate_options)
     given = listed(mechanism, cases, free=options is not None)
-    task = Task(
-        mechanism, positive(t_end, "t_end", " of seconds"), measure, options, simulate_options
-    )
+    _, t_end = checked_span(simulate_options.get("t0", 0.0), t_end)
+    task = Task(mechanism, t_end, measure, options, simulate_options)
     if isinstance(mechanism, Mechanism):
         _ = mechanism.structure  # found once, not by every worker
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import tomllib
 from collections.abc import Callable
@@ -12,11 +13,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 import srm_mbs as srm
 from srm_mbs.loading.description import parse_description
+from tools.method_tables import filled
+from tools.singular_pictures import draw
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -221,3 +226,37 @@ def test_the_sweeps_on_their_page_give_a_row_per_case(ran: Ran) -> None:
     assert len(names["broken"].failures) == 1
     assert not any(names[name].failures for name in ("sweep", "same", "swings", "on_dask"))
     assert (folder / "swings.parquet").exists()
+
+
+def test_the_table_on_the_page_on_methods_is_that_of_the_committed_benchmark() -> None:
+    results = json.loads((DOCS / "work_precision.json").read_text(encoding="utf-8"))
+    page = PAGES["methods.md"].read_text(encoding="utf-8")
+    assert filled(page, results) == page, "run python -m tools.method_tables"
+
+
+def test_the_page_on_methods_has_every_tableau_with_its_order_and_stages() -> None:
+    page = PAGES["methods.md"].read_text(encoding="utf-8")
+    for line in page[page.index("## Tableau") : page.index("The README lists")].splitlines():
+        if line.startswith("| `"):
+            names, orders, stages, estimate, _ = (
+                cell.strip() for cell in line.strip("|").split("|")
+            )
+            for name, order, count in zip(
+                re.findall(r"`(\w+)`", names), orders.split(","), stages.split(","), strict=True
+            ):
+                tableau = srm.TABLEAUS[name]
+                assert (tableau.order, tableau.n_stages) == (int(order), int(count))
+                assert (tableau.error is not None) == (estimate == "yes")
+    assert [name for name in srm.TABLEAUS if f"`{name}`" not in page] == []
+
+
+def test_the_pictures_of_singular_configurations_can_be_drawn_again(tmp_path: Path) -> None:
+    draw(tmp_path)
+    page = PAGES["singular_configurations.md"].read_text(encoding="utf-8")
+    shown = re.findall(r"\(singular/(\w+\.png)\)", page)
+    assert sorted(shown) == sorted(path.name for path in tmp_path.iterdir())
+    for name in shown:
+        with Image.open(tmp_path / name) as new, Image.open(DOCS / "singular" / name) as old:
+            assert new.size == old.size, name
+            assert np.std(np.asarray(new.convert("L"), dtype=float)) > 5.0, f"{name} is blank"
+    assert sum(path.stat().st_size for path in (DOCS / "singular").iterdir()) < 150_000

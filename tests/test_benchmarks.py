@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,9 +26,9 @@ from benchmarks.work_precision import (
     timing,
 )
 from benchmarks.work_precision.counting import Point, cheapest
-from benchmarks.work_precision.harness import attempt, errors_of, measure_problem
+from benchmarks.work_precision.harness import attempt, errors_of, measure_problem, sweep
 from benchmarks.work_precision.peers import PEERS
-from benchmarks.work_precision.peers.base import Peer, Setting
+from benchmarks.work_precision.peers.base import Outcome, OverBudgetError, Peer, Setting
 from benchmarks.work_precision.problems import PROBLEMS, andrews
 from benchmarks.work_precision.records import Measurement, Results
 from benchmarks.work_precision.references import by_extrapolation, by_gauss, by_scipy
@@ -287,6 +288,26 @@ def test_times_are_those_of_the_calls() -> None:
     cpu, wall = timing.repeated(lambda: calls.append(0), 7)
     assert len(calls) == len(cpu.all) == len(wall.all) == 7
     assert cpu.least == min(cpu.all) <= cpu.median
+
+
+def test_a_repeat_that_takes_too_long_ends_the_sweep_and_not_the_benchmark() -> None:
+    problem, peer = PROBLEMS["slider_crank_regular"](), PEERS["ours"]
+    settings = peer.settings(problem)[:2]
+    calls = iter(range(9))
+
+    def runner(setting: Setting) -> Callable[[], Outcome]:
+        whole = peer.prepare(problem)(setting)
+
+        def run() -> Outcome:
+            if next(calls):
+                raise OverBudgetError("stopped after 0.6 s")
+            return whole()
+
+        return run
+
+    done = list(sweep(problem, peer, runner, settings, 5, 1.0, quiet))
+    assert [measurement.status for measurement, _ in done] == ["over budget"]
+    assert done[0][0].message == "stopped after 0.6 s"
 
 
 def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,10 @@ def measured(
     error, drift, energy = errors_of(problem, outcome)
     if not np.isfinite(error):
         return Measurement(*name, "failed", "the state is not finite"), seconds
-    cpu, wall = timing.repeated(runner(setting), repeats)
+    try:
+        cpu, wall = timing.repeated(runner(setting), repeats)
+    except OverBudgetError as exception:  # a repeat may take longer than the first call
+        return Measurement(*name, "over budget", str(exception)), seconds
     measurement = Measurement(
         *name,
         "ok",

@@ -53,9 +53,10 @@ from srm_mbs.stepping.stepsize import (
     Verdict,
     initial_step,
 )
+from srm_mbs.systems.controllers import Controller, called
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.held import HeldForce
-from srm_mbs.systems.multibody import ClosedSystem, Controller, OpenSystem, called, make_system
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.systems.units import constraint_units
 
 log = logging.getLogger(__name__)

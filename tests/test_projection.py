@@ -16,7 +16,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
-from srm_mbs.systems import multibody
+from srm_mbs.systems import manifold, mechanics, multibody
 from srm_mbs.systems.base import Zone
 from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
@@ -562,7 +562,8 @@ def counted_pinocchio(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         for name, value in vars(pin).items()
         if callable(value) and not isinstance(value, type)
     }
-    monkeypatch.setattr(multibody, "pin", SimpleNamespace(**{**vars(pin), **functions}))
+    for module in (manifold, mechanics, multibody):
+        monkeypatch.setattr(module, "pin", SimpleNamespace(**{**vars(pin), **functions}))
     return calls
 
 

@@ -22,7 +22,8 @@ from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.motion import JointMotion
 from srm_mbs.systems.closure_geometry import ClosureGeometry
-from srm_mbs.systems.multibody import Controller, make_system
+from srm_mbs.systems.controllers import Controller
+from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
 from srm_mbs.systems.singular import TAU
 from srm_mbs.systems.tangent import TangentChart, differences, tangent_basis

@@ -11,7 +11,7 @@ from srm_mbs.arrays import FloatArray
 class HeldForce:
     """Generalised forces that are constant from one sample to the next.
 
-    A controller for :mod:`srm_mbs.systems.multibody`: called at any time of a run, also after it,
+    A controller (:mod:`srm_mbs.systems.controllers`): called at any time of a run, also after it,
     it returns what acted then; right-continuous.
     """
 

@@ -1,15 +1,15 @@
-r"""A mechanism as a system: Pinocchio terms, closures, and the answers of a stage.
+r"""Mechanisms as systems: the evaluation of a stage, without closures and with them.
 
     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),   f = tau - nle(q, v),
 
-s the motion of the drives, 0 in the rows of the loops; tau from controller, joint damping and
-friction, and force elements.  Only this module, ``loops``, ``driven``, ``forces`` and the load-time
-analysis call Pinocchio algorithms.
+s the motion of the drives, 0 in the rows of the loops; tau the applied forces.  States and their
+moves are in ``manifold``, the applied forces and the energy in ``mechanics``, the answers of an
+evaluated stage in ``mechanism_terms``.  Only these, ``loops``, ``driven``, ``forces`` and the
+load-time analysis call Pinocchio algorithms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -17,327 +17,25 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import blas
 
-from srm_mbs.arrays import FloatArray, IndexArray
-from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.base import Terms, Zone
-from srm_mbs.systems.charts import (
-    LARGEST_ROTATION,
-    ROTATION_PER_STEP,
-    SERIES,
-    GroupJoint,
-    dexp_inverse,
-    group_joints,
-    planar_translation,
-)
+from srm_mbs.systems.controllers import Controller
 from srm_mbs.systems.driven import DrivenKinematics
-from srm_mbs.systems.forces import resolved_forces
-from srm_mbs.systems.held import HeldForce
-from srm_mbs.systems.loops import COINCIDENT, LoopKinematics
-from srm_mbs.systems.projection import Projection, unwhiten
+from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.systems.mechanics import Mechanics
+from srm_mbs.systems.mechanism_terms import ClosedTerms, OpenTerms
+from srm_mbs.systems.projection import Projection
 from srm_mbs.systems.units import constraint_units
 
-Controller = Callable[[float, FloatArray, FloatArray], Any]
-"""(t, q, v) -> generalised forces tau (nv,), N and N m."""
-
 _WORLD = pin.Convention.WORLD
-_sum_of_sizes, _largest = blas.dasum, blas.idamax
-_NO_ROWS = np.zeros(0)
+_sum_of_sizes = blas.dasum
 _OVERFLOW = 1e100
 """Size of a state from which products of its rates may overflow."""
 
 
-def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-    """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v``.
-
-    Raises
-    ------
-    ControllerError
-        If it raises, or returns anything but nv finite numbers.
-    """
-    try:
-        tau = np.asarray(controller(t, q.copy(), v.copy()), dtype=float)
-    except Exception as error:
-        raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
-    if tau.shape != v.shape or not np.isfinite(tau).all():
-        raise ControllerError(
-            f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
-            f"it must return {len(v)} finite generalised forces"
-        )
-    return np.ascontiguousarray(tau)
-
-
-class _Mechanics:
-    """What open and closed mechanisms share: state, manifold, forces."""
-
-    carries_yhat = True
-    predicts = True
-
-    def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
-        self.mechanism = mechanism
-        self.model = model = mechanism.model
-        self.nq, self.nv = model.nq, model.nv
-        self.tangent_size = 2 * self.nv
-        self.multiplier_part = slice(self.nv, 2 * self.nv)
-        self.multiplier_size = self.nv
-        self.evaluations = 0
-        self._controller = controller
-        damping, friction = model.damping, model.friction
-        self._damping = damping.copy() if damping.any() else None
-        self._friction = friction.copy() if friction.any() else None
-        self._friction_speed = mechanism.friction_speed
-        self._forces = resolved_forces(mechanism)
-        self._groups: tuple[GroupJoint, ...] = mechanism.derived(
-            "groups", lambda: group_joints(self.model)
-        )
-        self._flat = self.nq == self.nv
-        self._unit = mechanism.structure.units.coordinate
-        self._position_of: IndexArray = mechanism.derived("position_of", self._vector_coordinates)
-        self._first, self._last = -np.inf, np.inf
-
-    # Made when the reference first evaluates: the compiled kernel has its own.
-    @cached_property
-    def data(self) -> pin.Data:
-        """Pinocchio's workspace."""
-        return self.model.createData()
-
-    @cached_property
-    def _caps(self) -> FloatArray:
-        caps: FloatArray = self.mechanism.at_start(
-            "caps", lambda: np.concatenate([self._unit, np.full(self.nv, np.inf)])
-        )
-        return caps
-
-    @cached_property
-    def _planar(self) -> tuple[GroupJoint, ...]:
-        return tuple(joint for joint in self._groups if joint.group == "se2")
-
-    def _vector_coordinates(self) -> IndexArray:
-        """Index into q of each velocity component, -1 where q is not a vector space there."""
-        index = np.full(self.nv, -1)
-        for joint in list(self.model.joints)[1:]:
-            if joint.nq == joint.nv:
-                index[joint.idx_v : joint.idx_v + joint.nv] = range(
-                    joint.idx_q, joint.idx_q + joint.nq
-                )
-        return index
-
-    @property
-    def controlled(self) -> bool:
-        """Whether a controller acts."""
-        return self._controller is not None
-
-    @property
-    def calls_forces(self) -> bool:
-        """Whether force elements are functions of the user."""
-        return self._forces is not None and self._forces.calls
-
-    def called_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Generalised forces (nv,) of the Python functions that act: the controller, unless its
-        output is held, and those among the force elements."""
-        tau = np.zeros(self.nv) if self.held is not None else self.controlled_force(t, q, v)
-        if self._forces is not None and self._forces.calls:
-            tau = tau + self._forces.called(self.data, q, v, t)
-        return tau
-
-    @property
-    def held(self) -> HeldForce | None:
-        """The controller, if it is one whose output is held between samples."""
-        return self._controller if isinstance(self._controller, HeldForce) else None
-
-    def count(self, evaluations: int, factorisations: int) -> None:
-        """Count what the compiled kernel did for this system."""
-        self.evaluations += evaluations
-
-    def between(self, first: float, last: float) -> None:
-        """Evaluate at times within [``first``, ``last``] (s) only, the nearer of them for others:
-        on one side of a breakpoint, whatever ``evaluate`` is given."""
-        self._first, self._last = first, last
-
-    def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Views (q, v) of a state."""
-        return state[: self.nq], state[self.nq :]
-
-    def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Generalised forces (nv,) of the controller, as :func:`called` returns them."""
-        if self._controller is None:
-            return np.zeros(self.nv)
-        return called(self._controller, t, q, v)
-
-    def damping_force(self, v: FloatArray) -> FloatArray:
-        """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
-        if self._damping is None:
-            return np.zeros(v.shape)
-        out: FloatArray = -self._damping * v
-        return out
-
-    def friction_force(self, v: FloatArray) -> FloatArray:
-        """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
-        if self._friction is None:
-            return np.zeros(v.shape)
-        out: FloatArray = -self._friction * np.tanh(v / self._friction_speed)
-        return out
-
-    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
-        """Controller, joint damping and joint friction (nv,); None if there is none of them."""
-        force = None if self._damping is None else self.damping_force(v)
-        if self._friction is not None:
-            rubbing = self.friction_force(v)
-            force = rubbing if force is None else force + rubbing
-        if self._controller is None:
-            return force
-        tau = self.controlled_force(t, q, v)
-        return tau if force is None else tau + force
-
-    def constants(self) -> dict[str, Any]:
-        """Everything that does not change, for the compiled kernel (:mod:`srm_mbs.kernel`)."""
-        fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
-        return fixed | {
-            "unit": self._unit,
-            "gap_scale": _NO_ROWS,
-            "damping": self._damping,
-            "friction": self._friction,
-        }
-
-    def _constants(self) -> dict[str, Any]:
-        """Those that do not depend on the start."""
-        return {
-            "loops": [],
-            "joint_rows": [],
-            "drives": [],
-            "rows": 0,
-            "structural_rank": 0,
-            "sigma_ref": 1.0,
-            "algebra": "auto",
-            "position_of": [int(i) for i in self._position_of],
-            "friction_speed": float(self._friction_speed),
-            "forces": [] if self._forces is None else self._forces.constants(),
-            "coincident": COINCIDENT,
-            "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
-            "series": np.array(SERIES),
-            "largest_rotation": LARGEST_ROTATION,
-            "rotation_per_step": ROTATION_PER_STEP,
-        }
-
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
-        """(q (+) dq, v + dv)."""
-        if self._flat:
-            return state + delta
-        out = np.empty_like(state)
-        out[: self.nq] = pin.integrate(self.model, state[: self.nq], delta[: self.nv])
-        for joint in self._planar:
-            k, i = joint.position, joint.start
-            out[k : k + 2] = planar_translation(state[k : k + 4], delta[i : i + 3])
-        out[self.nq :] = state[self.nq :] + delta[self.nv :]
-        return out
-
-    def difference(self, start: FloatArray, end: FloatArray) -> FloatArray:
-        """(q_end (-) q_start, v_end - v_start); see :class:`~srm_mbs.systems.base.System`."""
-        if self._flat:
-            return end - start
-        nq = self.nq
-        delta = np.concatenate(
-            [pin.difference(self.model, start[:nq], end[:nq]), end[nq:] - start[nq:]]
-        )
-        # The logarithm loses digits at small angles, the exponential does not.
-        moved = self.retract(start, delta)
-        delta[: self.nv] += pin.difference(self.model, moved[:nq], end[:nq])
-        return delta
-
-    def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
-        """dexp^-1 on the joints that need it; ``rate`` itself otherwise."""
-        if not self._groups:
-            return rate
-        out = rate.copy()
-        for joint in self._groups:
-            if joint.rotation(delta) > LARGEST_ROTATION:
-                raise EvaluationError("a ball or free joint turns too far within one step")
-            own = slice(joint.start, joint.start + joint.size)
-            out[own] = dexp_inverse(joint, delta[own], rate[own])
-        return out
-
-    def rate_change(self, delta: FloatArray) -> FloatArray:
-        """(dv, 0); see :class:`~srm_mbs.systems.base.System`."""
-        out: FloatArray = np.zeros(delta.shape)
-        out[..., : self.nv] = delta[..., self.nv :]
-        return out
-
-    def size(self, delta: FloatArray) -> float:
-        """max |dq| over units; see :class:`~srm_mbs.systems.base.System`."""
-        return float((np.abs(delta[: self.nv]) / self._unit).max())
-
-    def magnitudes(self, state: FloatArray) -> FloatArray:
-        """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
-
-        Angles are capped at 1 rad so that the accuracy does not decay with winding.
-        """
-        if self._flat:
-            sizes: FloatArray = np.minimum(np.abs(state), self._caps)
-            return sizes
-        q, v = self.split(state)
-        position = self._unit.copy()
-        vector = self._position_of >= 0
-        position[vector] = np.minimum(np.abs(q[self._position_of[vector]]), self._unit[vector])
-        return np.concatenate([position, np.abs(v)])
-
-    def step_limit(self, state: FloatArray) -> float:
-        """Step over which no group joint turns by more than ``ROTATION_PER_STEP``."""
-        v = state[self.nq :]
-        speed = max((joint.rotation(v) for joint in self._groups), default=0.0)
-        return ROTATION_PER_STEP / speed if speed > 0.0 else np.inf
-
-    def kinetic_energy(self, q: FloatArray, v: FloatArray) -> float:
-        """Kinetic energy (J), rotors on the joints (armature) included."""
-        energy = float(pin.computeKineticEnergy(self.model, self.data, q, v))
-        # Pinocchio's mass matrix has the armature, its energy does not.
-        return energy + 0.5 * float(self.model.armature @ (v * v))
-
-    def energy(self, state: FloatArray) -> float:
-        """Kinetic plus potential energy (J), of gravity and springs."""
-        q, v = self.split(state)
-        energy = self.kinetic_energy(q, v)
-        energy += float(pin.computePotentialEnergy(self.model, self.data, q))
-        return energy if self._forces is None else energy + self._forces.energy(self.data, q)
-
-
-class _OpenTerms:
-    """Terms of a mechanism without closures: the acceleration, and no algebra."""
-
-    sigma = np.inf
-    rank = 0
-    weak = False
-    held = False
-
-    def __init__(self, nv: int) -> None:
-        self._rate = np.zeros(2 * nv)
-        self._nv = nv
-
-    def normals(self) -> FloatArray:
-        return np.zeros((self._nv, 0))
-
-    def rate(self) -> FloatArray:
-        return self._rate
-
-    def multiplier(self) -> FloatArray:
-        return np.zeros(self._nv)
-
-    def project(self, w: FloatArray) -> FloatArray:
-        return np.zeros(self._nv)
-
-    def gap(self) -> float:
-        return 0.0
-
-    def correction(self) -> FloatArray:
-        return np.zeros(2 * self._nv)
-
-    def prediction(self) -> FloatArray:
-        return np.zeros(self._nv)
-
-    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
-        return self._rate, np.zeros(self._nv)
-
-
-class OpenSystem(_Mechanics):
+class OpenSystem(Mechanics):
     """A mechanism without effective closures: plain ``aba``."""
 
     has_constraints = False
@@ -346,7 +44,7 @@ class OpenSystem(_Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self._zero = np.zeros(self.nv)
-        self._terms = _OpenTerms(self.nv)
+        self._terms = OpenTerms(self.nv)
 
     def closure_gap(self, t: float, state: FloatArray) -> float:
         """0: there is no closure."""
@@ -363,7 +61,7 @@ class OpenSystem(_Mechanics):
             pin.computeJointJacobians(self.model, self.data)
             elements = self._forces.generalised(self.data, q, v, t)
             force = elements if force is None else force + elements
-        rate = self._terms._rate
+        rate = self._terms.rate()
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(
             self.model, self.data, q, v, self._zero if force is None else force
@@ -373,97 +71,7 @@ class OpenSystem(_Mechanics):
         return self._terms
 
 
-class _ClosedTerms:
-    """Terms of one stage of a closed-loop mechanism."""
-
-    def __init__(
-        self,
-        projection: Projection,
-        loops: LoopKinematics | DrivenKinematics,
-        gap_scale: FloatArray,
-    ) -> None:
-        self._p = projection
-        self._loops = loops
-        self._pushed = loops.pushed if isinstance(loops, DrivenKinematics) else None
-        self._gap_scale = gap_scale
-        self.v = np.zeros(0)
-        self.predicted: FloatArray | None = None
-        self.sigma = projection.sigma
-        self.weak = projection.weak
-
-    @property
-    def rank(self) -> int:
-        return self._p.rank
-
-    def _completed(self, white: FloatArray) -> FloatArray:
-        """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
-        if self.predicted is None:
-            return white
-        p = self._p
-        prediction = p.U @ self.predicted
-        return white + prediction - p.Q @ (p.Q.T @ prediction)
-
-    @property
-    def held(self) -> bool:
-        return self._p.held is not None
-
-    def normals(self) -> FloatArray:
-        if self._pushed is not None:
-            return np.zeros((self.v.size, 0))
-        return self._p.normals()
-
-    def _white_multiplier(self) -> FloatArray:
-        return self._completed(self._p.white_multiplier)
-
-    def rate(self) -> FloatArray:
-        p = self._p
-        nv = self.v.size
-        white = p.white_multiplier if self.predicted is None else self._white_multiplier()
-        out = np.empty(2 * nv)
-        out[:nv] = self.v
-        out[nv:] = unwhiten(p.U, p.white_force - white)
-        return out
-
-    def multiplier(self) -> FloatArray:
-        return self._p.unwhiten(self._white_multiplier())
-
-    def prediction(self) -> FloatArray:
-        return self.multiplier()
-
-    def project(self, w: FloatArray) -> FloatArray:
-        return self._p.project(w)
-
-    def _white_rates(self, w: FloatArray, s: float = 1.0) -> FloatArray:
-        """L^T (P w - s E s'): with w = v and s = 1 that of the rates that violate G v = s'."""
-        p = self._p
-        white = p.white_project(w)
-        return white if self._pushed is None else white - s * p.normal(self._pushed[p.order])
-
-    def gap(self) -> float:
-        gaps = self._loops.g * self._gap_scale
-        return abs(float(gaps.item(_largest(gaps))))
-
-    def correction(self) -> FloatArray:
-        p = self._p
-        nv = self.v.size
-        right = np.empty((nv, 2), order="F")
-        right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = self._white_rates(self.v)
-        return p.unwhiten(right).ravel(order="F")
-
-    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
-        p = self._p
-        nv = self.v.size
-        right = np.empty((nv, 3), order="F")
-        right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
-        right[:, 2] = p.white_force - right[:, 1]
-        back = p.unwhiten(right)
-        rate = np.concatenate([self.v - back[:, 0] / eps, back[:, 2]])
-        return rate, back[:, 1]
-
-
-class ClosedSystem(_Mechanics):
+class ClosedSystem(Mechanics):
     """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
 
     has_constraints = True
@@ -508,8 +116,8 @@ class ClosedSystem(_Mechanics):
         return M
 
     @cached_property
-    def _terms(self) -> _ClosedTerms:
-        return _ClosedTerms(self.projection, self.loops, self._gap_scale)
+    def _terms(self) -> ClosedTerms:
+        return ClosedTerms(self.projection, self.loops, self._gap_scale)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""

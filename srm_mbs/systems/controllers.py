@@ -1,0 +1,34 @@
+"""Controllers: functions of the user that return generalised forces, called and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import ControllerError
+
+Controller = Callable[[float, FloatArray, FloatArray], Any]
+"""(t, q, v) -> generalised forces tau (nv,), N and N m."""
+
+
+def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+    """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v``.
+
+    Raises
+    ------
+    ControllerError
+        If it raises, or returns anything but nv finite numbers.
+    """
+    try:
+        tau = np.asarray(controller(t, q.copy(), v.copy()), dtype=float)
+    except Exception as error:
+        raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
+    if tau.shape != v.shape or not np.isfinite(tau).all():
+        raise ControllerError(
+            f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
+            f"it must return {len(v)} finite generalised forces"
+        )
+    return np.ascontiguousarray(tau)

@@ -72,3 +72,19 @@ def test_the_platform_has_six_damped_modes(tmp_path: Path) -> None:
     output = run(ROOT / "examples" / "stewart_platform.py", tmp_path)
     assert "stable: True" in output
     assert len([line for line in output.splitlines() if line[:6].strip().isdigit()]) == 6
+
+
+def test_the_sweep_finds_which_cases_overload_the_pin(tmp_path: Path) -> None:
+    output = run(ROOT / "examples" / "parameter_sweep.py", tmp_path)
+    assert "9 reached the end, 3 failures, 0 resumed" in output
+    rows = [line.split() for line in output.splitlines() if line[:7].strip()[:1].isdigit()]
+    forces = {(float(row[0]), float(row[1])): float(row[2]) for row in rows}
+    assert len(forces) == 9
+    for mass, speed in forces:
+        # Without a faster crank or a heavier coupler there is no larger force.
+        assert forces[mass, speed] <= forces[mass, 6.0]
+        assert forces[mass, speed] <= forces[2.0, speed]
+    assert 0 < output.count("too much") < 9
+    again = run(ROOT / "examples" / "parameter_sweep.py", tmp_path)
+    assert "3 failures, 9 resumed" in again
+    assert again.splitlines()[1:] == output.splitlines()[1:]

@@ -82,8 +82,8 @@ def sweep(
         Any executor of the kind of ``concurrent.futures``; by default the cases run one after the
         other in this thread.  Threads share the mechanism; others get it pickled.
     chunk
-        Cases that a worker is given at a time.  More than one pays where a run takes less time than
-        sending it.
+        Cases that a worker is given at a time, and that are lost together if it dies.  More than
+        one pays where a run takes less time than sending it.
     resume
         A file to which every finished case is appended, and from which those that it holds already
         are taken instead of being run.  Cases in which something was raised are tried again.

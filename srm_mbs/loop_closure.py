@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from srm_mbs.anchors import Anchor, finite_numbers, resolve_apart, vector
 from srm_mbs.arrays import FloatArray
-from srm_mbs.closures import CLOSURE_TYPES, ClosureValues, JointRow, RowSet
+from srm_mbs.closures import CLOSURE_TYPES, ClosureType, ClosureValues, JointRow, RowSet
 from srm_mbs.errors import InputError
 
 _KEYS = {
@@ -39,7 +39,8 @@ class LoopClosure:
     Parameters
     ----------
     type
-        A key of :data:`srm_mbs.closures.CLOSURE_TYPES`.
+        A key of :data:`srm_mbs.closures.CLOSURE_TYPES`, or a
+        :class:`~srm_mbs.closures.ClosureType` of one's own.
     a, b
         The two anchors.
     axis : (3,)
@@ -65,7 +66,7 @@ class LoopClosure:
         cannot be.
     """
 
-    type: str
+    type: str | ClosureType
     a: Anchor | None = None
     b: Anchor | None = None
     axis: tuple[float, float, float] | None = None
@@ -81,19 +82,19 @@ class LoopClosure:
     def __post_init__(self) -> None:
         if not self.name:
             where = [anchor.where for anchor in self.anchors] or [*(self.joints or ())]
-            object.__setattr__(self, "name", "_".join((self.type, *where)))
-        kind = CLOSURE_TYPES.get(self.type)
-        if kind is None:
+            object.__setattr__(self, "name", "_".join((self.type_name, *where)))
+        if not isinstance(self.type, ClosureType) and self.type not in CLOSURE_TYPES:
             raise self._fault(
                 f"there is no closure type {self.type!r}",
                 f"This version knows {', '.join(CLOSURE_TYPES)}",
             )
+        kind = self.kind
         for key, (words, remedy) in _KEYS.items():
             given = getattr(self, key) is not None
             if not given and key in kind.needs:
-                raise self._fault(f"a {self.type} closure needs {words}", remedy)
+                raise self._fault(f"a {self.type_name} closure needs {words}", remedy)
             if given and key not in (*kind.needs, *kind.takes):
-                raise self._fault(f"a {self.type} closure takes no {key}", f'Remove "{key}"')
+                raise self._fault(f"a {self.type_name} closure takes no {key}", f'Remove "{key}"')
         for key in ("axis", "axis_a", "axis_b"):
             if getattr(self, key) is not None:
                 self._take_axis(key)
@@ -172,6 +173,16 @@ class LoopClosure:
         object.__setattr__(self, "joints", joints)
 
     @property
+    def kind(self) -> ClosureType:
+        """Its type: what it needs, and its rows."""
+        return self.type if isinstance(self.type, ClosureType) else CLOSURE_TYPES[self.type]
+
+    @property
+    def type_name(self) -> str:
+        """The name of its type."""
+        return self.type.name if isinstance(self.type, ClosureType) else str(self.type)
+
+    @property
     def anchors(self) -> tuple[Anchor, ...]:
         """(a, b), or () for a coupling of joints."""
         return tuple(anchor for anchor in (self.a, self.b) if anchor is not None)
@@ -200,7 +211,7 @@ class LoopClosure:
         if self.joints is not None:
             coefficients = self.coefficients or (1.0, -float(self.ratio or 0.0))
             given["joint_row"] = JointRow(self.joints, coefficients, float(self.offset or 0.0))
-        return CLOSURE_TYPES[self.type].rows(ClosureValues(**given))
+        return self.kind.rows(ClosureValues(**given))
 
     @property
     def row_names(self) -> tuple[str, ...]:

@@ -64,7 +64,7 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
     Raises
     ------
     InputError
-        If the run used a tableau that is not in TABLEAUS.
+        If the run used a tableau that is not in TABLEAUS, or a closure type of one's own.
     OSError
         If the file cannot be written.
     """
@@ -76,6 +76,13 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
             file=str(path),
             remedy="Save the arrays t, q and v instead",
         )
+    for loop in mechanism.loops:
+        if not isinstance(loop.type, str):
+            raise InputError(
+                f"the closure type {loop.type_name!r} is not one of the package's and is not saved",
+                file=str(path),
+                remedy="Save the arrays t, q and v instead",
+            )
     zones = solution.steps.zones
     meta = {
         "format": FORMAT,

@@ -135,10 +135,10 @@ def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
         gaps = [(own[~turned], "m"), (own[turned], "rad")]
         gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
         if loop.joints is not None:
-            yield loop.name, loop.type, ", ".join(loop.joints), _relation(loop), gap
+            yield loop.name, loop.type_name, ", ".join(loop.joints), _relation(loop), gap
             continue
         a, b = map(_anchor, loop.anchors)
-        yield loop.name, loop.type, a, b, gap
+        yield loop.name, loop.type_name, a, b, gap
 
 
 def _relation(loop: LoopClosure) -> str:

@@ -67,7 +67,8 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
             patch.chdir(folder)
             for number, (language, text) in enumerate(blocks(page), start=1):
                 if language == "python":
-                    exec(compile(text, f"{page}, block {number}", "exec"), names)
+                    code = compile(text, f"{page}, block {number}", "exec", dont_inherit=True)
+                    exec(code, names)
                 elif language == "toml" and is_whole(text):
                     describe(text, folder)
         return names, folder
@@ -108,6 +109,14 @@ def test_the_tables_of_descriptions_on_a_page_are_valid(page: str, text: str) ->
     description = parse_description('format = 1\nurdf = "x.urdf"\n' + text, page)
     found = len(description.loop) + len(description.drive) + len(description.force)
     assert found == text.count("[[")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_files_that_a_page_names_are_there(page: str) -> None:
+    text = PAGES[page].read_text(encoding="utf-8")
+    folders = "srm_mbs|tests|benchmarks|tools|docs|models|urdf|examples"
+    named = re.findall(rf"`((?:{folders})/[\w./]+)`", text)
+    assert [path for path in named if not list(ROOT.glob(f"{path}*"))] == []
 
 
 # --- the site ------------------------------------------------------------------------------------

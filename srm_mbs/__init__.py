@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.linearisation import Linearisation, linearise
     from srm_mbs.analysis.mobility import MobilityMap, mobility_map
     from srm_mbs.analysis.modes import AssemblyMode, assembly_modes
+    from srm_mbs.anchors import Anchor
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
     from srm_mbs.dae import DaeSolution, solve_dae
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
         SrmError,
         SrmWarning,
     )
+    from srm_mbs.force_element import ForceElement
     from srm_mbs.forces import (
         FORCE_TYPES,
         Bushing,
@@ -44,7 +46,8 @@ if TYPE_CHECKING:
     from srm_mbs.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
     from srm_mbs.loading import bundled_models, load, n_four_bar
     from srm_mbs.loading.converting import convert
-    from srm_mbs.mechanism import Anchor, ForceElement, LoopClosure, Mechanism
+    from srm_mbs.loop_closure import LoopClosure
+    from srm_mbs.mechanism import Mechanism
     from srm_mbs.methods.butcher import ButcherTableau
     from srm_mbs.methods.psrm import PSRM
     from srm_mbs.methods.srm import SRM
@@ -63,7 +66,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "AnalysisError": "errors",
-    "Anchor": "mechanism",
+    "Anchor": "anchors",
     "Assembly": "assembly",
     "AssemblyError": "errors",
     "AssemblyMode": "analysis.modes",
@@ -78,7 +81,7 @@ _HOME = {
     "Event": "actions",
     "FORCE_TYPES": "forces",
     "FollowedPath": "analysis.following",
-    "ForceElement": "mechanism",
+    "ForceElement": "force_element",
     "InputError": "errors",
     "InverseDynamics": "analysis.inverse_dynamics",
     "JointMotion": "motion",
@@ -86,7 +89,7 @@ _HOME = {
     "LAW_TYPES": "laws",
     "LimitSpring": "forces",
     "Linearisation": "analysis.linearisation",
-    "LoopClosure": "mechanism",
+    "LoopClosure": "loop_closure",
     "Mechanism": "mechanism",
     "MinimumJerk": "laws",
     "MobilityMap": "analysis.mobility",

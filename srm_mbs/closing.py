@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray, IndexArray
-from srm_mbs.mechanism import LoopClosure
+from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.loops import support, world_jacobian
 from srm_mbs.systems.singular import sharpened

@@ -14,9 +14,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import Anchor, finite_numbers, resolve_apart
 from srm_mbs.errors import InputError
+from srm_mbs.force_element import ForceElement
 from srm_mbs.laws import Law
-from srm_mbs.mechanism import Anchor, ForceElement, finite_numbers, resolve_apart
 
 OPEN = 1e30
 """Limits (rad, m) beyond this are none; Pinocchio has the largest number there."""

@@ -1,152 +1,47 @@
-"""Immutable descriptions: anchors, loop closures, mechanisms, and what a force element is.
+"""The description of a mechanism: tree, closures, forces, drives and an initial state.
 
-Nothing here computes; :mod:`srm_mbs.systems` evaluates a mechanism.  A ``pin.Model`` cannot be
-frozen: the package treats it as constant and never attaches anything to it, and so should you.
+Nothing here computes; :mod:`srm_mbs.systems` evaluates a mechanism.  What is asked of its parts
+together is in :mod:`srm_mbs.mechanism_checks`.  A ``pin.Model`` cannot be frozen: the package
+treats it as constant and never attaches anything to it, and so should you.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.anchors import WORLD, Anchor, finite_numbers, resolve_apart
 from srm_mbs.arrays import FloatArray
+from srm_mbs.derivations import Derivations
 from srm_mbs.errors import InputError
+from srm_mbs.force_element import ForceElement
 from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.mechanism_checks import (
+    check_names,
+    check_tree,
+    checked_friction_speed,
+    checked_start,
+)
+from srm_mbs.provenance import SimulationDefaults, Source
+from srm_mbs.time_dependence import NamedLaw, check_covers, knots_between, laws_over_time
 
 if TYPE_CHECKING:
     from srm_mbs.drives import Drive
-    from srm_mbs.laws import Curve, Law
+    from srm_mbs.laws import Curve
     from srm_mbs.pinocchio_constraints import PinocchioConstraints
     from srm_mbs.systems.mobility import Mobility
     from srm_mbs.systems.structure import Structure
-
-__all__ = [
-    "FRICTION_SPEED",
-    "WORLD",
-    "Anchor",
-    "ForceElement",
-    "LoopClosure",
-    "Mechanism",
-    "SimulationDefaults",
-    "Source",
-    "finite_numbers",
-    "resolve_apart",
-]
 
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
 
 
-class ForceElement(ABC):
-    """What acts on the joints or links of a mechanism; the kinds are in :mod:`srm_mbs.forces`.
-
-    Attributes
-    ----------
-    type
-        Its type in a description.
-    name
-        Unique name; by default made from the type and what the element acts on.
-    has_potential
-        Whether its force at rest follows from a potential, which ``solution.energy`` contains.
-    """
-
-    type: ClassVar[str]
-    has_potential: ClassVar[bool] = False
-    name: str
-
-    @abstractmethod
-    def check(self, model: pin.Model) -> None:
-        """Refuse a joint, link or frame that ``model`` does not have or that cannot take the force.
-
-        Raises
-        ------
-        InputError
-            Naming the element and the remedy.
-        """
-
-
-def _check_names(what: str, names: Sequence[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(
-                f"the {what} name {name!r} is used twice",
-                element=f"{what} {name!r}",
-                remedy=f"Give every {what} its own name",
-            )
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where a mechanism came from: enough to load it again, and to draw it.
-
-    Attributes
-    ----------
-    description
-        Text of the TOML description.
-    urdf
-        Text of the URDF as it was read.
-    urdf_path
-        Where that URDF lay, for mesh files relative to it; may be gone when a run is replayed.
-    path
-        The description's own path, for messages.
-    base, gravity
-        As used: the description's, unless the caller gave others.
-    format
-        Format of the file that held the links and joints.
-    """
-
-    description: str
-    urdf: str
-    urdf_path: str
-    path: str
-    base: str
-    gravity: tuple[float, float, float]
-    format: str = "URDF"
-
-
-@dataclass(frozen=True)
-class SimulationDefaults:
-    """Defaults of the command line from ``[simulation]``; ``None`` where the file is silent."""
-
-    t_end: float | None = None
-    rtol: float | None = None
-    atol: float | None = None
-
-
-def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
-    array = np.array(values, dtype=float)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(
-            f"{what} has shape {array.shape} or is not finite",
-            element=what,
-            remedy=f"Give {shape[0]} finite numbers",
-        )
-    array.setflags(write=False)
-    return array
-
-
-def _check_order(model: pin.Model) -> None:
-    """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
-    for joint in range(2, model.njoints):
-        if model.parents[joint] not in list(model.supports[joint - 1]):
-            raise InputError(
-                f"the joint {model.names[joint]!r} continues a branch that another joint, "
-                f"{model.names[joint - 1]!r}, has interrupted",
-                element="model",
-                remedy="Add the joints depth first, every branch to its tip; Pinocchio's mass "
-                "matrix is wrong otherwise",
-            )
-
-
 @dataclass(frozen=True, eq=False)
-class Mechanism:
+class Mechanism(Derivations):
     """A mechanism: a Pinocchio tree, the closures of its loops, and an initial state.
 
     Parameters
@@ -195,45 +90,26 @@ class Mechanism:
     def __post_init__(self) -> None:
         model = self.model
         set_ = object.__setattr__
-        if model.nv == 0:
-            raise InputError(
-                "nothing in this mechanism can move",
-                element="model",
-                remedy="Give it at least one joint that is neither fixed nor locked",
-            )
-        _check_order(model)
+        check_tree(model)
         set_(self, "loops", tuple(self.loops))
         set_(self, "name", self.name or model.name)
         self._take_start(
             pin.neutral(model) if self.q0 is None else self.q0,
             np.zeros(model.nv) if self.v0 is None else self.v0,
         )
-        _check_names("loop", [loop.name for loop in self.loops])
+        check_names("loop", [loop.name for loop in self.loops])
         for loop in self.loops:
             loop.check(model)
         set_(self, "loops", tuple(loop.measured(model, self.q0) for loop in self.loops))
         set_(self, "forces", tuple(self.forces))
-        _check_names("force", [force.name for force in self.forces])
+        check_names("force", [force.name for force in self.forces])
         for force in self.forces:
             force.check(model)
         set_(self, "drives", tuple(self.drives))
-        _check_names("drive", [drive.name for drive in self.drives])
+        check_names("drive", [drive.name for drive in self.drives])
         for drive in self.drives:
             drive.check(model)
-        if not (np.isfinite(model.friction).all() and np.all(model.friction >= 0.0)):
-            raise InputError(
-                "joint friction is negative or not finite",
-                element="model.friction",
-                remedy="Give values >= 0",
-            )
-        speed = finite_numbers((self.friction_speed,), 1, "friction_speed", "Give rad/s or m/s")[0]
-        if speed <= 0.0:
-            raise InputError(
-                f"friction_speed = {speed:g} is not positive",
-                element="friction_speed",
-                remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
-            )
-        set_(self, "friction_speed", speed)
+        set_(self, "friction_speed", checked_friction_speed(model, self.friction_speed))
 
     def with_loop(self, loop: LoopClosure) -> Mechanism:
         """The same mechanism with one more closure, for :class:`srm_mbs.Switch`.
@@ -335,40 +211,9 @@ class Mechanism:
             array.setflags(write=False)
 
     def _take_start(self, q0: Any, v0: Any) -> None:
-        model = self.model
-        q0 = _frozen_array(q0, (model.nq,), "q0")
-        if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
-            raise InputError(
-                "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
-                element="q0",
-                remedy="Use pinocchio.normalize(model, q0)",
-            )
+        q0, v0 = checked_start(self.model, q0, v0)
         object.__setattr__(self, "q0", q0)
-        object.__setattr__(self, "v0", _frozen_array(v0, (model.nv,), "v0"))
-
-    @cached_property
-    def _derived(self) -> dict[str, Any]:
-        return {}
-
-    def derived(self, name: str, make: Callable[[], Any]) -> Any:
-        """What follows from the model alone, made once and kept under ``name``.
-
-        It is shared with every :meth:`with_state`, so it must not depend on the initial state, and
-        nothing may change it.
-        """
-        if name not in self._derived:
-            self._derived[name] = make()
-        return self._derived[name]
-
-    def at_start(self, name: str, make: Callable[[], Any]) -> Any:
-        """As :meth:`derived`, for what depends on the initial state as well."""
-        if name not in self._of_start:
-            self._of_start[name] = make()
-        return self._of_start[name]
-
-    @cached_property
-    def _of_start(self) -> dict[str, Any]:
-        return {}
+        object.__setattr__(self, "v0", v0)
 
     @cached_property
     def structure(self) -> Structure:
@@ -432,14 +277,8 @@ class Mechanism:
         return {drive.name: drive.curve(starts[drive.name]) for drive in self.drives}
 
     @cached_property
-    def _laws(self) -> tuple[tuple[str, Law], ...]:
-        """Every law over time, and the element that follows it."""
-        found = [(f"drive {drive.name!r}", drive.law) for drive in self.drives]
-        for force in self.forces:
-            given = getattr(force, "law", None) or ()
-            laws = given if isinstance(given, tuple) else (given,)
-            found += [(f"force {force.name!r}", law) for law in laws]
-        return tuple(found)
+    def _laws(self) -> tuple[NamedLaw, ...]:
+        return laws_over_time(self.drives, self.forces)
 
     def check_covers(self, t_end: float) -> None:
         """Refuse a run to ``t_end`` (s) that is longer than a table.
@@ -449,20 +288,12 @@ class Mechanism:
         InputError
             Naming what has the table.
         """
-        for element, law in self._laws:
-            last = law.span[1]
-            if last < t_end:
-                raise InputError(
-                    f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
-                    element=element,
-                    remedy="Continue the table, or end the run earlier",
-                )
+        check_covers(self._laws, t_end)
 
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
         """Times (s) between ``t0`` and ``t_end`` at which a part of it that depends on time is not
         smooth: knots of tables, switches of drives.  Runs take no step across them."""
-        times = {knot for _, law in self._laws for knot in law.knots}
-        return tuple(sorted(knot for knot in times if t0 < knot < t_end))
+        return knots_between(self._laws, t0, t_end)
 
     @property
     def degrees_of_freedom(self) -> int:

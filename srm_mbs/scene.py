@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import WORLD, Mechanism
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, Visual, visuals_of
 
 if TYPE_CHECKING:

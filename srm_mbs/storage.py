@@ -15,23 +15,20 @@ from typing import IO, Any
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
+from srm_mbs.force_element import ForceElement
 from srm_mbs.forces import FORCE_TYPES
 from srm_mbs.kernel import dense_output
 from srm_mbs.laws import LAW_TYPES, Law
 from srm_mbs.loading import rebuild
-from srm_mbs.mechanism import (
-    Anchor,
-    ForceElement,
-    LoopClosure,
-    Mechanism,
-    SimulationDefaults,
-    Source,
-)
+from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
+from srm_mbs.provenance import SimulationDefaults, Source
 from srm_mbs.records import ATTEMPT, Settings, Statistics
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import StepData

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.coordinates import position_of
 from srm_mbs.kernel import backend
-from srm_mbs.mechanism import Anchor, LoopClosure, Mechanism
+from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.units import row_angles

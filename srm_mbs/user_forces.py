@@ -11,7 +11,7 @@ import pinocchio as pin
 from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import ForceElement
+from srm_mbs.force_element import ForceElement
 
 
 @dataclass(frozen=True)

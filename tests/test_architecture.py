@@ -15,9 +15,9 @@ PACKAGE = Path(srm_mbs.__file__).parent
 
 # From the bottom up; a module may import its own layer and those before it.
 LAYERS = (
-    ("_kernel", "arrays", "errors", "records", "semi_explicit"),
-    ("anchors", "closures", "csv_tables", "laws"),
-    ("loop_closure",),
+    ("_kernel", "arrays", "derivations", "errors", "provenance", "records", "semi_explicit"),
+    ("anchors", "closures", "csv_tables", "force_element", "laws"),
+    ("loop_closure", "mechanism_checks", "time_dependence"),
     ("mechanism",),
     ("coordinates", "drives", "pinocchio_constraints", "forces", "user_forces", "systems"),
     ("methods",),

@@ -21,10 +21,11 @@ from scipy.spatial.transform import Rotation
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from srm_mbs.anchors import WORLD, Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.closures import CLOSURE_TYPES, perpendicular_basis
 from srm_mbs.errors import EvaluationError
-from srm_mbs.mechanism import WORLD, Anchor, LoopClosure
+from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.systems.loops import LoopKinematics, row_wrenches
 from srm_mbs.systems.multibody import ClosedSystem
 from srm_mbs.systems.structure import Structure

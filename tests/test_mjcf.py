@@ -11,10 +11,10 @@ import pytest
 import tomli_w
 
 import srm_mbs as srm
+from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.description import parse_description
 from srm_mbs.loading.urdf import build_urdf
-from srm_mbs.mechanism import Anchor
 from srm_mbs.systems.forces import ForceKinematics
 from tests.lockstep import compare
 from tests.mjcf_files import BODY, FOUR_BAR, TREE, TWO, TWO_LOOPS, file, model_of, translated

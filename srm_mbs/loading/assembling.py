@@ -24,7 +24,8 @@ from srm_mbs.loading.description import (
     parse_description,
 )
 from srm_mbs.loading.urdf import build_urdf, check_inertia, lock_joints, undetermined_joint
-from srm_mbs.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.provenance import SimulationDefaults, Source
 from srm_mbs.systems.forces import friction_time
 
 log = logging.getLogger(__name__)

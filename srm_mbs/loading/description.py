@@ -23,13 +23,16 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from srm_mbs.anchors import Anchor
 from srm_mbs.closures import CLOSURE_TYPES
 from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
+from srm_mbs.force_element import ForceElement
 from srm_mbs.forces import FORCE_TYPES
 from srm_mbs.loading.laws import LAW_KEYS, law_from, with_law
 from srm_mbs.loading.translation import MODEL_KEYS
-from srm_mbs.mechanism import FRICTION_SPEED, Anchor, ForceElement, LoopClosure
+from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.mechanism import FRICTION_SPEED
 
 LARGEST = 1e30
 """Numbers beyond this have lost their meaning, and their squares may overflow."""

@@ -12,10 +12,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.cut_joints import placement
 from srm_mbs.loading.loop_elements import LoopElements
-from srm_mbs.mechanism import WORLD
 
 NOT_ACTING = ("physics", "sensor")
 """Elements inside such a joint that belong to Gazebo's own solver."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.errors import InputError
 from srm_mbs.loading.cut_joints import bushing, closure
 from srm_mbs.loading.joint_graph import (
@@ -20,7 +21,6 @@ from srm_mbs.loading.joint_graph import (
 )
 from srm_mbs.loading.translation import Translation
 from srm_mbs.loading.urdf_writer import is_identity, urdf_text
-from srm_mbs.mechanism import WORLD
 
 MODEL_FRAME = "__model__"
 """Massless root link of a floating robot: the frame in which the file places its bodies."""

@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.mechanism import WORLD
+from srm_mbs.anchors import WORLD
 
 Direction = tuple[float, float, float]
 

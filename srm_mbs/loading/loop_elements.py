@@ -16,13 +16,13 @@ from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.loading.cut_joints import CLOSURE_OF, bushing, closure, placement
 from srm_mbs.loading.urdf_elements import ElementChecker
 from srm_mbs.loading.urdf_graph import Graph
 from srm_mbs.loading.urdf_writer import anchor
-from srm_mbs.mechanism import WORLD
 
 DRAKE = "drake"
 

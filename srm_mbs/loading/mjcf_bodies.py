@@ -13,13 +13,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.joint_graph import UNLIMITED, Body, Joint
 from srm_mbs.loading.mjcf_geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
 from srm_mbs.loading.mjcf_schema import BODY_IGNORED, BODY_READ
 from srm_mbs.loading.mjcf_values import MjcfValues
 from srm_mbs.loading.urdf_writer import anchor
-from srm_mbs.mechanism import WORLD
 
 JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""

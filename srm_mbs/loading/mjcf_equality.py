@@ -11,11 +11,11 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.loading.mjcf_bodies import BodyReader
 from srm_mbs.loading.mjcf_schema import JOINT_EQUALITY
 from srm_mbs.loading.mjcf_values import MjcfValues
 from srm_mbs.loading.urdf_writer import anchor
-from srm_mbs.mechanism import WORLD
 
 KINDS = ("connect", "weld", "joint")
 REFUSED = ("tendon", "flex", "flexvert", "flexstrain", "distance")

@@ -21,7 +21,8 @@ from srm_mbs.loading.formats import DESCRIPTION, Format, find_format, of_key
 from srm_mbs.loading.generated import n_four_bar as _n_four_bar_texts
 from srm_mbs.loading.translation import Options, merged
 from srm_mbs.loading.urdf import ROOT_JOINTS
-from srm_mbs.mechanism import Mechanism, Source
+from srm_mbs.mechanism import Mechanism
+from srm_mbs.provenance import Source
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.errors import InputError
 from srm_mbs.loading.graph_translation import GraphTranslator
 from srm_mbs.loading.joint_graph import Body, Joint
@@ -24,7 +25,6 @@ from srm_mbs.loading.sdf_links import PlaceOf, read_link
 from srm_mbs.loading.sdf_poses import MODEL, RESERVED, SEPARATOR, Frames, joint_frame, pose
 from srm_mbs.loading.translation import Options, Translation
 from srm_mbs.loading.xml_values import XmlValues
-from srm_mbs.mechanism import WORLD
 
 OLDEST, NEWEST = (1, 3), (1, 12)
 MODEL_READ = ("pose", "link", "joint", "frame", "model", "include", "static")

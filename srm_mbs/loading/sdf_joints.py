@@ -10,12 +10,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.loading.joint_graph import UNLIMITED, Body, Direction, Joint
 from srm_mbs.loading.sdf_poses import Frames, joint_frame
 from srm_mbs.loading.xml_values import XmlValues
-from srm_mbs.mechanism import WORLD
 
 TYPES = {
     "revolute": ("axis",),

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.errors import InputError
 from srm_mbs.loading.xml_values import XmlValues
-from srm_mbs.mechanism import WORLD
 
 MODEL = "__model__"
 SEPARATOR = "::"

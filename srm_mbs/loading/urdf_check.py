@@ -14,10 +14,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.errors import SrmWarning
 from srm_mbs.loading.urdf_joints import UNIVERSE, JointChecker
 from srm_mbs.loading.urdf_schema import ATTRIBUTES
-from srm_mbs.mechanism import WORLD
 
 DEEPEST = 1000
 """Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""

@@ -10,9 +10,9 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.joint_graph import Body, Joint
-from srm_mbs.mechanism import WORLD
 
 JOINT_FRAME = "::joint_frame"
 """Added to a joint's name: the massless link at the joint where its child's frame is elsewhere."""

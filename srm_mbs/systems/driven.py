@@ -19,7 +19,8 @@ import pinocchio as pin
 from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.drives import NOMINAL, Drive, in_order_of_rows, positions
 from srm_mbs.laws import Curve
-from srm_mbs.mechanism import LoopClosure, Mechanism
+from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics, all_rows, closure_errors
 
 if TYPE_CHECKING:

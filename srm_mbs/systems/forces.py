@@ -17,8 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.force_element import ForceElement
 from srm_mbs.forces import (
     Bushing,
     JointTorque,
@@ -28,7 +30,7 @@ from srm_mbs.forces import (
     Wrench,
 )
 from srm_mbs.laws import Law
-from srm_mbs.mechanism import Anchor, ForceElement, Mechanism
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import COINCIDENT, placement_numbers, support, world_jacobian
 from srm_mbs.systems.projection import cholesky, whiten
 from srm_mbs.systems.vectors import cross

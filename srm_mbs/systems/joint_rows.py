@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
-from srm_mbs.mechanism import LoopClosure
+from srm_mbs.loop_closure import LoopClosure
 
 
 class JointRows:

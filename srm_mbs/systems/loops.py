@@ -35,7 +35,8 @@ import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
-from srm_mbs.mechanism import LoopClosure, Mechanism
+from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.joint_rows import JointRows
 from srm_mbs.systems.vectors import cross, cross3, dot, from_world, minus, plus_cross, to_world
 

@@ -1,0 +1,114 @@
+"""What is asked of a mechanism as a whole; its closures, forces and drives check themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.anchors import finite_numbers
+from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import InputError
+
+
+def check_tree(model: pin.Model) -> None:
+    """Refuse a tree that cannot move, or whose joints are not in depth-first order.
+
+    Raises
+    ------
+    InputError
+        Naming the joint that is out of order.
+    """
+    if model.nv == 0:
+        raise InputError(
+            "nothing in this mechanism can move",
+            element="model",
+            remedy="Give it at least one joint that is neither fixed nor locked",
+        )
+    _check_order(model)
+
+
+def _check_order(model: pin.Model) -> None:
+    """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
+    for joint in range(2, model.njoints):
+        if model.parents[joint] not in list(model.supports[joint - 1]):
+            raise InputError(
+                f"the joint {model.names[joint]!r} continues a branch that another joint, "
+                f"{model.names[joint - 1]!r}, has interrupted",
+                element="model",
+                remedy="Add the joints depth first, every branch to its tip; Pinocchio's mass "
+                "matrix is wrong otherwise",
+            )
+
+
+def check_names(what: str, names: Sequence[str]) -> None:
+    """Refuse names that repeat, of elements of the kind ``what``.
+
+    Raises
+    ------
+    InputError
+        Naming the first that does.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"the {what} name {name!r} is used twice",
+                element=f"{what} {name!r}",
+                remedy=f"Give every {what} its own name",
+            )
+
+
+def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, FloatArray]:
+    """Read-only copies of an initial state, q0 (nq,) and v0 (nv,).
+
+    Raises
+    ------
+    InputError
+        If a shape does not fit, a number is not finite, or a quaternion is not of unit length.
+    """
+    q0 = _frozen_array(q0, (model.nq,), "q0")
+    if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
+        raise InputError(
+            "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
+            element="q0",
+            remedy="Use pinocchio.normalize(model, q0)",
+        )
+    return q0, _frozen_array(v0, (model.nv,), "v0")
+
+
+def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
+    array = np.array(values, dtype=float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} has shape {array.shape} or is not finite",
+            element=what,
+            remedy=f"Give {shape[0]} finite numbers",
+        )
+    array.setflags(write=False)
+    return array
+
+
+def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
+    """The speed (rad/s, m/s) over which the joint friction of ``model`` changes its sign.
+
+    Raises
+    ------
+    InputError
+        If it is not positive, or the friction is negative or not finite.
+    """
+    if not (np.isfinite(model.friction).all() and np.all(model.friction >= 0.0)):
+        raise InputError(
+            "joint friction is negative or not finite",
+            element="model.friction",
+            remedy="Give values >= 0",
+        )
+    speed = finite_numbers((friction_speed,), 1, "friction_speed", "Give rad/s or m/s")[0]
+    if speed <= 0.0:
+        raise InputError(
+            f"friction_speed = {speed:g} is not positive",
+            element="friction_speed",
+            remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
+        )
+    return speed

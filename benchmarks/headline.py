@@ -26,6 +26,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from srm_mbs.compiled.twin import twin_of
 from srm_mbs.systems.loops import closure_errors
 from srm_mbs.systems.multibody import make_system
 from tests import reduced
@@ -160,7 +161,7 @@ def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float, float]:
     inside = 2000
     compiled = float("nan")
     if kernel.core is not None:
-        twin = kernel.compiled(system)
+        twin = twin_of(system)
         compiled = per_call(lambda: twin.repeat(0.0, state, inside), 1) / inside
     return compiled, per_call(whole), per_call(pinocchio_only)
 

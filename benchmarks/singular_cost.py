@@ -29,6 +29,7 @@ import numpy as np
 import srm_mbs as srm
 from srm_mbs import kernel, simulation
 from srm_mbs.arrays import FloatArray
+from srm_mbs.compiled import handover
 from srm_mbs.methods import psrm
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
 from srm_mbs.methods.split import later_stages
@@ -125,7 +126,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(psrm, "split_accept", plain_accept),
         patch.object(simulation, "placed_control", control),
         patch.object(simulation, "start", start),
-        patch.object(simulation, "_bifurcations", lambda _: ""),
+        patch.object(simulation, "bifurcations_told", lambda _: ""),
         patch.object(Closures, "trouble", lambda *_: ""),
     ):
         yield
@@ -139,8 +140,8 @@ NEVER = {"watched": -1.0, "far": 0.0, "gap_every": -(2**31 - 1)}
 def nothing_on_the_kernel() -> Iterator[None]:
     """The same for the kernel, together with ``placement="off"``."""
     with (
-        patch.dict(kernel.CONSTANTS, NEVER),
-        patch.object(simulation, "_bifurcations", lambda _: ""),
+        patch.dict(handover.CONSTANTS, NEVER),
+        patch.object(simulation, "bifurcations_told", lambda _: ""),
     ):
         yield
 

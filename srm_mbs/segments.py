@@ -13,8 +13,9 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError, EventError, InputError, SimulationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.options import checked_times, positive
+from srm_mbs.preparation import check_consistent
 from srm_mbs.segmented import SegmentedSolution
-from srm_mbs.simulation import check_consistent, simulate
+from srm_mbs.simulation import simulate
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.events import Event, prepare_events
 from srm_mbs.systems.consistent import onto_closures

@@ -10,6 +10,7 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
+from srm_mbs.kernel import uses_kernel
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.methods.butcher import ButcherTableau
@@ -21,14 +22,14 @@ from srm_mbs.options import (
     loosest_rtol,
     positive,
 )
-from srm_mbs.records import Statistics
-from srm_mbs.simulation import (
+from srm_mbs.preparation import (
     absolute_tolerance,
     check_consistent,
+    check_mechanism,
     mechanism_method,
     placed_control,
-    uses_kernel,
 )
+from srm_mbs.records import Statistics
 from srm_mbs.stepping.breakpoints import pieces_between
 from srm_mbs.stepwise import KernelRun, ReferenceRun
 from srm_mbs.systems.consistent import onto_closures
@@ -76,12 +77,7 @@ class Simulator:
         placement: str = "automatic",
         backend: str = "auto",
     ) -> None:
-        if not isinstance(mechanism, Mechanism):
-            raise InputError(
-                f"{mechanism!r} is not a mechanism",
-                element="mechanism",
-                remedy="Give srm.load(...) or srm.Mechanism(...)",
-            )
+        check_mechanism(mechanism)
         for value, what in ((step, "step"), (max_step, "max_step")):
             if value is not None:
                 positive(value, what, " of seconds")

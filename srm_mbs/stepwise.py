@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs import kernel
 from srm_mbs.arrays import FloatArray
+from srm_mbs.compiled.driving import why_stopped
+from srm_mbs.compiled.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
+from srm_mbs.compiled.twin import Evaluator, twin_of
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method
 from srm_mbs.methods.psrm import PSRM
@@ -81,7 +83,7 @@ class KernelRun(_Live):
     system, held
         The mechanism, under what is held.
     method, norm, step, max_step, placement
-        As for :class:`~srm_mbs.kernel.CompiledRun`.
+        As for :class:`~srm_mbs.compiled.run.CompiledRun`.
     """
 
     def __init__(
@@ -94,13 +96,13 @@ class KernelRun(_Live):
         max_step: float,
         placement: str,
     ) -> None:
-        twin = kernel.compiled(system)
-        super().__init__(system, held, method, norm, kernel.Evaluator(system, twin))
+        twin = twin_of(system)
+        super().__init__(system, held, method, norm, Evaluator(system, twin))
         nothing = np.zeros(2 * system.nv)
         state = np.zeros(system.nq + system.nv)
         pieces = pieces_between(nothing[:0], nothing[:0], 0.0, 1.0)
         self._twin = twin
-        self._run = kernel.CompiledRun(
+        self._run = CompiledRun(
             twin,
             method,
             norm,
@@ -157,23 +159,23 @@ class KernelRun(_Live):
         ValueError
             If ``force`` has another shape, or is not finite.
         """
-        reason = self._go_on(end, first, last, force, anew, grid, kernel.CHUNK)
-        if reason == kernel.FINISHED:
+        reason = self._go_on(end, first, last, force, anew, grid, CHUNK)
+        if reason == FINISHED:
             return ""
         self._held.only(force)
         self.system.between(first, last)
-        if reason == kernel.BREAKPOINT:
+        if reason == BREAKPOINT:
             try:
                 self._run.remember(self._renewed(self._run.memory(), end))
             except EvaluationError as error:
                 return f"Stopped at t = {self.t:.6g} s: {error}. {LAST_GOOD}."
-            reason = kernel.CHUNK_FULL
-        while reason == kernel.CHUNK_FULL:
+            reason = CHUNK_FULL
+        while reason == CHUNK_FULL:
             reason = self._run.advance()
-        if reason == kernel.FINISHED:
+        if reason == FINISHED:
             return ""
         run = self._run
-        why = kernel.why_stopped(reason, self.system, run) or (
+        why = why_stopped(reason, self.system, run) or (
             "the error estimate stays above the tolerance however small the step"
         )
         return f"Stopped at t = {run.t:.6g} s with step {run.h:.1e} s: {why}. {LAST_GOOD}."

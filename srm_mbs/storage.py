@@ -17,11 +17,11 @@ import pinocchio as pin
 
 from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
+from srm_mbs.compiled.dense_output import dense_output
 from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
 from srm_mbs.force_element import ForceElement
 from srm_mbs.forces import FORCE_TYPES
-from srm_mbs.kernel import dense_output
 from srm_mbs.laws import LAW_TYPES, Law
 from srm_mbs.loading import rebuild
 from srm_mbs.loop_closure import LoopClosure

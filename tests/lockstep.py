@@ -13,14 +13,16 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
-from srm_mbs import kernel, options, simulation
 from srm_mbs.arrays import FloatArray
+from srm_mbs.compiled.run import CompiledRun
+from srm_mbs.compiled.twin import twin_of
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm
+from srm_mbs.preparation import absolute_tolerance, placed_control
 from srm_mbs.stepping.breakpoints import Passing, pieces_between
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.placement import SingularityPlacement
-from srm_mbs.stepping.singular_times import SlopeOfSigma, placed
+from srm_mbs.stepping.singular_times import SlopeOfSigma
 from srm_mbs.stepping.starting import start
 from srm_mbs.stepping.stepsize import FixedStep, PIControl, Verdict, initial_step
 from srm_mbs.systems.multibody import make_system
@@ -128,9 +130,9 @@ def compare(
     scheme = method.scheme
     system = make_system(mechanism, controller)
     pieces = pieces_between(np.array(breakpoints), np.zeros(0), 0.0, t_end)
-    twin = kernel.compiled(system)
+    twin = twin_of(system)
     norm = ErrorNorm(
-        simulation.absolute_tolerance(mechanism, None, rtol),
+        absolute_tolerance(mechanism, None, rtol),
         rtol,
         NEGLIGIBLE if step is None else 0.0,
     )
@@ -138,13 +140,10 @@ def compare(
     memory = start(system, method, 0.0, x, norm, t_end)
     order = scheme.controller_order or 1
     first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
-    control = options.step_size_control(scheme, 0.0, t_end, step, lambda: first)
-    control, _ = placed(
-        control, scheme, placement if system.has_constraints else None, np.zeros(0), t_end, step
+    control, _ = placed_control(
+        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0)
     )
-    if system.has_constraints and placement == "automatic":
-        control = BranchGuard(control, system)
-    run = kernel.CompiledRun(
+    run = CompiledRun(
         twin,
         method,
         norm,

@@ -24,6 +24,7 @@ from srm_mbs import kernel
 from srm_mbs.anchors import WORLD, Anchor
 from srm_mbs.arrays import FloatArray
 from srm_mbs.closures import CLOSURE_TYPES, perpendicular_basis
+from srm_mbs.compiled.twin import twin_of
 from srm_mbs.errors import EvaluationError
 from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.systems.loops import LoopKinematics, row_wrenches
@@ -728,7 +729,7 @@ def test_the_kernel_refuses_points_that_coincide_as_well() -> None:
     loop = random_loop("distance", "two branches", rng)
     closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
     system = ClosedSystem(srm.Mechanism(model, (closed,)))
-    twin = kernel.compiled(system)
+    twin = twin_of(system)
     with pytest.raises(ArithmeticError):
         twin.terms(0.0, np.concatenate([q, v]), -1.0)
 

@@ -15,6 +15,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from srm_mbs.compiled.twin import twin_of
 from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.systems.multibody import make_system
 from tests.lockstep import Comparison, compare
@@ -99,7 +100,7 @@ def random_state(mechanism: srm.Mechanism, rng: np.random.Generator) -> np.ndarr
 def test_the_terms_of_a_stage_agree_anywhere(name: str) -> None:
     mechanism = srm.load(name)
     system = make_system(mechanism)
-    twin = kernel.compiled(system)
+    twin = twin_of(system)
     rng = np.random.default_rng(5)
     for _ in range(20):
         x = random_state(mechanism, rng)

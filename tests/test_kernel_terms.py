@@ -10,6 +10,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from srm_mbs.compiled.twin import twin_of
 from srm_mbs.systems.multibody import make_system
 from tests.mechanisms import along_x, rod
 
@@ -83,7 +84,7 @@ def test_terms_are_those_of_the_reference_for_any_kind_of_joint(name: str) -> No
     mechanism = _branching((IN_ONE_PASS | BY_PINOCCHIO)[name])
     model = mechanism.model
     system = make_system(mechanism)
-    twin = kernel.compiled(system)
+    twin = twin_of(system)
     rng = np.random.default_rng(2)
     for _ in range(5):
         q = pin.integrate(model, mechanism.q0, rng.uniform(-1.0, 1.0, model.nv))
@@ -111,7 +112,7 @@ def test_workspaces_of_large_trees_hold_no_second_derivatives() -> None:
         model.appendBodyToJoint(parent, rod(), pin.SE3.Identity())
     system = make_system(srm.Mechanism(model))
     before = _resident()
-    kept = [kernel.compiled(system) for _ in range(6)]
+    kept = [twin_of(system) for _ in range(6)]
     # What one gives back may stay with the process until the next one takes it: once, not six.
     assert _resident() - before < 2.5 * 86.0
     assert np.isfinite(kept[0].terms(0.0, np.zeros(2 * model.nv))["rate"]).all()

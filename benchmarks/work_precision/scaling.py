@@ -27,7 +27,7 @@ from benchmarks.work_precision.peers.pinocchio_dynamics import PinocchioDynamics
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.records import Results
-from srm_mbs.kernel import compiled
+from srm_mbs.compiled.twin import twin_of
 from srm_mbs.systems.multibody import make_system
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160)
@@ -92,7 +92,7 @@ def kernel_evaluation(mechanism: srm.Mechanism, repeats: int) -> float | None:
     """Microseconds of an evaluation in the kernel's own loop; None where runs do not use it."""
     if srm.backend() != "kernel":
         return None
-    twin = compiled(make_system(mechanism))
+    twin = twin_of(make_system(mechanism))
     state = np.concatenate([mechanism.q0, mechanism.v0])
     number = 20
     cost = per_call(lambda: twin.repeat(0.0, state, number), repeats)

@@ -55,7 +55,7 @@ class Attempt:
 class RunRecord:
     """Everything a run produced, complete at any moment it is stopped.
 
-    The compiled kernel makes its own kind (:mod:`srm_mbs.kernel`).
+    The compiled kernel makes its own kind (:mod:`srm_mbs.compiled`).
 
     Attributes
     ----------

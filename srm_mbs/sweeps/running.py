@@ -15,8 +15,9 @@ from typing import Any
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.options import checked_span
+from srm_mbs.preparation import mechanism_method
 from srm_mbs.progress import Counted, counting
-from srm_mbs.simulation import mechanism_method, simulate
+from srm_mbs.simulation import simulate
 from srm_mbs.sweeps.cases import Case, listed
 from srm_mbs.sweeps.journal import Journal
 from srm_mbs.sweeps.results import Sweep

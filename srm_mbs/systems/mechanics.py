@@ -111,7 +111,7 @@ class Mechanics(Manifold):
         return tau if force is None else tau + force
 
     def constants(self) -> dict[str, Any]:
-        """Everything that does not change, for the compiled kernel (:mod:`srm_mbs.kernel`)."""
+        """Everything that does not change, for the compiled kernel (:mod:`srm_mbs.compiled`)."""
         fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
         return fixed | {
             "unit": self._unit,

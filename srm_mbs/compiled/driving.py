@@ -1,0 +1,151 @@
+"""From the start of a run on the compiled kernel to its record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.compiled.handover import VERDICTS, history_from
+from srm_mbs.compiled.run import (
+    BREAKPOINT,
+    CHUNK_FULL,
+    CLOSURES,
+    FINISHED,
+    NOT_EVALUATED,
+    STANDSTILL,
+    TOO_SHORT,
+    CompiledRun,
+)
+from srm_mbs.errors import ControllerError, EvaluationError, EventError
+from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs.stepping import loop
+from srm_mbs.stepping.breakpoints import Passing
+from srm_mbs.stepping.dense import StepData
+from srm_mbs.stepping.events import EventWatch
+from srm_mbs.stepping.loop import RunRecord, Tick
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+
+
+@dataclass
+class CompiledRecord(RunRecord):
+    """A run of the kernel.
+
+    Attributes
+    ----------
+    run
+        What holds its steps.
+    suspects
+        Times (s) of steps that were kept although the velocity turned.
+    """
+
+    run: Any = None
+    suspects: list[float] = field(default_factory=list)
+    placed: int = 0
+    replaced: int = 0
+
+    def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
+        """The accepted steps as arrays."""
+        if self.run is None:
+            return super().data(scheme, tangent_size)
+        arrays = self.run.arrays()
+        zones = {
+            step: (threshold, history_from(history))
+            for step, (threshold, history) in arrays.pop("zones").items()
+        }
+        times, states = arrays.pop("times"), arrays.pop("states")
+        breaks = arrays.pop("breaks").astype(int)
+        return StepData(
+            breaks=breaks,
+            times=np.concatenate([[self.t0], times]),
+            states=np.concatenate([self.x0[None], states]),
+            zones=zones,
+            stop=self.stop,
+            **arrays,
+        )
+
+
+def integrate(
+    system: ClosedSystem | OpenSystem,
+    run: CompiledRun,
+    *,
+    tick: Tick | None = None,
+    events: EventWatch | None = None,
+    passing: Passing | None = None,
+) -> CompiledRecord:
+    """As :func:`srm_mbs.stepping.loop.integrate`, on the kernel.
+
+    Parameters
+    ----------
+    system
+        The mechanism that ``run`` is of.
+    tick, events
+        With either, the kernel returns after every step.
+    passing
+        What happens at breakpoints, if there are any.
+    """
+    state = run.start
+    record = CompiledRecord(run.t0, state)
+    record.run = run
+    started = time.perf_counter()
+    one_by_one = tick is not None or events is not None
+    start = state
+    try:
+        if events is not None:
+            events.begin(run.t0, state)
+        reason = CHUNK_FULL
+        while reason in (CHUNK_FULL, BREAKPOINT):
+            made = run.count
+            reason = run.advance(1 if one_by_one else 0)
+            if reason == BREAKPOINT and passing is not None:
+                run.pass_breakpoint(passing)
+                continue
+            if reason not in (CHUNK_FULL, FINISHED):
+                trouble = why_stopped(reason, system, run)
+                loop.fail(record, run.t, run.h, run.memory().sigma, trouble, run.adaptive)
+                break
+            if not one_by_one or run.count == made:
+                continue
+            result, t = run.last(), run.t
+            stop = None if events is None else events.after_step(start, result, t)
+            start = result.state
+            if stop is not None:
+                record.ended(stop)
+                break
+            if tick is not None:
+                loop.tell(tick, t, result.h, result.state)
+        else:
+            record.finished(run.t_end)
+    except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
+        record.broken_off(run.t, error)
+    record.attempts = [
+        loop.Attempt(t, h, ratio, VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
+    ]
+    record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
+    system.count(run.twin.evaluations, run.twin.factorisations)
+    record.wall_time = time.perf_counter() - started
+    loop.log.info("%s", record.message)
+    return record
+
+
+def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> str:
+    """Why the kernel stopped, in the words of the reference, which repeats what failed."""
+    attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
+    if reason == STANDSTILL:
+        return loop.standstill(run.t - run.time_before(loop.WATCHED_STEPS))
+    if reason == CLOSURES:
+        return loop.Closures(system, run.norm).trouble(run.last())
+    if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
+        return loop.BELOW_ROUND_OFF
+    if run.trouble:
+        failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
+        # The last one first; at the edge of what can be evaluated rounding decides.
+        for h in reversed(failed):
+            try:
+                run.method.step(system, run.t, h, run.state, run.memory(), run.norm)
+            except EvaluationError as error:
+                return str(error)
+    return loop.NOT_FINITE if reason == NOT_EVALUATED else ""

@@ -5,13 +5,17 @@ How runs are made on it is in :mod:`srm_mbs.compiled`.
 
 from __future__ import annotations
 
+import logging
 import os
+from functools import cache
 
-from srm_mbs._kernel import core, missing
+from srm_mbs._kernel import OUTDATED, core, missing
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.methods.base import Method
 from srm_mbs.methods.psrm import PSRM
+
+log = logging.getLogger(__name__)
 
 BACKENDS = ("auto", "python", "kernel")
 PLACEMENTS = ("automatic", "off")
@@ -67,4 +71,14 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
             element="backend",
             remedy='Use backend="auto", which takes the Python reference where it has to',
         )
+    if reason == OUTDATED:
+        warn_outdated()
     return not reason
+
+
+@cache
+def warn_outdated() -> None:
+    """Say, once, that runs are slow because the kernel does not fit the sources any more."""
+    log.warning(
+        "runs use the Python reference, because the compiled kernel is left out: %s", missing
+    )

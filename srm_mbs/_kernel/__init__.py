@@ -7,29 +7,39 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from types import ModuleType
+
+from srm_mbs._kernel.sources import fingerprint
 
 INSTALL_AGAIN = (
     "install srm-mbs again from its source: "
     "pip install --force-reinstall --no-deps --no-cache-dir <folder or address of srm-mbs>"
 )
+OUTDATED = "it was built from other sources; install again: pip install -e ."
+"""``missing`` of a checkout whose sources have changed since the kernel was built."""
 
 
 def _load() -> tuple[ModuleType | None, str]:
     """The extension module, or why there is none."""
     try:
-        built_against: str = import_module("srm_mbs._kernel.built").PINOCCHIO
+        built = import_module("srm_mbs._kernel.built")
     except ModuleNotFoundError:
         return None, (
             "it was not built when srm-mbs was installed, because there was no C++17 compiler "
             f"or because it failed; {INSTALL_AGAIN} (with -v, it says why)"
         )
+    built_against: str = built.PINOCCHIO
     installed = version("pin")
     if built_against.split(".")[:2] != installed.split(".")[:2]:
         return None, (
             f"it was built against Pinocchio {built_against}, but pin {installed} is installed; "
             f"{INSTALL_AGAIN}"
         )
+    sources = fingerprint(Path(__file__).parent)
+    # A kernel that does not say from what it was built is older than this question.
+    if sources and sources != getattr(built, "SOURCES", ""):
+        return None, OUTDATED
     import pinocchio  # noqa: F401 - loads the libraries that the kernel links to
 
     try:

@@ -253,7 +253,7 @@ def test_a_closure_is_what_it_says_between_the_anchors_of_the_file(
 
 
 def _closures(path: Path) -> tuple[srm.LoopClosure, ...]:
-    from srm_mbs.loading.description import parse_description
+    from srm_mbs.loading.parsing import parse_description
 
     return parse_description(path.read_text(), str(path)).closures()
 

@@ -13,7 +13,7 @@ import tomli_w
 import srm_mbs as srm
 from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
-from srm_mbs.loading.description import parse_description
+from srm_mbs.loading.parsing import parse_description
 from srm_mbs.loading.urdf import build_urdf
 from srm_mbs.systems.forces import ForceKinematics
 from tests.lockstep import compare

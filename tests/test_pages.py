@@ -19,7 +19,7 @@ import yaml
 from PIL import Image
 
 import srm_mbs as srm
-from srm_mbs.loading.description import parse_description
+from srm_mbs.loading.parsing import parse_description
 from tools.method_tables import filled
 from tools.singular_pictures import draw
 

@@ -16,13 +16,9 @@ from srm_mbs.assembly import assemble
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.joint_limits import limit_springs
-from srm_mbs.loading.description import (
-    Description,
-    LimitSpringEntry,
-    TorqueEntry,
-    TorsionSpringEntry,
-    parse_description,
-)
+from srm_mbs.loading.description import Description
+from srm_mbs.loading.entries import LimitSpringEntry, TorqueEntry, TorsionSpringEntry
+from srm_mbs.loading.parsing import parse_description
 from srm_mbs.loading.urdf import build_urdf, check_inertia, lock_joints, undetermined_joint
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.provenance import SimulationDefaults, Source

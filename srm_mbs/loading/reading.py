@@ -16,9 +16,11 @@ import tomli_w
 from srm_mbs.errors import InputError
 from srm_mbs.loading.assembling import assembled
 from srm_mbs.loading.bundled import bundled_models, generated_size, models_folder
-from srm_mbs.loading.description import LARGEST, Description, parse_description
+from srm_mbs.loading.description import Description
+from srm_mbs.loading.entries import LARGEST
 from srm_mbs.loading.formats import DESCRIPTION, Format, find_format, of_key
 from srm_mbs.loading.generated import n_four_bar as _n_four_bar_texts
+from srm_mbs.loading.parsing import parse_description
 from srm_mbs.loading.translation import Options, merged
 from srm_mbs.loading.urdf import ROOT_JOINTS
 from srm_mbs.mechanism import Mechanism

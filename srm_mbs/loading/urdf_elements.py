@@ -6,7 +6,7 @@ import sys
 from xml.etree.ElementTree import Element
 
 from srm_mbs.errors import InputError
-from srm_mbs.loading.description import LARGEST
+from srm_mbs.loading.entries import LARGEST
 from srm_mbs.loading.urdf_schema import (
     ATTRIBUTES,
     DRAWN_ONLY,

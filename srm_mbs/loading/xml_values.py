@@ -10,7 +10,7 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.loading.description import LARGEST
+from srm_mbs.loading.entries import LARGEST
 
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)

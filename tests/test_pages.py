@@ -14,14 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import yaml
 from PIL import Image
 
 import srm_mbs as srm
 from srm_mbs.loading.parsing import parse_description
+from srm_mbs.systems.loops import closure_errors
 from tools.method_tables import filled
-from tools.singular_pictures import draw
+from tools.singular_pictures import by_scipy, draw
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -259,6 +261,18 @@ def test_the_page_on_methods_has_every_tableau_with_its_order_and_stages() -> No
     assert [name for name in srm.TABLEAUS if f"`{name}`" not in page] == []
 
 
+def test_the_run_that_jumps_on_the_page_on_singular_configurations_hardly_shows_it() -> None:
+    mechanism = srm.load("slider_crank")
+    model, data = mechanism.model, mechanism.model.createData()
+    run = by_scipy(mechanism, 10.0)
+    q, v = np.ascontiguousarray(run.y[:2].T), np.ascontiguousarray(run.y[2:].T)
+    assert np.abs(q[:, 1] + 2.0 * q[:, 0]).max() > 1.0, "it stayed on its branch"
+    gap, _ = closure_errors(model, mechanism.loops, q, v)
+    energy = np.array([pin.computeMechanicalEnergy(model, data, *state) for state in zip(q, v)])
+    assert np.abs(gap).max() < 5e-6
+    assert np.abs(energy / energy[0] - 1.0).max() < 1e-3
+
+
 def test_the_pictures_of_singular_configurations_can_be_drawn_again(tmp_path: Path) -> None:
     draw(tmp_path)
     page = PAGES["singular_configurations.md"].read_text(encoding="utf-8")
@@ -269,3 +283,20 @@ def test_the_pictures_of_singular_configurations_can_be_drawn_again(tmp_path: Pa
             assert new.size == old.size, name
             assert np.std(np.asarray(new.convert("L"), dtype=float)) > 5.0, f"{name} is blank"
     assert sum(path.stat().st_size for path in (DOCS / "singular").iterdir()) < 150_000
+
+
+# --- docstrings on the site ----------------------------------------------------------------------
+
+
+def test_the_roles_of_docstrings_become_links_and_formulae_code() -> None:
+    roles = pytest.importorskip("tools.docstring_roles", reason="needs the extra docs")
+    text = roles.without_roles(r"See :class:`~srm_mbs.mechanism.Mechanism`, :math:`\dot G v`.")
+    link = '<autoref optional identifier="srm_mbs.mechanism.Mechanism">`Mechanism`</autoref>'
+    assert text == rf"See {link}, `\dot G v`."
+
+
+def test_parameters_described_together_are_listed_by_all_their_names() -> None:
+    roles = pytest.importorskip("tools.docstring_roles", reason="needs the extra docs")
+    text = "    q0 : (nq,), v0 : (nv,)\n        Initial state."
+    assert roles.listed_together(text) == "    q0, v0 : (nq,), (nv,)\n        Initial state."
+    assert roles.listed_together("    t : (n,)\n        s") == "    t : (n,)\n        s"

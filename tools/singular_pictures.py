@@ -52,21 +52,21 @@ def points(mechanism: srm.Mechanism, q: FloatArray) -> FloatArray:
     return np.array([data.oMi[1].translation, data.oMi[2].translation, tip])[:, [0, 2]]
 
 
-def draw_bars(axes: Axes, mechanism: srm.Mechanism, q: FloatArray, colour: str, style: str) -> None:
+def draw_bars(axes: Axes, mechanism: srm.Mechanism, q: FloatArray, colour: str) -> None:
     x, z = points(mechanism, q).T
-    axes.plot(x, z, style, color=colour, linewidth=2.0, marker="o", markersize=4)
+    axes.plot(x, z, color=colour, linewidth=2.0, marker="o", markersize=4)
 
 
 def branches(mechanism: srm.Mechanism, path: Path) -> None:
     """The bars before, at and behind the singular configuration, on both branches."""
-    figure, axes = panels(1, 2.6, 3, sharey=True)
+    figure, axes = panels(1, 1.5, 3, sharey=True)
     titles = ("before", "singular: the bars coincide", "behind: two ways to go on")
     for one, title, turn in zip(axes[0], titles, (0.6, 0.0, -0.6)):
         crank = VERTICAL + turn
         one.axhline(0.0, color=GREY, linewidth=0.8)
-        draw_bars(one, mechanism, np.array([crank, -2.0 * crank]), BLUE, "-")
+        draw_bars(one, mechanism, np.array([crank, -2.0 * crank]), BLUE)
         if turn < 0.0:  # the tip stays on the pivot
-            draw_bars(one, mechanism, np.array([crank, np.pi]), VERMILION, "--")
+            draw_bars(one, mechanism, np.array([crank, np.pi]), VERMILION)
         one.plot(0.0, 0.0, "s", color=BLACK, markersize=6)
         one.set_aspect("equal")
         one.set_xlim(-2.6, 2.6)

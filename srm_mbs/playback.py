@@ -7,21 +7,23 @@ time and its time slider scrubs through it.
 from __future__ import annotations
 
 import atexit
-import base64
-import contextlib
-import html
-import io
-import json
 import logging
 import math
 import sys
 import time
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from srm_mbs.anchors import Anchor
+from srm_mbs.drawing import draw_picture, import_meshcat
 from srm_mbs.errors import InputError
-from srm_mbs.scene import ASPECT, draw_scene, import_meshcat
+from srm_mbs.overlays import Wanted
+from srm_mbs.page_server import start_server
+from srm_mbs.readout import read_out
+from srm_mbs.scene import ASPECT, Picture, make_picture
+from srm_mbs.web_page import make_page
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
@@ -63,11 +65,13 @@ def play(
     fps: float = 60.0,
     open_browser: bool = True,
     block: bool | None = None,
+    trace: Sequence[Anchor] = (),
+    gaps: bool = False,
+    reactions: bool = False,
 ) -> Any:
     """Play a run in the browser, in real time, over and over.
 
-    "Open Controls" in the page has pause, play, the time slider and the speed (``timeScale``).
-    The page is served by a local process of meshcat's.
+    The page is that of :func:`export_html`, served by a local process.
 
     Parameters
     ----------
@@ -81,6 +85,13 @@ def play(
     block
         Wait until Ctrl+C, and then stop serving.  By default in a script, whose end would also be
         that of the page, and not in an interactive session.
+    trace
+        Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
+    gaps
+        Draw the gaps of the closures, so much exaggerated that they are seen; the panel gives the
+        factor.
+    reactions
+        Colour the closures by the size of their reaction force, with a legend in the panel.
 
     Returns
     -------
@@ -90,15 +101,17 @@ def play(
     Raises
     ------
     InputError
-        If ``fps`` is not a positive number, or meshcat is missing or cannot start.
+        If ``fps`` is not a positive number, what is asked for cannot be drawn, or meshcat is
+        missing or cannot start.
     """
-    fps = check_fps(fps)
     meshcat = import_meshcat()
-    visualizer = _start_server(meshcat)
+    picture = make_picture(solution, check_fps(fps), Wanted(trace, gaps, reactions))
+    about = _about(solution, picture, panel=True)
+    visualizer = _start_server(meshcat, make_page(meshcat, solution.mechanism.name, about, None))
     try:
         # Without a limit, sending to a server that has died would wait for ever.
         visualizer.window.zmq_socket.setsockopt(_zmq().RCVTIMEO, int(1000.0 * REPLY_TIME))
-        draw_scene(meshcat, visualizer, solution, fps)
+        draw_picture(meshcat, visualizer, picture)
         visualizer.window.zmq_socket.setsockopt(_zmq().RCVTIMEO, -1)
     except _zmq().ZMQError as error:
         close(visualizer)
@@ -154,17 +167,13 @@ def _zmq() -> Any:
     return zmq
 
 
-def _start_server(meshcat: Any) -> Any:
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(printed):  # meshcat prints the address
-            visualizer = meshcat.Visualizer()
-    except Exception as error:  # a process, a port, a socket: anything may fail here
-        details = " ".join([str(error), *printed.getvalue().split("\n")[-2:]]).strip()
-        raise InputError(
-            f"meshcat cannot start its server: {details}",
-            remedy="solution.export_html(path) needs none",
-        ) from error
+def _start_server(meshcat: Any, page: str) -> Any:
+    process, commands, address = start_server(page)
+    kind = meshcat.visualizer.ViewerWindow
+    window = kind.__new__(kind)  # its constructor starts a server of its own, or leaves a socket
+    window.server_proc, window.zmq_url, window.web_url = process, commands, address
+    window.connect_zmq()
+    visualizer = meshcat.Visualizer(window=window)
     # Kept until closed: an abandoned process and socket would warn when collected.
     _open_visualizers.append(visualizer)
     return visualizer
@@ -183,11 +192,22 @@ class _Recorder:
         self.commands.append(command.lower())
 
 
-def export_html(solution: Playable, path: str | Path, *, fps: float = 60.0) -> None:
+def export_html(
+    solution: Playable,
+    path: str | Path,
+    *,
+    fps: float = 60.0,
+    trace: Sequence[Anchor] = (),
+    gaps: bool = False,
+    reactions: bool = False,
+    panel: bool = True,
+) -> None:
     """Write one file that plays a run in any browser, without a network or a server.
 
-    It starts at once and repeats for ever.  Below are pause, play and the time slider; the speed
-    (``timeScale``) is under "Open Controls".  The mouse turns, shifts and zooms the picture.
+    It starts at once and repeats for ever.  Below are pause, play, the speed, and the time slider
+    with the singular passages marked; a panel has the time, and of a run drift, energy and sigma
+    there.  The mouse turns, shifts and zooms the picture.  Spring-dampers between two points are
+    drawn.
 
     Parameters
     ----------
@@ -199,102 +219,34 @@ def export_html(solution: Playable, path: str | Path, *, fps: float = 60.0) -> N
         Key frames per second; between them the browser interpolates.  Fewer are taken where
         their number would get too large (:data:`srm_mbs.scene.MAX_BODY_FRAMES`), to keep the file
         below 5 MB unless there are mesh files or very many bodies.
+    trace
+        Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
+    gaps
+        Draw the gaps of the closures, so much exaggerated that they are seen; the panel gives the
+        factor.
+    reactions
+        Colour the closures by the size of their reaction force, with a legend in the panel.
+    panel
+        Whether there are the panel and the marks.
 
     Raises
     ------
     InputError
-        If ``fps`` is not a positive number, meshcat is missing, or the file cannot be written.
+        If ``fps`` is not a positive number, what is asked for cannot be drawn, meshcat is missing,
+        or the file cannot be written.
     """
-    fps = check_fps(fps)
     meshcat = import_meshcat()
+    picture = make_picture(solution, check_fps(fps), Wanted(trace, gaps, reactions))
     recorder = _Recorder()
-    draw_scene(meshcat, meshcat.Visualizer(window=recorder), solution, fps)
-    page = _page(meshcat, solution.mechanism.name, recorder.commands)
+    draw_picture(meshcat, meshcat.Visualizer(window=recorder), picture)
+    about = _about(solution, picture, panel=panel)
+    page = make_page(meshcat, solution.mechanism.name, about, recorder.commands)
     try:
         Path(path).write_text(page, encoding="utf-8")
     except OSError as error:
         raise InputError(f"the page cannot be written: {error.strerror}", file=str(path)) from error
 
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>@title@</title>
-<style>
-body { margin: 0; background: #eef0f2; font: 15px system-ui, sans-serif; color: #333; }
-#meshcat-pane { width: 100vw; height: 100vh; overflow: hidden; }
-#bar { position: fixed; left: 0; right: 0; bottom: 0; padding: 10px 18px 12px; gap: 14px;
-  align-items: center; background: rgba(255, 255, 255, 0.75); }
-#bar:not([hidden]) { display: flex; }
-#bar button { font: inherit; width: 5em; padding: 4px 0; cursor: pointer; }
-#bar input { flex: 1; min-width: 0; accent-color: #0072b2; }
-#bar output { min-width: 9em; text-align: right; font-variant-numeric: tabular-nums; }
-</style>
-</head>
-<body>
-<div id="meshcat-pane"></div>
-<div id="bar" hidden><button id="toggle">Pause</button>
-<input id="time" type="range" min="0" step="any" value="0" aria-label="time"><output></output></div>
-<script>@viewer@</script>
-<script>
-var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
-for (const text of @commands@) {
-  const bytes = atob(text), buffer = new Uint8Array(bytes.length);
-  for (let i = 0; i < bytes.length; i++) buffer[i] = bytes.charCodeAt(i);
-  viewer.handle_command_bytearray(buffer);
-}
-// The picture is made for one shape of window: step back in a narrower one.
-const narrow = @aspect@ * window.innerHeight / window.innerWidth;
-if (narrow > 1) viewer.camera.position.multiplyScalar(narrow);
-// A wide slider over meshcat's animator; its own controls remain under "Open Controls".
-const animator = viewer.animator, slider = document.getElementById("time");
-const toggle = document.getElementById("toggle"), clock = document.querySelector("output");
-document.getElementById("bar").hidden = animator.duration === 0;
-slider.max = animator.duration;
-slider.oninput = () => {
-  animator.pause();
-  animator.seek(+slider.value);
-  animator.display_progress(+slider.value);
-};
-toggle.onclick = () => animator.playing ? animator.pause() : animator.play();
-(function show() {
-  slider.value = animator.time;
-  toggle.textContent = animator.playing ? "Pause" : "Play";
-  clock.value = `${animator.time.toFixed(2)} / ${animator.duration.toFixed(2)} s`;
-  requestAnimationFrame(show);
-})();
-</script>
-</body>
-</html>
-"""
-
-
-def _page(meshcat: Any, title: str, commands: list[dict[str, Any]]) -> str:
-    """meshcat's viewer with ``commands``, as one page.
-
-    Unlike meshcat's own ``static_html``, which needs a running server, it applies the commands in
-    order.
-    """
-    import umsgpack  # type: ignore[import-untyped]
-
-    encoded = []
-    for command in commands:
-        # Animations are played in single precision anyway, and are most of the file.
-        precision = "single" if command["type"] == "set_animation" else "double"
-        packed = umsgpack.packb(command, force_float_precision=precision)
-        encoded.append(base64.b64encode(packed).decode("ascii"))
-    root = Path(meshcat.servers.zmqserver.VIEWER_ROOT)
-    parts = {
-        "title": html.escape(title),
-        "viewer": (root / "main.min.js").read_text(encoding="utf-8"),
-        "commands": json.dumps(encoded),
-        "aspect": repr(ASPECT),
-    }
-    page = _PAGE
-    # The last first: what is put in may itself hold marks.
-    for name in reversed(parts):
-        before, after = page.split(f"@{name}@", 1)
-        page = before + parts[name] + after
-    return page
+def _about(solution: Playable, picture: Picture, *, panel: bool) -> dict[str, Any]:
+    about = read_out(solution, picture.motion.times, panel=panel)
+    return about | {"notes": picture.overlays.notes, "aspect": ASPECT}

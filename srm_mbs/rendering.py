@@ -89,7 +89,7 @@ def _photographer(solution: Playable, size: tuple[int, int], fps: float) -> Iter
         )
     with tempfile.TemporaryDirectory() as folder, browser() as chromium:
         file = Path(folder) / "page.html"
-        export_html(solution, file, fps=fps)
+        export_html(solution, file, fps=fps, panel=False)
         page = chromium.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")

@@ -1,26 +1,19 @@
-"""What meshcat is given to draw: the bodies, their motion over a run, the camera and the light.
-
-In the page, ``/mechanism/<joint>`` is the body that the joint moves, ``/mechanism/world`` the
-ground; the transform of ``/mechanism`` itself puts the centre of the picture at the origin, about
-which meshcat's camera turns.
-"""
+"""What there is to draw of a run: the bodies, their motion, what is beside them, and the view."""
 
 from __future__ import annotations
 
 import logging
 import math
-import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
-from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, Visual, visuals_of
+from srm_mbs.overlays import Overlays, Wanted, joints_of, make_overlays, springs_of
+from srm_mbs.visuals import Visual, visuals_of
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
@@ -35,7 +28,6 @@ MIN_FPS = 10.0
 FIELD_OF_VIEW = 25.0  # degrees, vertical: narrow, so that planar mechanisms look planar
 ASPECT = 1.5  # width by height of the window that the picture is made for
 FILLED = 0.84  # of the window
-TOP_COLOUR, BOTTOM_COLOUR = (1.0, 1.0, 1.0), (0.90, 0.92, 0.94)
 SAMPLES = 300  # frames that are looked at to find the camera's place
 
 
@@ -71,7 +63,9 @@ class Motion:
         return float((len(self.times) - 1) / (self.times[-1] - self.times[0]))
 
 
-def sample_motion(solution: Playable, joints: tuple[int, ...], fps: float) -> Motion:
+def sample_motion(
+    solution: Playable, joints: tuple[int, ...], fps: float, others: int = 0
+) -> Motion:
     """Forward kinematics of the dense output at uniform times.
 
     Parameters
@@ -83,16 +77,19 @@ def sample_motion(solution: Playable, joints: tuple[int, ...], fps: float) -> Mo
     fps
         Wanted key frames per second.  There are fewer if otherwise all bodies together had more
         than :data:`MAX_BODY_FRAMES`, but at least :data:`MIN_FPS` or ``fps``, the smaller one.
+    others
+        Number of other things that have as many key frames.
     """
     start, end = solution.span
     duration = end - start
     wanted = duration * fps * (1.0 - 1e-12)  # rounding must not add one to a whole number
-    allowed = max(MAX_BODY_FRAMES // max(1, len(joints)), math.ceil(MIN_FPS * duration))
+    count = max(1, len(joints) + others)
+    allowed = max(MAX_BODY_FRAMES // count, math.ceil(MIN_FPS * duration))
     intervals = math.ceil(min(wanted, allowed))
     if wanted > allowed:
         log.info(
             "%d bodies over %g s: %.3g key frames per second instead of %g",
-            len(joints),
+            count,
             duration,
             intervals / duration,
             fps,
@@ -167,99 +164,53 @@ def _view_direction(mechanism: Mechanism) -> FloatArray:
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-# Drawing ------------------------------------------------------------------------------------
+# The picture ---------------------------------------------------------------------------------
 
 
-def import_meshcat() -> Any:
-    """The meshcat package with the modules that playback uses.
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """All that is drawn of a run.
+
+    Attributes
+    ----------
+    visuals
+        Shapes of the bodies.
+    motion
+        Of the joints that carry them, and of those that the overlays are computed from.
+    overlays
+        What is drawn beside them.
+    view
+        The camera's place.
+    """
+
+    mechanism: Mechanism
+    visuals: list[Visual]
+    motion: Motion
+    overlays: Overlays
+    view: View
+
+
+def make_picture(solution: Playable, fps: float, wanted: Wanted) -> Picture:
+    """Key frames of everything that is drawn of ``solution``.
+
+    ``fps`` is the wanted number of key frames per second (:func:`sample_motion`).
 
     Raises
     ------
     InputError
-        If it is not installed.
-    """
-    try:
-        with warnings.catch_warnings():
-            # Its imports are not the reader's to mend: it takes a deprecated module of pyzmq.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            import meshcat
-            import meshcat.animation
-            import meshcat.geometry
-            import meshcat.path
-            import meshcat.servers.zmqserver
-    except ImportError as error:
-        raise InputError(
-            f"playback needs meshcat, which cannot be imported: {error}",
-            remedy="Install it: pip install meshcat",
-        ) from error
-    return meshcat
-
-
-def _node_names(mechanism: Mechanism) -> list[str]:
-    """Name in the page of the ground and of each joint's body, unique and without slashes."""
-    names: list[str] = []
-    for name in (WORLD, *mechanism.joint_names):
-        plain = name.replace("/", "_") or "_"
-        while plain in names:
-            plain += "_"
-        names.append(plain)
-    return names
-
-
-def _geometry(meshcat: Any, visual: Visual) -> tuple[Any, FloatArray]:
-    """meshcat's geometry of a shape, and its homogeneous placement (4, 4) in the joint frame."""
-    shapes = meshcat.geometry
-    placement = np.array(visual.placement.homogeneous)
-    match visual.shape:
-        case Box(size):
-            return shapes.Box(list(size)), placement
-        case Sphere(radius):
-            return shapes.Sphere(radius), placement
-        case Cylinder(radius, length):
-            # Its axis is z in URDF and y in three.js.
-            turn = pin.SE3(pin.rpy.rpyToMatrix(0.5 * np.pi, 0.0, 0.0), np.zeros(3))
-            return shapes.Cylinder(length, radius), placement @ turn.homogeneous
-        case Mesh(vertices, faces):
-            return shapes.TriangularMeshGeometry(vertices, faces), placement
-
-
-def _material(meshcat: Any, visual: Visual) -> Any:
-    red, green, blue, opacity = visual.colour
-    number = sum(round(255.0 * c) << s for c, s in ((red, 16), (green, 8), (blue, 0)))
-    return meshcat.geometry.MeshPhongMaterial(
-        color=number, opacity=opacity, shininess=20.0, flatShading=isinstance(visual.shape, Mesh)
-    )
-
-
-def draw_scene(meshcat: Any, scene: Any, solution: Playable, fps: float) -> None:
-    """Send the whole scene, the motion included, to ``scene``, a meshcat Visualizer.
-
-    ``fps`` is the wanted number of key frames per second (:func:`sample_motion`).
+        If what is ``wanted`` cannot be drawn.
     """
     mechanism = solution.mechanism
     visuals = visuals_of(mechanism)
-    names = _node_names(mechanism)
-    joints = tuple(sorted({visual.joint for visual in visuals} - {0}))
-    motion = sample_motion(solution, joints, fps)
-    view = choose_view(mechanism, seen_points(visuals, motion))
-    _light(scene, view)
-
-    root = scene["/mechanism"]
-    shift = np.eye(4)
-    shift[:3, 3] = -view.target
-    root.set_transform(shift)
-    for k, joint in enumerate(joints):
-        start = pin.XYZQUATToSE3(np.concatenate([motion.positions[0, k], motion.quaternions[0, k]]))
-        root[names[joint]].set_transform(start.homogeneous)
-    for number, visual in enumerate(visuals):
-        node = root[f"{names[visual.joint]}/shape_{number}"]
-        geometry, placement = _geometry(meshcat, visual)
-        node.set_object(geometry, _material(meshcat, visual))
-        node.set_transform(placement)
-    animation = _animation(meshcat, motion, [f"/mechanism/{names[j]}" for j in joints])
-    if animation.clips:
-        # For ever: a page that is looked at late still moves; "pause" stops it.
-        scene.set_animation(animation, play=True, repetitions=math.inf)
+    joints = {visual.joint for visual in visuals} - {0} | joints_of(mechanism, wanted)
+    loops = len(mechanism.loops) * (2 * wanted.gaps + 2 * wanted.reactions)
+    others = 2 * len(springs_of(mechanism)) + len(wanted.trace) + loops
+    motion = sample_motion(solution, tuple(sorted(joints)), fps, others)
+    points = seen_points(visuals, motion)
+    extent = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
+    overlays = make_overlays(solution, wanted, motion, extent)
+    view = choose_view(mechanism, np.concatenate([points, overlays.points()]))
+    return Picture(mechanism, visuals, motion, overlays, view)
 
 
 def seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
@@ -276,50 +227,3 @@ def seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
             rotation = pin.Quaternion(motion.quaternions[i, k]).matrix()
             points.append(together @ rotation.T + motion.positions[i, k])
     return np.concatenate(points)
-
-
-def _light(scene: Any, view: View) -> None:
-    """Background, lights and camera."""
-    scene["/Background"].set_property("top_color", list(TOP_COLOUR))
-    scene["/Background"].set_property("bottom_color", list(BOTTOM_COLOUR))
-    scene["/Axes"].set_property("visible", False)
-    scene["/Grid"].set_property("visible", False)
-    # Two lamps on the camera's side, to the left above and to the right, and a faint one behind.
-    lamps = {
-        "PointLightNegativeX": ((-0.6, 0.9, -1.0), 0.55),
-        "PointLightPositiveX": ((1.0, 0.3, -0.5), 0.25),
-        "FillLight": ((0.0, 1.0, 1.0), 0.2),
-        "AmbientLight": ((0.0, 0.0, 0.0), 0.55),
-    }
-    for name, (position, intensity) in lamps.items():
-        lamp = scene[f"/Lights/{name}/<object>"]
-        lamp.set_property("intensity", intensity)
-        lamp.set_property("distance", 0.0)  # it does not fade with the distance
-        lamp.set_property("position", (view.distance * np.array(position) @ view.axes).tolist())
-    camera = scene["/Cameras/default/rotated/<object>"]
-    camera.set_property("fov", FIELD_OF_VIEW)
-    camera.set_property("near", 0.02 * view.distance)
-    camera.set_property("far", 50.0 * view.distance)
-    # Cameras live in three.js's own axes, y up.
-    x, y, z = (-view.distance * view.axes[2]).tolist()
-    camera.set_property("position", [x, z, -y])
-
-
-def _animation(meshcat: Any, motion: Motion, paths: list[str]) -> Any:
-    """meshcat's animation: one clip per body that moves."""
-    animation = meshcat.animation.Animation(default_framerate=motion.rate)
-    for k, path in enumerate(paths):
-        tracks = {}
-        for name, kind, values in (
-            ("position", "vector3", motion.positions[:, k]),
-            ("quaternion", "quaternion", motion.quaternions[:, k]),
-        ):
-            # What stays is said once: the pivot of a crank, the direction of a slider.
-            count = len(values) if np.ptp(values, axis=0).max() > 1e-12 else 1
-            tracks[name] = meshcat.animation.AnimationTrack(
-                name, kind, list(range(count)), values[:count].tolist()
-            )
-        if any(len(track.frames) > 1 for track in tracks.values()):
-            clip = meshcat.animation.AnimationClip(tracks, fps=motion.rate)
-            animation.clips[meshcat.path.Path().append(path)] = clip
-    return animation

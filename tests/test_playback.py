@@ -389,13 +389,12 @@ def test_a_page_that_cannot_be_written_is_an_input_error(
 
 
 def test_a_server_that_does_not_start_is_an_input_error(
-    spatial_four_bar: srm.Solution, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, spatial_four_bar: srm.Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(**_: Any) -> None:
-        print("address already in use")  # noqa: T201
-        raise RuntimeError("exit code 1")
-
-    monkeypatch.setattr("meshcat.visualizer.start_zmq_server_as_subprocess", fail)
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho 'address already in use' >&2\nexit 1\n")
+    python.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(python))
     with pytest.raises(srm.InputError, match=r"cannot start .*exit code 1.*already in use") as info:
         play(spatial_four_bar, open_browser=False, block=False)
     assert "export_html" in str(info.value)

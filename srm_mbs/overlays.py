@@ -46,6 +46,7 @@ LARGEST_GAP = 0.1
 """Part of the picture's extent that the largest gap may take."""
 HIGH = 98.0
 """Percentile of the reactions at the end of the colours: near singular passages they have peaks."""
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 TURNS, AROUND, SECTION = 7, 12, 5
 """Of a coil: turns, points around one, corners of the wire."""
 
@@ -326,7 +327,8 @@ def _add_gaps(out: Overlays, solution: Playable, motion: Motion, extent: float) 
     if not largest > 0.0:
         out.notes.append({"text": "the closures have no gaps"})
         return
-    factor = 10.0 ** np.floor(np.log10(LARGEST_GAP * extent / largest))
+    power = int(np.floor(np.log10(LARGEST_GAP * extent / largest)))
+    factor = 10.0**power
     for number, (start, gap) in enumerate(gaps.values()):
         bar = Cylinder(0.006 * extent, 1.0)
         middle = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
@@ -334,8 +336,8 @@ def _add_gaps(out: Overlays, solution: Playable, motion: Motion, extent: float) 
         out.moving.append(_stretched(f"gap_{number}", parts, start, factor * gap))
     out.notes.append(
         {
-            "text": f"gaps of the closures, at most {largest:.2g} m, drawn {factor:.0e} times "
-            "as large"
+            "text": f"gaps of the closures, at most {largest:.1e} m, drawn 10"
+            f"{str(power).translate(SUPERSCRIPTS)} times as large"
         }
     )
 
@@ -364,7 +366,7 @@ def _add_reactions(out: Overlays, solution: Playable, motion: Motion, extent: fl
     for number, loop in enumerate(loop for loop in mechanism.loops if loop.name in sizes):
         path = path_of(motion, *loop.resolve(mechanism.model)[0])
         colours = ramp_colours(sizes[loop.name] / top if top else 0.0 * sizes[loop.name])
-        ball = Sphere(0.02 * extent)
+        ball = Sphere(0.014 * extent)
         parts = ((ball, pin.SE3.Identity(), (*RAMP[0], 1.0)),)
         name = f"closure_{number}"
         out.moving.append(Moving(name, parts, path, _no_turn(len(path)), colours=colours))

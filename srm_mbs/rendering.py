@@ -78,7 +78,9 @@ def browser() -> Iterator[Any]:
 
 
 @contextmanager
-def _photographer(solution: Playable, size: tuple[int, int], fps: float) -> Iterator[Any]:
+def _photographer(
+    solution: Playable, size: tuple[int, int], fps: float, drawn: dict[str, Any]
+) -> Iterator[Any]:
     """A function from a time of the run (s) to a PNG."""
     width, height = size
     if not (isinstance(width, int) and isinstance(height, int) and min(size) > 0):
@@ -89,7 +91,7 @@ def _photographer(solution: Playable, size: tuple[int, int], fps: float) -> Iter
         )
     with tempfile.TemporaryDirectory() as folder, browser() as chromium:
         file = Path(folder) / "page.html"
-        export_html(solution, file, fps=fps, panel=False)
+        export_html(solution, file, fps=fps, panel=False, **drawn)
         page = chromium.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
@@ -117,6 +119,7 @@ def export_image(
     *,
     t: float | None = None,
     size: tuple[int, int] = SIZE,
+    **drawn: Any,
 ) -> None:
     """Write a picture of a run at one time.
 
@@ -130,6 +133,8 @@ def export_image(
         Time (s) in the run; its end by default.
     size
         Width and height in pixels.
+    drawn
+        ``trace``, ``gaps`` and ``reactions`` of :func:`srm_mbs.playback.export_html`.
 
     Raises
     ------
@@ -150,7 +155,7 @@ def export_image(
             element="t",
             remedy="Give a time of the run",
         )
-    with _photographer(solution, size, 60.0) as photograph:
+    with _photographer(solution, size, 60.0, drawn) as photograph:
         _written(path, photograph(t))
 
 
@@ -161,6 +166,7 @@ def export_video(
     fps: float = 25.0,
     speed: float = 1.0,
     size: tuple[int, int] = (720, 480),
+    **drawn: Any,
 ) -> None:
     """Write a film of a run.
 
@@ -177,6 +183,8 @@ def export_video(
         Seconds of the run per second of film.
     size
         Width and height in pixels.
+    drawn
+        ``trace``, ``gaps`` and ``reactions`` of :func:`srm_mbs.playback.export_html`.
 
     Raises
     ------
@@ -203,7 +211,7 @@ def export_video(
     start, end = solution.span
     count = max(1, math.floor((end - start) / speed * fps * (1.0 + 1e-12)) + 1)
     times = start + np.arange(count) * (speed / fps)
-    with _photographer(solution, size, fps / min(speed, 1.0)) as photograph:
+    with _photographer(solution, size, fps / min(speed, 1.0), drawn) as photograph:
         pictures = [photograph(min(float(t), end)) for t in times]
     if kind == ".gif":
         _written(path, _gif(pictures, fps))

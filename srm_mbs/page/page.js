@@ -26,7 +26,7 @@ function add_row(label, unit) {
   for (const text of [label, "", unit]) row.insertCell().textContent = text;
   cells.push(row.cells[1]);
 }
-add_row("t", "s");
+if (about.panel) add_row("t", "s");
 for (const value of about.values) add_row(value.label, value.unit);
 for (const note of about.notes) {
   const text = element("notes").appendChild(document.createElement("div"));
@@ -39,7 +39,7 @@ for (const note of about.notes) {
   ends.className = "ends";
   for (const end of note.ends) ends.appendChild(document.createElement("span")).textContent = end;
 }
-element("panel").hidden = !about.panel;
+element("panel").hidden = !about.panel && !about.notes.length;
 
 function value_at(samples, time) {
   const times = about.times;
@@ -109,7 +109,7 @@ function lay_out() {
   element("toggle").textContent = animator.playing ? "Pause" : "Play";
   clock.value = `${animator.time.toFixed(2)} / ${animator.duration.toFixed(2)} s`;
   const time = about.start + animator.time;
-  cells[0].textContent = time.toFixed(3);
+  if (about.panel) cells[0].textContent = time.toFixed(3);
   about.values.forEach((value, i) => {
     cells[i + 1].textContent = shown(value_at(value.samples, time));
   });

@@ -40,7 +40,7 @@ def make_page(
         "viewer": (root / "main.min.js").read_text(encoding="utf-8"),
         "commands": json.dumps(None if commands is None else _packed(commands)),
         # Names are the user's: they must not end the script.
-        "about": json.dumps(about, allow_nan=False).replace("</", "<\\/"),
+        "about": json.dumps(about, allow_nan=False).replace("<", "\\u003c"),
         "script": (FOLDER / "page.js").read_text(encoding="utf-8"),
     }
     page = (FOLDER / "page.html").read_text(encoding="utf-8")

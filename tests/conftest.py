@@ -1,12 +1,16 @@
-"""Shared fixtures: reference data."""
+"""Shared fixtures: reference data, a browser."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+import srm_mbs as srm
+from srm_mbs.rendering import browser as headless_browser
 
 DATA = Path(__file__).parent / "data"
 
@@ -16,3 +20,13 @@ def exact() -> dict[str, Any]:
     """High-accuracy solutions (40-digit Taylor series, elliptic functions), as decimal strings."""
     data: dict[str, Any] = json.loads((DATA / "exact_solutions.json").read_text())
     return data
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    try:
+        with headless_browser() as launched:
+            yield launched
+    except srm.InputError as error:
+        pytest.skip(str(error))

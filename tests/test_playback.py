@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import logging
 import subprocess
@@ -17,9 +16,9 @@ import pytest
 import srm_mbs as srm
 from srm_mbs import scene
 from srm_mbs.playback import close, export_html, play
-from srm_mbs.rendering import browser as headless_browser
 from srm_mbs.scene import choose_view, sample_motion
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, visuals_of
+from tests.browsing import opened
 
 MEGABYTE = 1e6
 
@@ -437,43 +436,6 @@ def test_play_serves_until_it_is_interrupted_and_leaves_nothing_behind(
 
 
 # In the browser
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    try:
-        with headless_browser() as launched:
-            yield launched
-    except srm.InputError as error:
-        pytest.skip(str(error))
-
-
-@contextlib.contextmanager
-def opened(browser: Any, address: str) -> Iterator[Any]:
-    """The loaded page; whatever it complains about, or asks the network for, is an error."""
-    context = browser.new_context(viewport={"width": 900, "height": 600})
-    page = context.new_page()
-    complaints: list[str] = []
-
-    def complain(kind: str, text: str, location: dict[str, Any]) -> None:
-        if kind == "error" and not location["url"].endswith("favicon.ico"):  # meshcat serves none
-            complaints.append(text)
-
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on("console", lambda message: complain(message.type, message.text, message.location))
-    allowed = ("file:", "data:", "blob:", address)
-    page.on(
-        "request",
-        lambda request: request.url.startswith(allowed) or complaints.append(request.url),
-    )
-    if address.startswith("file:"):
-        context.set_offline(True)
-    page.goto(address)
-    page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
-    yield page
-    context.close()
-    assert complaints == []
 
 
 @pytest.fixture(scope="module")

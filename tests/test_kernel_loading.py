@@ -135,7 +135,7 @@ def test_a_kernel_built_before_its_sources_changed_is_refused_before_it_is_loade
     change(checkout)
     assert load(checkout) == (
         None,
-        "it was built from other sources; install again: pip install -e .",
+        "it was built from other sources (install again: pip install -e .)",
     )
     assert imported["seen"] == [BUILT]
 

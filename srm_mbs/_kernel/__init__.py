@@ -16,7 +16,7 @@ INSTALL_AGAIN = (
     "install srm-mbs again from its source: "
     "pip install --force-reinstall --no-deps --no-cache-dir <folder or address of srm-mbs>"
 )
-OUTDATED = "it was built from other sources; install again: pip install -e ."
+OUTDATED = "it was built from other sources (install again: pip install -e .)"
 """``missing`` of a checkout whose sources have changed since the kernel was built."""
 
 

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from srm_mbs.anchors import Anchor
     from srm_mbs.assembly import Assembly, assemble
     from srm_mbs.closures import CLOSURE_TYPES
-    from srm_mbs.dae import DaeSolution, solve_dae
+    from srm_mbs.dae import solve_dae
+    from srm_mbs.dae_solution import DaeSolution
     from srm_mbs.drives import Drive
     from srm_mbs.errors import (
         AnalysisError,
@@ -74,7 +75,7 @@ _HOME = {
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
     "ConstantSpeed": "laws",
-    "DaeSolution": "dae",
+    "DaeSolution": "dae_solution",
     "Drive": "drives",
     "EnergyBalance": "analysis.energy_balance",
     "Equilibrium": "analysis.equilibrium",

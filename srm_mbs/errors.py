@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from srm_mbs.dae import DaeSolution
+    from srm_mbs.dae_solution import DaeSolution
     from srm_mbs.solution import Solution
 
 

@@ -24,7 +24,7 @@ LAYERS = (
     ("stepping",),
     ("closing", "compiled", "driven_start", "kernel"),
     ("closing_failure", "continuation", "joint_limits"),
-    ("assembly", "motion", "segmented", "solution"),
+    ("assembly", "consistent_rates", "dae_solution", "motion", "segmented", "solution"),
     ("loading",),
     ("segment_storage", "storage"),
     ("options", "progress"),

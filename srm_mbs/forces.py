@@ -7,68 +7,21 @@ Torques and wrenches may follow a law over time (:mod:`srm_mbs.laws`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.anchors import Anchor, finite_numbers, resolve_apart
+from srm_mbs.anchors import Anchor, resolve_apart
 from srm_mbs.errors import InputError
+from srm_mbs.force_checks import fault, in_unit, moving_joint, take, take_law, take_name, take_rates
 from srm_mbs.force_element import ForceElement
 from srm_mbs.laws import Law
 
 OPEN = 1e30
 """Limits (rad, m) beyond this are none; Pinocchio has the largest number there."""
-
-
-def _in(unit: str, default: Any) -> Any:
-    """A field with a unit, for tables."""
-    return field(default=default, metadata={"unit": unit})
-
-
-def _fault(force: ForceElement, problem: str, remedy: str) -> InputError:
-    return InputError(problem, element=f"force {force.name!r}", remedy=remedy)
-
-
-def _take_name(force: ForceElement, *places: str) -> None:
-    """The default name, if none is given."""
-    if not force.name:
-        object.__setattr__(force, "name", "_".join((force.type, *places)))
-
-
-def _take(force: ForceElement, key: str, count: int = 0, lowest: float = -np.inf) -> Any:
-    """Check a number, or ``count`` numbers, of ``force`` and store them as float or tuple."""
-    given = getattr(force, key)
-    remedy = f"Give a list of {count} finite numbers" if count else "Give a finite number"
-    try:
-        numbers = finite_numbers(given if count else (given,), count or 1, key, remedy)
-    except InputError as error:
-        raise _fault(force, f"{key} = {given!r} cannot be", remedy) from error
-    if min(numbers) < lowest:
-        raise _fault(force, f"{key} = {given!r} is negative", "Give a value >= 0")
-    value = numbers if count else numbers[0]
-    object.__setattr__(force, key, value)
-    return value
-
-
-def _take_rates(force: ForceElement, count: int = 0) -> None:
-    """Check stiffness and damping: not negative, not both zero."""
-    given = [_take(force, key, count, 0.0) for key in ("stiffness", "damping")]
-    if not np.any(given):
-        raise _fault(
-            force, "stiffness and damping are zero", "Give one of them, or remove the element"
-        )
-
-
-def _joint(force: ForceElement, model: pin.Model, name: str) -> Any:
-    names = list(model.names)[1:]
-    if name not in names:
-        raise _fault(
-            force, f"there is no moving joint {name!r}", f"Known: {', '.join(names) or 'none'}"
-        )
-    return model.joints[model.getJointId(name)]
 
 
 @dataclass(frozen=True)
@@ -103,38 +56,24 @@ class SpringDamper(ForceElement):
     has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
-    stiffness: float = _in("N/m", 0.0)
-    damping: float = _in("N s/m", 0.0)
-    rest_length: float | None = _in("m", None)
+    stiffness: float = in_unit("N/m", 0.0)
+    damping: float = in_unit("N s/m", 0.0)
+    rest_length: float | None = in_unit("m", None)
     name: str = ""
 
     def __post_init__(self) -> None:
-        _take_name(self, self.a.where, self.b.where)
-        _take_rates(self)
+        take_name(self, self.a.where, self.b.where)
+        take_rates(self)
         if self.rest_length is None:
             if self.stiffness:
-                raise _fault(
+                raise fault(
                     self, "a spring needs a rest_length", "Give the length without force, in m"
                 )
             object.__setattr__(self, "rest_length", 0.0)
-        _take(self, "rest_length", 0, 0.0)
+        take(self, "rest_length", 0, 0.0)
 
     def check(self, model: pin.Model) -> None:
         resolve_apart(model, self.a, self.b, f"force {self.name!r}")
-
-
-def _take_law(force: ForceElement, count: int) -> bool:
-    """Check the law of ``force``, one or ``count`` of them; whether there is any."""
-    law = getattr(force, "law")  # noqa: B009 - the fields of subclasses
-    if law is None:
-        return False
-    laws = tuple(law) if isinstance(law, list | tuple) else (law,)
-    if len(laws) not in (1, count) or not all(isinstance(each, Law) for each in laws):
-        raise _fault(
-            force, "law is not a law", f"Give srm.Sine(...) or alike, or a list of {count} of them"
-        )
-    object.__setattr__(force, "law", laws[0] if len(laws) == 1 else laws)
-    return True
 
 
 @dataclass(frozen=True)
@@ -161,23 +100,23 @@ class JointTorque(ForceElement):
 
     type: ClassVar[str] = "torque"
     joint: str
-    torque: float | tuple[float, ...] | None = _in("N m, N", None)
+    torque: float | tuple[float, ...] | None = in_unit("N m, N", None)
     name: str = ""
     law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
-        _take_name(self, self.joint)
+        take_name(self, self.joint)
         given: Any = self.torque
-        follows = _take_law(self, max(1, np.size(given)))
+        follows = take_law(self, max(1, np.size(given)))
         if given is None:
             object.__setattr__(self, "torque", 1.0 if follows else 0.0)
-        _take(self, "torque", np.size(given) if np.ndim(given) else 0)
+        take(self, "torque", np.size(given) if np.ndim(given) else 0)
 
     def check(self, model: pin.Model) -> None:
-        joint = _joint(self, model, self.joint)
+        joint = moving_joint(self, model, self.joint)
         numbers: Any = self.torque
         if np.size(numbers) != joint.nv:
-            raise _fault(
+            raise fault(
                 self,
                 f"torque = {self.torque!r} does not fit the {joint.nv} degrees of freedom of "
                 f"joint {self.joint!r}",
@@ -210,26 +149,26 @@ class TorsionSpring(ForceElement):
     type: ClassVar[str] = "torsion_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = _in("N m/rad, N/m", 0.0)
-    damping: float = _in("N m s/rad, N s/m", 0.0)
-    rest_angle: float = _in("rad, m", 0.0)
+    stiffness: float = in_unit("N m/rad, N/m", 0.0)
+    damping: float = in_unit("N m s/rad, N s/m", 0.0)
+    rest_angle: float = in_unit("rad, m", 0.0)
     name: str = ""
 
     def __post_init__(self) -> None:
-        _take_name(self, self.joint)
-        _take_rates(self)
-        _take(self, "rest_angle")
+        take_name(self, self.joint)
+        take_rates(self)
+        take(self, "rest_angle")
 
     def check(self, model: pin.Model) -> None:
-        joint = _joint(self, model, self.joint)
+        joint = moving_joint(self, model, self.joint)
         if joint.nv != 1:
-            raise _fault(
+            raise fault(
                 self,
                 f"joint {self.joint!r} has {joint.nv} degrees of freedom",
                 "Use a bushing between its links",
             )
         if joint.nq != 1 and self.stiffness:
-            raise _fault(
+            raise fault(
                 self,
                 f"the angle of the continuous joint {self.joint!r} does not count turns",
                 'Make the joint "revolute" in the URDF, with wide limits: they do not act',
@@ -262,24 +201,24 @@ class Wrench(ForceElement):
 
     type: ClassVar[str] = "wrench"
     at: Anchor
-    force: tuple[float, float, float] = _in("N", (0.0, 0.0, 0.0))
-    moment: tuple[float, float, float] = _in("N m", (0.0, 0.0, 0.0))
+    force: tuple[float, float, float] = in_unit("N", (0.0, 0.0, 0.0))
+    moment: tuple[float, float, float] = in_unit("N m", (0.0, 0.0, 0.0))
     frame: Literal["world", "link"] = "world"
     name: str = ""
     law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
-        _take_name(self, self.at.where)
-        several = _take_law(self, 6) and not isinstance(self.law, Law)
+        take_name(self, self.at.where)
+        several = take_law(self, 6) and not isinstance(self.law, Law)
         if several and not np.any([self.force, self.moment]):
             object.__setattr__(self, "force", (1.0, 1.0, 1.0))
             object.__setattr__(self, "moment", (1.0, 1.0, 1.0))
-        if not np.any([_take(self, "force", 3), _take(self, "moment", 3)]):
-            raise _fault(
+        if not np.any([take(self, "force", 3), take(self, "moment", 3)]):
+            raise fault(
                 self, "force and moment are zero", "Give one of them, or remove the element"
             )
         if self.frame not in ("world", "link"):
-            raise _fault(self, f"there is no frame {self.frame!r}", 'Give "world" or "link"')
+            raise fault(self, f"there is no frame {self.frame!r}", 'Give "world" or "link"')
 
     def check(self, model: pin.Model) -> None:
         try:
@@ -288,7 +227,7 @@ class Wrench(ForceElement):
             error.element = f"force {self.name!r}, anchor at"
             raise
         if joint == 0:
-            raise _fault(
+            raise fault(
                 self, f"{self.at.where!r} does not move", "Let the wrench act on a moving link"
             )
 
@@ -323,13 +262,13 @@ class Bushing(ForceElement):
     has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
-    stiffness: Sequence[float] = _in("N/m, N m/rad", (0.0,) * 6)
-    damping: Sequence[float] = _in("N s/m, N m s/rad", (0.0,) * 6)
+    stiffness: Sequence[float] = in_unit("N/m, N m/rad", (0.0,) * 6)
+    damping: Sequence[float] = in_unit("N s/m, N m s/rad", (0.0,) * 6)
     name: str = ""
 
     def __post_init__(self) -> None:
-        _take_name(self, self.a.where, self.b.where)
-        _take_rates(self, 6)
+        take_name(self, self.a.where, self.b.where)
+        take_rates(self, 6)
 
     def check(self, model: pin.Model) -> None:
         resolve_apart(model, self.a, self.b, f"force {self.name!r}")
@@ -365,27 +304,27 @@ class LimitSpring(ForceElement):
     type: ClassVar[str] = "limit_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = _in("N m/rad, N/m", 0.0)
-    damping: float = _in("N m s/rad, N s/m", 0.0)
-    lower: float | None = _in("rad, m", None)
-    upper: float | None = _in("rad, m", None)
-    depth: float | None = _in("rad, m", None)
+    stiffness: float = in_unit("N m/rad, N/m", 0.0)
+    damping: float = in_unit("N m s/rad, N s/m", 0.0)
+    lower: float | None = in_unit("rad, m", None)
+    upper: float | None = in_unit("rad, m", None)
+    depth: float | None = in_unit("rad, m", None)
     name: str = ""
 
     def __post_init__(self) -> None:
-        _take_name(self, self.joint)
-        _take(self, "damping", 0, 0.0)
-        if not _take(self, "stiffness", 0, 0.0) > 0.0:
-            raise _fault(self, "a limit needs a stiffness", "Give a positive stiffness")
+        take_name(self, self.joint)
+        take(self, "damping", 0, 0.0)
+        if not take(self, "stiffness", 0, 0.0) > 0.0:
+            raise fault(self, "a limit needs a stiffness", "Give a positive stiffness")
         for key in ("lower", "upper", "depth"):
             if getattr(self, key) is not None:
-                _take(self, key)
+                take(self, key)
         if self.depth is not None and not self.depth > 0.0:
-            raise _fault(self, f"depth = {self.depth:g} is not positive", "Give a positive depth")
+            raise fault(self, f"depth = {self.depth:g} is not positive", "Give a positive depth")
 
     def resolved(self, model: pin.Model) -> tuple[float, float, float]:
         """Lower and upper limit, infinite where open, and depth."""
-        joint = _joint(self, model, self.joint)
+        joint = moving_joint(self, model, self.joint)
         low = float(model.lowerPositionLimit[joint.idx_q]) if self.lower is None else self.lower
         high = float(model.upperPositionLimit[joint.idx_q]) if self.upper is None else self.upper
         low, high = (x if abs(x) < OPEN else float(np.copysign(np.inf, x)) for x in (low, high))
@@ -393,16 +332,16 @@ class LimitSpring(ForceElement):
         return low, high, 0.01 * width if self.depth is None else self.depth
 
     def check(self, model: pin.Model) -> None:
-        joint = _joint(self, model, self.joint)
+        joint = moving_joint(self, model, self.joint)
         if not joint.nq == joint.nv == 1:
-            raise _fault(
+            raise fault(
                 self,
                 f"the position of joint {self.joint!r} is not one number",
                 "Limits are for revolute and prismatic joints",
             )
         low, high, _ = self.resolved(model)
         if not low < high or not np.isfinite([low, high]).any():
-            raise _fault(
+            raise fault(
                 self,
                 f"joint {self.joint!r} has no limits ({low:g} to {high:g})",
                 "Give lower or upper, or limits in the model",

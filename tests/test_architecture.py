@@ -17,7 +17,7 @@ PACKAGE = Path(srm_mbs.__file__).parent
 LAYERS = (
     ("_kernel", "arrays", "derivations", "errors", "provenance", "records", "semi_explicit"),
     ("anchors", "closures", "csv_tables", "force_element", "laws"),
-    ("loop_closure", "mechanism_checks", "time_dependence"),
+    ("force_checks", "loop_closure", "mechanism_checks", "time_dependence"),
     ("mechanism",),
     ("coordinates", "drives", "pinocchio_constraints", "forces", "user_forces", "systems"),
     ("methods",),

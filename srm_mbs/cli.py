@@ -11,11 +11,10 @@ import os
 import re
 import subprocess
 import sys
-from contextlib import suppress
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 # Before NumPy is loaded: on matrices of this size the threads of BLAS cost many times their work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,21 +22,30 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 import srm_mbs
-from srm_mbs import cli_analysis
+from srm_mbs import cli_analysis, cli_playback
 from srm_mbs.cli_output import (
     BAD_INPUT,
     RUN_FAILED,
     Lines,
     Model,
+    Run,
     check_output,
     reported,
     table,
     write_files,
 )
+from srm_mbs.cli_playback import (
+    At,
+    Gaps,
+    Image,
+    Reactions,
+    Trace,
+    Video,
+    check_pictures,
+    drawn,
+    play_run,
+)
 from srm_mbs.errors import InputError
-
-if TYPE_CHECKING:
-    from srm_mbs.solution import Solution
 
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
@@ -52,21 +60,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-
-Run = Annotated[
-    Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
-]
-Image = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.png", help="Write a picture of the run, at its end or --at S."),
-]
-At = Annotated[
-    float | None, typer.Option("--at", metavar="S", help="Time of the picture in the run (s).")
-]
-Video = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Write a film of the run; the suffix is .gif or .mp4."),
-]
 
 
 def _print_version(wanted: bool) -> None:
@@ -157,6 +150,9 @@ def simulate(
     image: Image = None,
     at: At = None,
     video: Video = None,
+    trace: Trace = None,
+    gaps: Gaps = False,
+    reactions: Reactions = False,
     balance: Annotated[
         bool, typer.Option("--balance", help="Print the energy balance of the run.")
     ] = False,
@@ -179,9 +175,10 @@ def simulate(
         check_output(csv, "--csv", (".csv",))
     if html is not None:
         check_output(html, "--html", (".html", ".htm"))
-    _check_pictures(image, video)
+    check_pictures(image, video)
 
     mechanism = srm_mbs.load(model)
+    shown = drawn(mechanism, trace, gaps, reactions)
     defaults = mechanism.defaults
     solution = srm_mbs.simulate(
         mechanism,
@@ -199,9 +196,9 @@ def simulate(
             (out, solution.save),
             (plot, solution.plot),
             (csv, solution.to_csv),
-            (html, solution.export_html),
-            (image, partial(solution.export_image, t=at)),
-            (video, solution.export_video),
+            (html, partial(solution.export_html, **shown)),
+            (image, partial(solution.export_image, t=at, **shown)),
+            (video, partial(solution.export_video, **shown)),
         ]
     )
     table([*run_rows(solution), *(("written", str(path)) for path in written)])
@@ -211,20 +208,11 @@ def simulate(
         table(balance_rows(solution.energy_balance))
     typer.echo(solution.message, err=not solution.success)
     if play:
-        _play(solution)
+        play_run(solution, shown)
     if failed:
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
         raise typer.Exit(RUN_FAILED)
-
-
-def _check_pictures(image: Path | None, video: Path | None) -> None:
-    from srm_mbs.rendering import FILMS
-
-    if image is not None:
-        check_output(image, "--image", (".png",))
-    if video is not None:
-        check_output(video, "--video", FILMS)
 
 
 def _first(*values: float | None) -> float:
@@ -308,30 +296,7 @@ def _first_sentence(path: Path) -> str:
     return re.split(r"(?<!\b[A-Z])\.(?:\s|$)", text, maxsplit=1)[0]
 
 
-@app.command()
-@reported()
-def play(run: Run, image: Image = None, at: At = None, video: Video = None) -> None:
-    """Play a saved run in the browser; with --image or --video, write these instead."""
-    _check_pictures(image, video)
-    solution = srm_mbs.load_solution(run)
-    if image is None and video is None:
-        _play(solution)
-        return
-    written, failed = write_files(
-        [(image, partial(solution.export_image, t=at)), (video, solution.export_video)]
-    )
-    for path in written:
-        typer.echo(f"written: {path}")
-    if failed:
-        raise typer.Exit(BAD_INPUT)
-
-
-def _play(solution: Solution) -> None:
-    # Its messages are few, and one of them is the address of the page.
-    logging.getLogger("srm_mbs.playback").setLevel(logging.INFO)
-    typer.echo("Ctrl-C ends the playback.", err=True)
-    with suppress(KeyboardInterrupt):  # while the page is being made; later, play() takes it
-        solution.play()
+app.command()(cli_playback.play)
 
 
 @app.command()

@@ -16,6 +16,9 @@ import typer
 from srm_mbs.errors import InputError, SrmError, SrmWarning
 
 RUN_FAILED, BAD_INPUT = 1, 2
+Run = Annotated[
+    Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
+]
 Model = Annotated[
     str,
     typer.Argument(

@@ -102,6 +102,22 @@ class Wanted:
     gaps: bool = False
     reactions: bool = False
 
+    def check(self, mechanism: Mechanism) -> None:
+        """Refuse what ``mechanism`` has not.
+
+        Raises
+        ------
+        InputError
+            As :meth:`anchors`, or if reactions are wanted and no closure has anchors.
+        """
+        self.anchors(mechanism)
+        if self.reactions and not any(loop.anchors for loop in mechanism.loops):
+            raise InputError(
+                "the mechanism has no closures with reactions",
+                element="reactions",
+                remedy="Leave the option away",
+            )
+
     def anchors(self, mechanism: Mechanism) -> list[tuple[int, pin.SE3]]:
         """Joint and placement of the traced points.
 
@@ -354,12 +370,6 @@ def _add_reactions(out: Overlays, solution: Playable, motion: Motion, extent: fl
         name: np.linalg.norm(wrench[:, :3], axis=1)
         for name, wrench in solution.at(motion.times).reactions.items()
     }
-    if not sizes:
-        raise InputError(
-            "the mechanism has no closures with reactions",
-            element="reactions",
-            remedy="Leave the option away",
-        )
     together = np.concatenate(list(sizes.values()))
     together = together[np.isfinite(together)]
     top = float(np.percentile(together, HIGH)) if len(together) else 0.0

@@ -201,6 +201,7 @@ def make_picture(solution: Playable, fps: float, wanted: Wanted) -> Picture:
         If what is ``wanted`` cannot be drawn.
     """
     mechanism = solution.mechanism
+    wanted.check(mechanism)
     visuals = visuals_of(mechanism)
     joints = {visual.joint for visual in visuals} - {0} | joints_of(mechanism, wanted)
     loops = len(mechanism.loops) * (2 * wanted.gaps + 2 * wanted.reactions)

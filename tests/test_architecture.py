@@ -37,7 +37,7 @@ LAYERS = (
     ("plots", "playback", "rendering", "summary", "export"),
     ("findings",),
     ("cli_output",),
-    ("cli_analysis",),
+    ("cli_analysis", "cli_playback"),
     ("cli",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -291,10 +291,14 @@ def test_warnings_are_single_lines() -> None:
 
 def test_simulate_can_play_the_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     played = []
-    monkeypatch.setattr("srm_mbs.solution.Solution.play", lambda solution: played.append(solution))
-    run("simulate", "four_bar", "--t-end", 0.1, "--play")
-    (solution,) = played
+    monkeypatch.setattr(
+        "srm_mbs.solution.Solution.play", lambda *given, **o: played.append((given, o))
+    )
+    run("simulate", "four_bar", "--t-end", 0.1, "--play", "--gaps", "--trace", "crank:1,0,0")
+    (((solution,), options),) = played
     assert solution.t[-1] == 0.1
+    anchor = srm.Anchor("crank", xyz=(1.0, 0.0, 0.0))
+    assert options == {"trace": [anchor], "gaps": True, "reactions": False}
 
 
 @POSIX

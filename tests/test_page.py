@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs import overlays
+from srm_mbs.cli import app
 from srm_mbs.overlays import Wanted, gaps_of, ramp_colours
 from srm_mbs.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
 from srm_mbs.systems.driven import constraint_errors
@@ -307,3 +309,34 @@ def test_names_do_not_end_the_script_of_a_page() -> None:
 def test_what_the_page_is_made_of_is_package_data() -> None:
     folder = Path(srm.__file__).with_name("page")
     assert {"page.html", "page.js"} <= {file.name for file in folder.iterdir()}
+
+
+@pytest.mark.browser
+def test_the_command_line_draws_the_path_of_a_point_of_a_link(
+    browser: Any, tmp_path: Path, slider_crank: srm.Solution
+) -> None:
+    path = tmp_path / "page.html"
+    options = ["--t-end", "8", "--html", str(path), "--trace", "rod:0.5,0,0.2"]
+    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
+    assert done.exit_code == 0, done.output
+    with opened(browser, path.as_uri()) as page:
+        ball = ends_in(page, "point_0", 2.5)[0]
+    assert np.abs(ball - place(slider_crank, 2.5, ROD)).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "words"),
+    [
+        ("slider_crank", ["--trace", "rod"], "'rod' is no point of a link"),
+        ("slider_crank", ["--trace", "rod:1,2"], "'rod:1,2' is no point of a link"),
+        ("slider_crank", ["--trace", "bar:1,2,3"], "--trace: there is no link 'bar'"),
+        ("simple_pendulum", ["--reactions"], "--reactions: the mechanism has no closures"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_the_run(
+    model: str, options: list[str], words: str
+) -> None:
+    done = CliRunner().invoke(app, ["simulate", model, *options])
+    assert done.exit_code == 2
+    assert words in done.output
+    assert "steps" not in done.output

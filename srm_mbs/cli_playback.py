@@ -1,0 +1,131 @@
+"""What is looked at from the command line: pages, pictures, films, and the command ``play``."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import srm_mbs
+from srm_mbs.cli_output import BAD_INPUT, Run, check_output, reported, write_files
+from srm_mbs.errors import InputError
+
+if TYPE_CHECKING:
+    from srm_mbs.mechanism import Mechanism
+    from srm_mbs.solution import Solution
+
+Image = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.png", help="Write a picture of the run, at its end or --at S."),
+]
+At = Annotated[
+    float | None, typer.Option("--at", metavar="S", help="Time of the picture in the run (s).")
+]
+Video = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Write a film of the run; the suffix is .gif or .mp4."),
+]
+Trace = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--trace",
+        metavar="LINK:X,Y,Z",
+        help="Draw the path of a point of a link (m, in the link's frame). May be given several "
+        "times.",
+    ),
+]
+Gaps = Annotated[bool, typer.Option("--gaps", help="Draw the gaps of the closures, exaggerated.")]
+Reactions = Annotated[
+    bool, typer.Option("--reactions", help="Colour the closures by the force in them.")
+]
+
+
+def check_pictures(image: Path | None, video: Path | None) -> None:
+    """Refuse files that could not be written after the run."""
+    from srm_mbs.rendering import FILMS
+
+    if image is not None:
+        check_output(image, "--image", (".png",))
+    if video is not None:
+        check_output(video, "--video", FILMS)
+
+
+def drawn(
+    mechanism: Mechanism, trace: list[str] | None, gaps: bool, reactions: bool
+) -> dict[str, Any]:
+    """The options of playback, checked before a long run.
+
+    Raises
+    ------
+    InputError
+        If a trace is none, its point is not there or does not move, or no closure has reactions.
+    """
+    from srm_mbs.overlays import Wanted
+
+    anchors = _anchors(trace or [])
+    try:
+        Wanted(anchors, gaps, reactions).check(mechanism)
+    except InputError as error:
+        error.element = f"--{error.element}"
+        raise
+    return {"trace": anchors, "gaps": gaps, "reactions": reactions}
+
+
+def _anchors(texts: list[str]) -> list[srm_mbs.Anchor]:
+    found = []
+    for text in texts:
+        link, colon, numbers = text.rpartition(":")
+        try:
+            x, y, z = (float(number) for number in numbers.split(","))
+        except ValueError:
+            colon = ""
+        if not colon:
+            raise InputError(
+                f"{text!r} is no point of a link",
+                element="--trace",
+                remedy="Write LINK:X,Y,Z, for example rod:0.5,0,0",
+            )
+        found.append(srm_mbs.Anchor(link, xyz=(x, y, z)))
+    return found
+
+
+@reported()
+def play(
+    run: Run,
+    image: Image = None,
+    at: At = None,
+    video: Video = None,
+    trace: Trace = None,
+    gaps: Gaps = False,
+    reactions: Reactions = False,
+) -> None:
+    """Play a saved run in the browser; with --image or --video, write these instead."""
+    check_pictures(image, video)
+    solution = srm_mbs.load_solution(run)
+    options = drawn(solution.mechanism, trace, gaps, reactions)
+    if image is None and video is None:
+        play_run(solution, options)
+        return
+    written, failed = write_files(
+        [
+            (image, partial(solution.export_image, t=at, **options)),
+            (video, partial(solution.export_video, **options)),
+        ]
+    )
+    for path in written:
+        typer.echo(f"written: {path}")
+    if failed:
+        raise typer.Exit(BAD_INPUT)
+
+
+def play_run(solution: Solution, options: dict[str, Any]) -> None:
+    """Play a run until Ctrl-C."""
+    # Its messages are few, and one of them is the address of the page.
+    logging.getLogger("srm_mbs.playback").setLevel(logging.INFO)
+    typer.echo("Ctrl-C ends the playback.", err=True)
+    with suppress(KeyboardInterrupt):  # while the page is being made; later, play() takes it
+        solution.play(**options)

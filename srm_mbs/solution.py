@@ -18,6 +18,7 @@ from srm_mbs.records import Settings, Statistics
 from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.stepping.winding import wound_angles
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
@@ -201,28 +202,9 @@ class Solution:
         rate = self.v[:, joint.idx_v]
         if joint.nq == 1:
             return self.q[:, joint.idx_q], rate
-        angles = self._wound_angles(joint)
-        return angles, rate
-
-    def _wound_angles(self, joint: Any) -> FloatArray:
-        """Angle of a (cos, sin) joint at ``t``, followed through every step of the run."""
+        states = np.hstack([self.q, self.v])
         nq = self.mechanism.model.nq
-        nodes = self.steps.states
-        principal = np.arctan2(nodes[:, joint.idx_q + 1], nodes[:, joint.idx_q])
-        # A long step may turn the joint by more than pi: its chart coordinate knows by how much.
-        h = np.diff(self.steps.times)
-        weights = np.append(self.scheme.b, 0.0)
-        turned = h * (self.steps.rates[:, : len(weights), joint.idx_v] @ weights)
-        wound = np.concatenate([[principal[0]], principal[0] + np.cumsum(turned)])
-        wound = principal + 2.0 * np.pi * np.round((wound - principal) / (2.0 * np.pi))
-        # Between nodes: the step's start plus the principal difference nearest to v dt.
-        index = np.clip(
-            np.searchsorted(self.steps.times, self.t, side="right") - 1, 0, len(nodes) - 1
-        )
-        here = np.arctan2(self.q[:, joint.idx_q + 1], self.q[:, joint.idx_q])
-        mean = 0.5 * (nodes[index, nq + joint.idx_v] + self.v[:, joint.idx_v])
-        guess = wound[index] + mean * (self.t - self.steps.times[index])
-        return here + 2.0 * np.pi * np.round((guess - here) / (2.0 * np.pi))  # type: ignore[no-any-return]
+        return wound_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
 
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:

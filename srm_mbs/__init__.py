@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     )
     from srm_mbs.kernel import backend
     from srm_mbs.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
+    from srm_mbs.live import LiveView
     from srm_mbs.loading import bundled_models, load, n_four_bar
     from srm_mbs.loading.converting import convert
     from srm_mbs.loop_closure import LoopClosure
@@ -89,6 +90,7 @@ _HOME = {
     "JointTorque": "forces",
     "LAW_TYPES": "laws",
     "LimitSpring": "forces",
+    "LiveView": "live",
     "Linearisation": "analysis.linearisation",
     "LoopClosure": "loop_closure",
     "Mechanism": "mechanism",
@@ -161,6 +163,7 @@ __all__ = [
     "JointTorque",
     "LimitSpring",
     "Linearisation",
+    "LiveView",
     "LoopClosure",
     "Mechanism",
     "MinimumJerk",

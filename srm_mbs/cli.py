@@ -38,11 +38,13 @@ from srm_mbs.cli_playback import (
     At,
     Gaps,
     Image,
+    Live,
     Reactions,
     Trace,
     Video,
     check_pictures,
     drawn,
+    live_view,
     play_run,
 )
 from srm_mbs.errors import InputError
@@ -157,6 +159,7 @@ def simulate(
         bool, typer.Option("--balance", help="Print the energy balance of the run.")
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
+    live: Live = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -180,6 +183,7 @@ def simulate(
     mechanism = srm_mbs.load(model)
     shown = drawn(mechanism, trace, gaps, reactions)
     defaults = mechanism.defaults
+    view = live_view(mechanism) if live else None
     solution = srm_mbs.simulate(
         mechanism,
         _first(t_end, defaults.t_end, T_END),
@@ -188,7 +192,7 @@ def simulate(
         rtol=_first(rtol, defaults.rtol, RTOL),
         atol=defaults.atol if atol is None else atol,
         step=step,
-        progress=True,
+        progress=True if view is None else view,
         backend=backend,
     )
     written, failed = write_files(
@@ -207,8 +211,8 @@ def simulate(
 
         table(balance_rows(solution.energy_balance))
     typer.echo(solution.message, err=not solution.success)
-    if play:
-        play_run(solution, shown)
+    if play or view:
+        play_run(solution, shown, view)
     if failed:
         raise typer.Exit(BAD_INPUT)
     if not solution.success:

@@ -15,6 +15,7 @@ from srm_mbs.cli_output import BAD_INPUT, Run, check_output, reported, write_fil
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
+    from srm_mbs.live import LiveView
     from srm_mbs.mechanism import Mechanism
     from srm_mbs.solution import Solution
 
@@ -39,6 +40,10 @@ Trace = Annotated[
     ),
 ]
 Gaps = Annotated[bool, typer.Option("--gaps", help="Draw the gaps of the closures, exaggerated.")]
+Live = Annotated[
+    bool,
+    typer.Option("--live", help="Show the run in the browser while it is computed; then play it."),
+]
 Reactions = Annotated[
     bool, typer.Option("--reactions", help="Colour the closures by the force in them.")
 ]
@@ -122,10 +127,27 @@ def play(
         raise typer.Exit(BAD_INPUT)
 
 
-def play_run(solution: Solution, options: dict[str, Any]) -> None:
-    """Play a run until Ctrl-C."""
-    # Its messages are few, and one of them is the address of the page.
-    logging.getLogger("srm_mbs.playback").setLevel(logging.INFO)
+def live_view(mechanism: Mechanism) -> LiveView:
+    """The page of a run that is about to be computed."""
+    from srm_mbs.live import LiveView
+
+    _tell_address()
+    return LiveView(mechanism)
+
+
+def play_run(solution: Solution, options: dict[str, Any], view: LiveView | None = None) -> None:
+    """Play a run until Ctrl-C, in its live view if it has one."""
+    _tell_address()
     typer.echo("Ctrl-C ends the playback.", err=True)
     with suppress(KeyboardInterrupt):  # while the page is being made; later, play() takes it
-        solution.play(**options)
+        if view is None:
+            solution.play(**options)
+        else:
+            with view:
+                view.play(solution, **options)
+                view.wait()
+
+
+def _tell_address() -> None:
+    # Its messages are few, and one of them is the address of the page.
+    logging.getLogger("srm_mbs.playback").setLevel(logging.INFO)

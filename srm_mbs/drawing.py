@@ -50,7 +50,7 @@ def import_meshcat() -> Any:
     return meshcat
 
 
-def _node_names(mechanism: Mechanism) -> list[str]:
+def node_names(mechanism: Mechanism) -> list[str]:
     """Name in the page of the ground and of each joint's body, unique and without slashes."""
     names: list[str] = []
     for name in (WORLD, *mechanism.joint_names):
@@ -92,7 +92,7 @@ def _material(meshcat: Any, shape: Shape, colour: Colour) -> Any:
 def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
     """Send the whole picture, the motion included, to ``scene``, a meshcat Visualizer."""
     motion, view = picture.motion, picture.view
-    names = _node_names(picture.mechanism)
+    names = node_names(picture.mechanism)
     _light(scene, view)
     shift = np.eye(4)
     shift[:3, 3] = -view.target

@@ -6,6 +6,7 @@ are passed to every page that is open, or is opened later.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from contextlib import suppress
@@ -30,11 +31,14 @@ def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
     InputError
         If it ends before it serves.
     """
+    # The package and meshcat are where this process has found them.
+    paths = os.pathsep.join(path for path in sys.path if path)
     process = subprocess.Popen(
         [sys.executable, "-u", "-m", __name__],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": paths},
         start_new_session=True,  # Ctrl-C is the player's
     )
     assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - pipes

@@ -107,33 +107,24 @@ def play(
     meshcat = import_meshcat()
     picture = make_picture(solution, check_fps(fps), Wanted(trace, gaps, reactions))
     about = _about(solution, picture, panel=True)
-    visualizer = _start_server(meshcat, make_page(meshcat, solution.mechanism.name, about, None))
-    try:
-        # Without a limit, sending to a server that has died would wait for ever.
-        visualizer.window.zmq_socket.setsockopt(_zmq().RCVTIMEO, int(1000.0 * REPLY_TIME))
-        draw_picture(meshcat, visualizer, picture)
-        visualizer.window.zmq_socket.setsockopt(_zmq().RCVTIMEO, -1)
-    except _zmq().ZMQError as error:
-        close(visualizer)
-        raise InputError(f"meshcat's server does not answer: {error}") from error
-    except BaseException:
-        close(visualizer)
-        raise
-    address = visualizer.url()
-    log.info("%s is played at %s", solution.mechanism.name, address)
-    if open_browser and not webbrowser.open(address, new=2):
-        log.warning("no browser could be opened; open %s", address)
+    visualizer = serve(meshcat, make_page(meshcat, solution.mechanism.name, about, None), picture)
+    show(visualizer, solution.mechanism.name, open_browser=open_browser)
     if block is None:
         block = not (hasattr(sys, "ps1") or sys.flags.interactive)
     if block:
-        try:
-            while visualizer.window.server_proc.poll() is None:
-                time.sleep(0.1)
-        except KeyboardInterrupt:
-            log.info("stopped")
-        finally:
-            close(visualizer)
+        wait(visualizer)
     return visualizer
+
+
+def wait(visualizer: Any) -> None:
+    """Serve until Ctrl+C, then :func:`close`."""
+    try:
+        while visualizer.window.server_proc.poll() is None:
+            time.sleep(0.1)
+    except KeyboardInterrupt:
+        log.info("stopped")
+    finally:
+        close(visualizer)
 
 
 def close(visualizer: Any) -> None:
@@ -167,7 +158,19 @@ def _zmq() -> Any:
     return zmq
 
 
-def _start_server(meshcat: Any, page: str) -> Any:
+def serve(meshcat: Any, page: str, picture: Picture) -> Any:
+    """Serve ``page``, and draw in it.
+
+    Returns
+    -------
+    meshcat.Visualizer
+        For :func:`close`.
+
+    Raises
+    ------
+    InputError
+        If the server does not start, or does not answer.
+    """
     process, commands, address = start_server(page)
     kind = meshcat.visualizer.ViewerWindow
     window = kind.__new__(kind)  # its constructor starts a server of its own, or leaves a socket
@@ -176,7 +179,26 @@ def _start_server(meshcat: Any, page: str) -> Any:
     visualizer = meshcat.Visualizer(window=window)
     # Kept until closed: an abandoned process and socket would warn when collected.
     _open_visualizers.append(visualizer)
+    try:
+        # Without a limit, sending to a server that has died would wait for ever.
+        window.zmq_socket.setsockopt(_zmq().RCVTIMEO, int(1000.0 * REPLY_TIME))
+        draw_picture(meshcat, visualizer, picture)
+        window.zmq_socket.setsockopt(_zmq().RCVTIMEO, -1)
+    except _zmq().ZMQError as error:
+        close(visualizer)
+        raise InputError(f"meshcat's server does not answer: {error}") from error
+    except BaseException:
+        close(visualizer)
+        raise
     return visualizer
+
+
+def show(visualizer: Any, name: str, *, open_browser: bool) -> None:
+    """Log where the page is and, if wanted, open it."""
+    address = visualizer.url()
+    log.info("%s is played at %s", name, address)
+    if open_browser and not webbrowser.open(address, new=2):
+        log.warning("no browser could be opened; open %s", address)
 
 
 # Export -------------------------------------------------------------------------------------

@@ -35,6 +35,7 @@ LAYERS = (
     ("visuals", "overlays", "readout", "page_server", "web_page"),
     ("scene", "drawing"),
     ("plots", "playback", "rendering", "summary", "export"),
+    ("live",),
     ("findings",),
     ("cli_output",),
     ("cli_analysis", "cli_playback"),

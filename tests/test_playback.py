@@ -408,6 +408,15 @@ def test_a_run_that_fails_at_once_is_shown_as_it_stood(tmp_path: Path) -> None:
     assert motion.positions.shape == (1, 1, 3)
 
 
+def test_the_server_starts_from_any_folder(
+    tmp_path: Path, spatial_four_bar: srm.Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    visualizer = play(spatial_four_bar, open_browser=False, block=False)
+    assert visualizer.window.server_proc.poll() is None
+    close(visualizer)
+
+
 def test_play_serves_until_it_is_interrupted_and_leaves_nothing_behind(
     spatial_four_bar: srm.Solution,
     monkeypatch: pytest.MonkeyPatch,

@@ -83,7 +83,8 @@ def integrate(
     system
         The mechanism that ``run`` is of.
     tick, events
-        With either, the kernel returns after every step.
+        With events the kernel returns after every step; with a tick after as many as its
+        ``stride`` says, one if it has none.
     passing
         What happens at breakpoints, if there are any.
     """
@@ -99,7 +100,8 @@ def integrate(
         reason = CHUNK_FULL
         while reason in (CHUNK_FULL, BREAKPOINT):
             made = run.count
-            reason = run.advance(1 if one_by_one else 0)
+            steps = getattr(tick, "stride", 1) if events is None else 1
+            reason = run.advance(steps if one_by_one else 0)
             if reason == BREAKPOINT and passing is not None:
                 run.pass_breakpoint(passing)
                 continue

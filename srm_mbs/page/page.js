@@ -1,6 +1,6 @@
 // Plays what `scene` holds, or what the server of this page sends if it is null, with the values,
 // passages and notes of `about`.
-const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
+const SPEEDS = [0.01, 0.1, 0.25, 0.5, 1, 2, 4];
 
 var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
 if (scene === null) viewer.connect();
@@ -107,9 +107,13 @@ function lay_out() {
   if (laid_out !== animator.actions) lay_out();
   slider.value = animator.time;
   element("toggle").textContent = animator.playing ? "Pause" : "Play";
-  clock.value = `${animator.time.toFixed(2)} / ${animator.duration.toFixed(2)} s`;
-  const time = about.start + animator.time;
-  if (about.panel) cells[0].textContent = time.toFixed(3);
+  const digits = animator.duration > 0 && animator.duration < 1 ? 4 : 2;
+  clock.value = `${animator.time.toFixed(digits)} / ${animator.duration.toFixed(digits)} s`;
+  // While a run is computed there is no animation, and the server moves this node with the time.
+  const computed = about.live && animator.duration === 0;
+  const time = computed ? viewer.scene_tree.find(["live"]).object.position.x
+    : about.start + animator.time;
+  if (about.panel) cells[0].textContent = time.toFixed(digits + 1);
   about.values.forEach((value, i) => {
     cells[i + 1].textContent = shown(value_at(value.samples, time));
   });

@@ -1,0 +1,119 @@
+"""A run seen in the browser while it is computed."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+import srm_mbs as srm
+from srm_mbs.cli import app
+from srm_mbs.live import SHARE
+from tests.browsing import opened
+
+BODY = """name => {
+  viewer.scene.updateMatrixWorld(true);
+  const root = viewer.scene_tree.find(["mechanism"]);
+  const body = viewer.scene_tree.find(["mechanism", name]).object.matrixWorld;
+  return root.object.matrixWorld.clone().invert().multiply(body).toArray();
+}"""
+SETTLE = """async () => {
+  const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
+  for (let i = 0; i < 5; i++) await frame();
+}"""
+
+
+@pytest.mark.browser
+def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
+    mechanism = srm.load("four_bar")
+    solution = srm.simulate(mechanism, 1.5)
+    data = mechanism.model.createData()
+    with (
+        srm.LiveView(mechanism, open_browser=False) as view,
+        opened(browser, view.visualizer.url()) as page,
+    ):
+        assert page.locator("#bar").is_visible() is False
+        for t in (0.4, 1.1):
+            view.send(t, solution(t)[0])
+            page.wait_for_function(f"element('panel').innerText.includes('{t:.3f}')")
+            pin.forwardKinematics(mechanism.model, data, solution(t)[0])
+            for joint, name in enumerate(mechanism.joint_names, 1):
+                found = np.array(page.evaluate(BODY, name)).reshape(4, 4).T
+                assert np.abs(found - data.oMi[joint].homogeneous).max() < 1e-9
+        view.play(solution)
+        page.wait_for_function("animator.playing && animator.time > 0.1")
+        assert page.evaluate("animator.duration") == pytest.approx(1.5, rel=1e-6)
+        page.wait_for_function("!element('bar').hidden")
+
+
+@pytest.mark.parametrize("backend", ["auto", "python"])
+def test_a_run_that_is_watched_is_the_same_and_takes_hardly_longer(backend: str) -> None:
+    mechanism = srm.load("jansen_walker")
+    compiled = srm.backend() == "kernel" and backend == "auto"
+    t_end = 20.0 if compiled else 1.0
+    alone = srm.simulate(mechanism, t_end, backend=backend)
+    with srm.LiveView(mechanism, open_browser=False) as view:
+        calls = []
+
+        def counted(t: float, h: float, state: Any) -> None:
+            calls.append(t)
+            view(t, h, state)
+            counted.stride = view.stride  # type: ignore[attr-defined]
+
+        began = time.perf_counter()
+        watched = srm.simulate(mechanism, t_end, backend=backend, progress=counted)
+        wall = time.perf_counter() - began
+    assert np.array_equal(watched.t, alone.t)
+    assert np.array_equal(watched.q, alone.q)
+    # What is allowed, and what the last state took more than the one before.
+    assert view.spent < SHARE * wall + 0.03
+    assert calls == sorted(set(calls))
+    assert calls[-1] <= t_end
+    if compiled:
+        assert len(calls) < 0.5 * watched.stats.steps  # the kernel goes on by itself in between
+
+
+def test_states_are_shown_as_often_as_the_share_of_the_time_allows() -> None:
+    mechanism = srm.load("four_bar")
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    with srm.LiveView(mechanism, open_browser=False) as view:
+        began = time.perf_counter()
+        while (wall := time.perf_counter() - began) < 1.5:
+            view(wall, 0.0, state)
+            time.sleep(0.002)
+    assert view.shown > 1
+    assert 0.2 * SHARE * wall < view.spent < SHARE * wall + 0.03
+
+
+def test_the_command_line_shows_a_run_while_it_is_computed_and_then_plays_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    served = []
+
+    def interrupt(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", lambda address, new=0: served.append(address) or True)
+    monkeypatch.setattr("srm_mbs.playback.time.sleep", interrupt)
+    done = CliRunner().invoke(app, ["simulate", "four_bar", "--t-end", "0.2", "--live"])
+    assert done.exit_code == 0, done.output
+    assert len(served) == 1
+    assert served[0] in done.output
+    assert "Ctrl-C" in done.output
+
+
+def test_calls_without_time_to_show_anything_cost_next_to_nothing() -> None:
+    mechanism = srm.load("four_bar")
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    with srm.LiveView(mechanism, open_browser=False) as view:
+        view(0.0, 0.0, state)
+        view.spent = 1e9
+        began = time.perf_counter()
+        for _ in range(1000):
+            view(0.0, 0.0, state)
+        assert time.perf_counter() - began < 0.02
+    assert view.shown == 0

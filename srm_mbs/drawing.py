@@ -82,11 +82,16 @@ def _number(colour: Colour) -> int:
     return sum(round(255.0 * c) << s for c, s in zip(colour, (16, 8, 0)))
 
 
-def _material(meshcat: Any, shape: Shape, colour: Colour) -> Any:
+def _material(meshcat: Any, shape: Shape, colour: Colour, in_front: bool) -> Any:
     flat = isinstance(shape, Mesh)
-    return meshcat.geometry.MeshPhongMaterial(
+    material = meshcat.geometry.MeshPhongMaterial(
         color=_number(colour), opacity=colour[3], shininess=20.0, flatShading=flat
     )
+    if in_front:
+        # Transparent things are drawn last; without depth a shape must not show its back.
+        material.transparent, material.side = True, 0
+        material.properties["depthTest"] = False
+    return material
 
 
 def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
@@ -116,9 +121,16 @@ def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
         scene.set_animation(animation, play=True, repetitions=math.inf)
 
 
-def _put(meshcat: Any, node: Any, shape: Shape, at: pin.SE3, colour: Colour) -> None:
+def _put(
+    meshcat: Any,
+    node: Any,
+    shape: Shape,
+    at: pin.SE3,
+    colour: Colour,
+    in_front: bool = False,
+) -> None:
     geometry, placement = _geometry(meshcat, shape, at)
-    node.set_object(geometry, _material(meshcat, shape, colour))
+    node.set_object(geometry, _material(meshcat, shape, colour, in_front))
     node.set_transform(placement)
 
 
@@ -132,7 +144,7 @@ def _draw_overlays(
         node = root[moving.name]
         for number, (shape, at, colour) in enumerate(moving.parts):
             part = node[f"part_{number}"]
-            _put(meshcat, part, shape, at, colour)
+            _put(meshcat, part, shape, at, colour, moving.in_front)
             if moving.colours is not None:
                 tracks = {"material.color": ("color", moving.colours)}
                 _move(meshcat, animation, part["<object>"], tracks)

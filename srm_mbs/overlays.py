@@ -7,7 +7,7 @@ the animation turns and stretches.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,6 +65,8 @@ class Moving:
         At the key frames, in the world; no scales where it keeps its size.
     colours : (n, 3) or None
         Over time.
+    in_front
+        Seen through everything before it, as closures lie within the bodies.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Moving:
     quaternions: FloatArray
     scales: FloatArray | None = None
     colours: FloatArray | None = None
+    in_front: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,10 +208,10 @@ def make_overlays(solution: Playable, wanted: Wanted, motion: Motion, extent: fl
         out.traces.append(Trace(f"trace_{number}", points, colour))
         ball = (Sphere(0.012 * extent), pin.SE3.Identity(), colour)
         out.moving.append(Moving(f"point_{number}", (ball,), points, _no_turn(len(points))))
-    if wanted.gaps:
-        _add_gaps(out, solution, motion, extent)
     if wanted.reactions:
         _add_reactions(out, solution, motion, extent)
+    if wanted.gaps:
+        _add_gaps(out, solution, motion, extent)
     return out
 
 
@@ -349,7 +352,8 @@ def _add_gaps(out: Overlays, solution: Playable, motion: Motion, extent: float) 
         bar = Cylinder(0.006 * extent, 1.0)
         middle = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
         parts = ((bar, middle, GAP_COLOUR),)
-        out.moving.append(_stretched(f"gap_{number}", parts, start, factor * gap))
+        bars = _stretched(f"gap_{number}", parts, start, factor * gap)
+        out.moving.append(replace(bars, in_front=True))
     out.notes.append(
         {
             "text": f"gaps of the closures, at most {largest:.1e} m, drawn 10"
@@ -379,7 +383,7 @@ def _add_reactions(out: Overlays, solution: Playable, motion: Motion, extent: fl
         ball = Sphere(0.014 * extent)
         parts = ((ball, pin.SE3.Identity(), (*RAMP[0], 1.0)),)
         name = f"closure_{number}"
-        out.moving.append(Moving(name, parts, path, _no_turn(len(path)), colours=colours))
+        out.moving.append(Moving(name, parts, path, _no_turn(len(path)), None, colours, True))
     out.notes.append(
         {
             "text": "force in the closures",

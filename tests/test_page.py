@@ -156,22 +156,25 @@ def test_the_path_of_a_traced_point_is_where_forward_kinematics_puts_it(
     assert len(points) == 513
     for i in range(0, 513, 37):
         assert np.abs(points[i] - place(slider_crank, i / 64.0, ROD)).max() < 1e-6
-    ball = ends_in(page, "point_0", 2.5)[0]
+    ball = ends_in(page, "point_", 2.5)[0, 0]
     assert np.abs(ball - place(slider_crank, 2.5, ROD)).max() < 1e-6
 
 
-ENDS = """([name, t]) => {
+ENDS = """([kind, t]) => {
   seek(t);
   viewer.scene.updateMatrixWorld(true);
-  const world = viewer.scene_tree.find(["overlays"]).object.matrixWorld.clone().invert();
-  const matrix = world.multiply(viewer.scene_tree.find(["overlays", name]).object.matrixWorld);
-  return [0, 1].map(z => new MeshCat.THREE.Vector3(0, 0, z).applyMatrix4(matrix).toArray());
+  const root = viewer.scene_tree.find(["overlays"]);
+  const world = root.object.matrixWorld.clone().invert();
+  return Object.entries(root.children).filter(([name, _]) => name.startsWith(kind))
+    .map(([_, node]) => [0, 1].map(z => new MeshCat.THREE.Vector3(0, 0, z)
+      .applyMatrix4(node.object.matrixWorld).applyMatrix4(world).toArray()));
 }"""
 
 
-def ends_in(page: Any, name: str, t: float) -> Any:
-    """Where an overlay has its points (0, 0, 0) and (0, 0, 1) at the animation's time t."""
-    return np.array(page.evaluate(ENDS, [name, t]))
+def ends_in(page: Any, kind: str, t: float) -> Any:
+    """Where the overlays of a kind have their points (0, 0, 0) and (0, 0, 1), (k, 2, 3), at the
+    animation's time t."""
+    return np.array(page.evaluate(ENDS, [kind, t]))
 
 
 @pytest.mark.browser
@@ -184,8 +187,9 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
     solution.export_html(tmp_path / "page.html", fps=64.0, reactions=True)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         for t in (0.0, 0.515625, 1.0):
-            for number, spring in enumerate(overlays.springs_of(mechanism)):
-                a, b = ends_in(page, f"spring_{number}", t)
+            springs, ends = overlays.springs_of(mechanism), ends_in(page, "spring_", t)
+            assert len(ends) == len(springs) == 6
+            for spring, (a, b) in zip(springs, ends):
                 assert np.abs(a - place(solution, t, spring.a)).max() < 1e-6
                 assert np.abs(b - place(solution, t, spring.b)).max() < 1e-6
         legend = page.locator("#notes").inner_text()
@@ -210,7 +214,7 @@ def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
     solution.export_html(tmp_path / "page.html", fps=64.0, gaps=True)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         words = page.locator("#notes").inner_text()
-        start, end = ends_in(page, "gap_0", 0.75)
+        ((start, end),) = ends_in(page, "gap_", 0.75)
     power = words.split("10")[-1].split()[0].translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
     ((_, gap),) = gaps_of(solution, np.array([0.75])).values()
     assert np.linalg.norm(gap) > 1e-9  # there is one
@@ -320,7 +324,7 @@ def test_the_command_line_draws_the_path_of_a_point_of_a_link(
     done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
     assert done.exit_code == 0, done.output
     with opened(browser, path.as_uri()) as page:
-        ball = ends_in(page, "point_0", 2.5)[0]
+        ball = ends_in(page, "point_", 2.5)[0, 0]
     assert np.abs(ball - place(slider_crank, 2.5, ROD)).max() < 1e-6
 
 

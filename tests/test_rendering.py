@@ -15,7 +15,15 @@ from typer.testing import CliRunner
 import srm_mbs as srm
 from srm_mbs import rendering
 from srm_mbs.cli import app
-from srm_mbs.scene import FIELD_OF_VIEW, View, choose_view, sample_motion, seen_points
+from srm_mbs.overlays import Wanted
+from srm_mbs.scene import (
+    FIELD_OF_VIEW,
+    View,
+    choose_view,
+    make_picture,
+    sample_motion,
+    seen_points,
+)
 from srm_mbs.visuals import visuals_of
 
 ORANGE = np.array([0.902, 0.624, 0.0])
@@ -168,3 +176,20 @@ def test_without_playwright_it_says_what_to_install(
 def test_a_folder_that_is_not_there_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(srm.InputError, match="cannot be written"):
         run().export_image(tmp_path / "nowhere" / "a.png")
+
+
+@pytest.mark.browser
+def test_the_colour_of_a_closure_is_seen_although_it_lies_within_a_body(tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load("slider_crank"), 3.0)
+    pictures = []
+    for name, reactions in (("with.png", True), ("without.png", False)):
+        solution.export_image(tmp_path / name, t=2.4, reactions=reactions)
+        pictures.append(pixels(tmp_path / name))
+    view = make_picture(solution, 60.0, Wanted(reactions=True)).view
+    crank = solution(2.4)[0][0]  # two bars of 2 m, their end on the x axis
+    place = np.array([4.0 * math.cos(crank), 0.0, 0.0])
+    x, y, depth = view.axes @ (place - view.target)
+    scale = 300.0 / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)
+    column, row = round(450.0 + scale * x), round(300.0 - scale * y)
+    here = (slice(row - 3, row + 4), slice(column - 3, column + 4))
+    assert np.abs(pictures[0][here] - pictures[1][here]).max(axis=2).min() > 0.1

@@ -19,7 +19,10 @@ RTOL = (1e-4, 1e-6, 1e-8, 1e-10)
 
 
 def table(results: dict[str, Any]) -> str:
-    """CPU time and error of every variant, a row for each problem and tolerance."""
+    """CPU time and error of every variant, a row for each problem and tolerance.
+
+    A dash where the sweep of the benchmark had ended, at its limit of time.
+    """
     found = {
         (row["problem"], row["variant"], row["setting"]): row
         for row in results["measurements"]
@@ -31,11 +34,12 @@ def table(results: dict[str, Any]) -> str:
     ]
     for problem in PROBLEMS:
         for rtol in RTOL:
-            best, fifth, python = (found[problem, variant, rtol] for variant in VARIANTS)
+            best, fifth, python = (found.get((problem, variant, rtol)) for variant in VARIANTS)
             cells = [
-                f"{1e3 * row['cpu']['least']:.3g}, {row['error']:.0e}" for row in (best, fifth)
+                f"{1e3 * row['cpu']['least']:.3g}, {row['error']:.0e}" if row else "-"
+                for row in (best, fifth)
             ]
-            cells.append(f"{1e3 * python['cpu']['least']:.3g}")
+            cells.append(f"{1e3 * python['cpu']['least']:.3g}" if python else "-")
             lines.append(f"| {problem} | {rtol:.0e} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

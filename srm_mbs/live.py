@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -22,11 +24,15 @@ from srm_mbs.web_page import make_page
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
 
+log = logging.getLogger(__name__)
+
 SHARE = 0.03
 """Part of the time of the run that showing it may take."""
 OFTEN, SELDOM = 0.01, 0.04
 """Seconds between two calls below and above which they come after twice, or half, as many steps."""
 MOST = 4096
+PATIENCE = 2.0
+"""Seconds for the server to accept one command."""
 WIDER = 1.6
 """How much farther away the camera is than the start needs: where the motion goes is not known."""
 
@@ -74,6 +80,11 @@ class LiveView:
         drawn = sorted({visual.joint for visual in picture.visuals} - {0})
         self._nodes = [(joint, root[names[joint]]) for joint in drawn]
         self._clock = self.visualizer["/live"]
+        import zmq
+
+        # A server that has died must not stop the run.
+        self._lost = zmq.ZMQError
+        self.visualizer.window.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000.0 * PATIENCE))
         self._began = self._last = 0.0
         self.spent, self.shown, self.stride = 0.0, 0, 1
         # What a state costs is known before the run.
@@ -96,7 +107,12 @@ class LiveView:
         self._last = now
         if self.spent + self._cost > SHARE * (now - self._began):
             return
-        self.send(t, state[: self._model.nq])
+        try:
+            self.send(t, state[: self._model.nq])
+        except self._lost:
+            log.warning("the page no longer follows the run: its server does not answer")
+            self.spent = math.inf
+            return
         self._last = time.perf_counter()
         self._cost = self._last - now
         self.spent += self._cost

@@ -117,3 +117,21 @@ def test_calls_without_time_to_show_anything_cost_next_to_nothing() -> None:
             view(0.0, 0.0, state)
         assert time.perf_counter() - began < 0.02
     assert view.shown == 0
+
+
+def test_a_server_that_dies_ends_the_view_and_not_the_run(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("srm_mbs.live.PATIENCE", 0.2)
+    mechanism = srm.load("four_bar")
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    with srm.LiveView(mechanism, open_browser=False) as view:
+        view(0.0, 0.0, state)
+        process = view.visualizer.window.server_proc
+        process.kill()
+        process.wait()
+        time.sleep(1.0)  # the share of the time allows a state now
+        for t in (0.1, 0.2):
+            view(t, 0.0, state)
+    assert view.shown == 0
+    assert caplog.text.count("no longer follows the run") == 1

@@ -71,6 +71,9 @@ class Curve:
         }
 
 
+ALWAYS = (-math.inf, math.inf)
+
+
 @runtime_checkable
 class Law(Protocol):
     """A law over time."""
@@ -83,14 +86,13 @@ class Law(Protocol):
 
     @property
     def knots(self) -> tuple[float, ...]:
-        """Times (s) at which its third derivative jumps."""
+        """Times (s) at which its third derivative jumps; none by default."""
+        return ()
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time (s) that it says something about."""
-
-
-ALWAYS = (-math.inf, math.inf)
+        """First and last time (s) that it says something about; always by default."""
+        return ALWAYS
 
 
 def _fault(law: Law, problem: str, remedy: str) -> InputError:
@@ -150,14 +152,6 @@ class ConstantSpeed(Law):
     def curve(self, initial: float = 0.0) -> Curve:
         return Curve(pieces=((initial, self.speed),))
 
-    @property
-    def knots(self) -> tuple[float, ...]:
-        return ()
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return ALWAYS
-
 
 @dataclass(frozen=True)
 class Sine(Law):
@@ -201,14 +195,6 @@ class Sine(Law):
         wave = (self.amplitude, turns if self.omega is None else self.omega, self.phase)
         return Curve(pieces=((self.offset,),), sines=(wave,))
 
-    @property
-    def knots(self) -> tuple[float, ...]:
-        return ()
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return ALWAYS
-
 
 @dataclass(frozen=True)
 class Polynomial(Law):
@@ -233,14 +219,6 @@ class Polynomial(Law):
 
     def curve(self, initial: float = 0.0) -> Curve:
         return Curve(pieces=(tuple(self.coefficients),))
-
-    @property
-    def knots(self) -> tuple[float, ...]:
-        return ()
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return ALWAYS
 
 
 @dataclass(frozen=True)
@@ -288,10 +266,6 @@ class MinimumJerk(Law):
     @property
     def knots(self) -> tuple[float, ...]:
         return (self.start, self.start + self.duration)
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return ALWAYS
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from srm_mbs.mechanism_checks import (
     check_tree,
     checked_friction_speed,
     checked_start,
+    without,
 )
 from srm_mbs.provenance import SimulationDefaults, Source
 from srm_mbs.time_dependence import NamedLaw, check_covers, knots_between, laws_over_time
@@ -131,11 +132,7 @@ class Mechanism(Derivations):
         InputError
             If there is none; the message lists those there are.
         """
-        kept = tuple(loop for loop in self.loops if loop.name != name)
-        if len(kept) == len(self.loops):
-            known = ", ".join(repr(loop.name) for loop in self.loops) or "none"
-            raise InputError(f"there is no loop {name!r}", remedy=f"Known: {known}")
-        return replace(self, loops=kept)
+        return replace(self, loops=without("loop", self.loops, name))
 
     @classmethod
     def from_pinocchio(cls, model: pin.Model, constraint_models: Any, **options: Any) -> Mechanism:
@@ -174,11 +171,7 @@ class Mechanism(Derivations):
         InputError
             If there is none; the message lists those there are.
         """
-        kept = tuple(drive for drive in self.drives if drive.name != name)
-        if len(kept) == len(self.drives):
-            known = ", ".join(repr(drive.name) for drive in self.drives) or "none"
-            raise InputError(f"there is no drive {name!r}", remedy=f"Known: {known}")
-        return replace(self, drives=kept)
+        return replace(self, drives=without("drive", self.drives, name))
 
     def moved(self, q: Any, v: Any) -> Mechanism:
         """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with

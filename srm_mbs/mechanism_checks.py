@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -112,3 +112,26 @@ def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
             remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
         )
     return speed
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Part = TypeVar("Part", bound=_Named)
+
+
+def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
+    """``parts`` (loops, drives) without the one of that name.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message lists those there are.
+    """
+    kept = tuple(part for part in parts if part.name != name)
+    if len(kept) == len(parts):
+        known = ", ".join(repr(part.name) for part in parts) or "none"
+        raise InputError(f"there is no {what} {name!r}", remedy=f"Known: {known}")
+    return kept

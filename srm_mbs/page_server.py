@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from srm_mbs.errors import InputError
 
@@ -41,12 +41,12 @@ def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
         env=os.environ | {"PYTHONPATH": paths},
         start_new_session=True,  # Ctrl-C is the player's
     )
-    assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - pipes
+    to_server, from_server = cast(IO[bytes], process.stdin), cast(IO[bytes], process.stdout)
     with suppress(OSError):  # it may have ended
-        process.stdin.write(page.encode("utf-8"))
+        to_server.write(page.encode("utf-8"))
     with suppress(OSError):
-        process.stdin.close()
-    lines = [process.stdout.readline().decode().strip() for _ in range(2)]
+        to_server.close()
+    lines = [from_server.readline().decode().strip() for _ in range(2)]
     found = dict(line.split("=", 1) for line in lines if "=" in line)
     if not {"zmq_url", "web_url"} <= found.keys():
         process.kill()

@@ -106,6 +106,18 @@ def description(linkage: Linkage, text: str, rest: str) -> str:
     return "\n\n".join([header(linkage.name, text).rstrip(), *linkage.loops, rest.strip()]) + "\n"
 
 
+TURNING = """
+[initial]
+q = { crank = 0.0 }
+v = { crank = 8.0 }
+
+[simulation]
+t_end = 5.0
+rtol = 1e-8
+"""
+"""Start and run of the six-bars."""
+
+
 def watt_six_bar() -> tuple[str, str]:
     """Watt's chain with a binary ground: two ternary links that meet in a pin."""
     a, d = vector(0.0, 0.0), vector(1.0, 0.0)
@@ -133,15 +145,7 @@ def watt_six_bar() -> tuple[str, str]:
         "rocker that meet in a pin, and a dyad between them; bars of 1 kg per metre. The crank "
         "can turn fully and starts at 1 rad (joint angles count from there) with 8 rad/s. Seven "
         "pins, two loops.",
-        """
-[initial]
-q = { crank = 0.0 }
-v = { crank = 8.0 }
-
-[simulation]
-t_end = 5.0
-rtol = 1e-8
-""",
+        TURNING,
     )
     return plane.urdf.text(), text
 
@@ -172,15 +176,7 @@ def stephenson_six_bar() -> tuple[str, str]:
         "m, ground 1 m) whose coupler point moves a dyad on the ground; bars of 1 kg per metre. "
         "The crank can turn fully and starts at 1 rad (joint angles count from there) with 8 "
         "rad/s.",
-        """
-[initial]
-q = { crank = 0.0 }
-v = { crank = 8.0 }
-
-[simulation]
-t_end = 5.0
-rtol = 1e-8
-""",
+        TURNING,
     )
     return plane.urdf.text(), text
 

@@ -60,7 +60,7 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         raise InputError(
             f"there is no backend {asked!r}",
             element="backend",
-            remedy=f"Give one of {', '.join(BACKENDS)}",
+            remedy=f"Known: {', '.join(BACKENDS)}",
         )
     if asked == "python" or (asked == "auto" and _unwanted()):
         return False
@@ -73,6 +73,8 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         )
     if reason == OUTDATED:
         warn_outdated()
+    elif reason:
+        log.info("the Python reference makes this run, not the compiled kernel: %s", reason)
     return not reason
 
 

@@ -15,8 +15,11 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs import kernel
-from srm_mbs.compiled.twin import twin_of
+from srm_mbs.compiled.twin import Evaluator, twin_of
+from srm_mbs.methods.base import ErrorNorm
+from srm_mbs.preparation import absolute_tolerance
 from srm_mbs.stepping.dense import DenseOutput
+from srm_mbs.stepping.stepsize import initial_step
 from srm_mbs.systems.multibody import make_system
 from tests.lockstep import Comparison, compare
 from tests.mechanisms import floating_ring
@@ -305,3 +308,19 @@ def test_the_backend_is_named_and_can_be_chosen(monkeypatch: pytest.MonkeyPatch)
     assert srm.simulate(srm.load("four_bar"), 0.1).settings.backend == "kernel"
     assert srm.simulate(srm.load("four_bar"), 0.1, backend="python").settings.backend == "python"
     assert srm.simulate(srm.load("four_bar"), 0.1, method="srm").settings.backend == "python"
+
+
+@pytest.mark.parametrize("name", [name for name, _ in MODELS])
+def test_the_first_step_agrees(name: str) -> None:
+    mechanism = srm.load(name)
+    system = make_system(mechanism)
+    method = srm.PSRM()
+    rng = np.random.default_rng(3)
+    for span, rtol in ((10.0, 1e-3), (10.0, 1e-9), (1e-9, 1e-6)):
+        norm = ErrorNorm(absolute_tolerance(mechanism, None, rtol), rtol)
+        state = random_state(mechanism, rng)
+        memory = method.start(system, 0.2, state, norm)
+        expected = initial_step(system, state, memory, norm, span, 8, 0.2)
+        evaluator = Evaluator(system, twin_of(system))
+        found = evaluator.first_step(state, memory, norm, span, 8, 0.2)
+        assert found == pytest.approx(expected, rel=1e-9 / min(1.0, memory.sigma) ** 2)

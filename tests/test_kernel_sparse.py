@@ -29,6 +29,7 @@ MECHANISMS: dict[str, Callable[[], srm.Mechanism]] = {
     "squeezing_mechanism": lambda: srm.load("squeezing_mechanism"),
     "free and ball joints": floating_ring,
     "islands": lambda: islands((1.0, 1.3)),
+    "many islands": lambda: islands(tuple(np.linspace(1.0, 1.3, 40))),
 }
 
 
@@ -134,7 +135,7 @@ def test_its_terms_are_those_of_the_dense_algebra_and_of_the_reference(name: str
         alike(found, reference_terms(system, x))
 
 
-@pytest.mark.parametrize("n", [3, 10, 40])
+@pytest.mark.parametrize("n", [3, 10, 40, 100])
 def test_its_terms_are_the_dense_ones_up_to_the_singularity_of_a_chain(n: int) -> None:
     mechanism = srm.n_four_bar(n)
     system, dense, sparse = twins(mechanism)
@@ -145,7 +146,7 @@ def test_its_terms_are_the_dense_ones_up_to_the_singularity_of_a_chain(n: int) -
         alike(found, reference_terms(system, x))
 
 
-@pytest.mark.parametrize("n", [3, 10, 40])
+@pytest.mark.parametrize("n", [3, 10, 40, 100])
 def test_it_drops_the_pivots_that_the_dense_algebra_drops(n: int) -> None:
     """In the zone, on the singularity itself, and with some of the loops singular only."""
     mechanism = srm.n_four_bar(n)
@@ -227,8 +228,9 @@ def test_each_island_moves_as_it_does_alone() -> None:
         assert np.abs(together["rate"][6 + 3 * k : 9 + 3 * k] - rate).max() < 1e-11
 
 
-def test_an_evaluation_leaves_nothing_behind_for_the_next() -> None:
-    mechanism = srm.n_four_bar(10)
+@pytest.mark.parametrize("n", [10, 40])
+def test_an_evaluation_leaves_nothing_behind_for_the_next(n: int) -> None:
+    mechanism = srm.n_four_bar(n)
     _, _, sparse = twins(mechanism)
     x = flat(mechanism, 0.7)
     first = sparse.terms(0.0, x)

@@ -9,10 +9,11 @@ import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs.arrays import FloatArray
-from srm_mbs.compiled.twin import twin_of
+from srm_mbs.compiled.twin import given_back, shared, taken, twin_of
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping import hermite
 from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.stepping.reading_times import SLACK
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 
 
@@ -27,7 +28,9 @@ def dense_output(
         Backend of the run.
     """
     if made_by == "kernel" and core is not None:
-        return CompiledDenseOutput(twin_of(system), system, scheme, steps)
+        return CompiledDenseOutput(
+            None if shared(system) else twin_of(system), system, scheme, steps
+        )
     return DenseOutput(system, scheme, steps)
 
 
@@ -37,7 +40,8 @@ class CompiledDenseOutput(DenseOutput):
     Parameters
     ----------
     twin
-        From :func:`~srm_mbs.compiled.twin.twin_of`.
+        That of the run, to be kept; None where any idle one of the mechanism serves
+        (:func:`~srm_mbs.compiled.twin.shared`), so that runs at hand hold no workspace.
     system, scheme, steps
         As for :class:`~srm_mbs.stepping.dense.DenseOutput`.
     """
@@ -51,8 +55,13 @@ class CompiledDenseOutput(DenseOutput):
     ) -> None:
         super().__init__(system, scheme, steps)
         self._mechanism_system = system
+        self._scheme = scheme
         self._twin = twin
         self._compiled: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Where it is copied to there may be no kernel.
+        return dense_output, (self._mechanism_system, self._scheme, self._steps, "kernel")
 
     def __call__(self, t: FloatArray) -> FloatArray:
         """States (k, nx) at the times ``t`` (k,), in any order; see
@@ -63,17 +72,22 @@ class CompiledDenseOutput(DenseOutput):
             return super().__call__(t)
         if len(self._extension.extra_c) and self._steps.rates.shape[1] == self._extension.n_rates:
             return super().__call__(t)  # loaded without the controller: no stage is to be evaluated
-        self.check(t)
         if self._compiled is None:
             self._compiled = self._compile()
-        before = self._twin.evaluations, self._twin.factorisations
+        system = self._mechanism_system
+        twin = taken(system) if self._twin is None else self._twin
+        before = twin.evaluations, twin.factorisations
         try:
-            return self._compiled.states(np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
+            return self._compiled.states(twin, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().__call__(t)  # which says why
+        except IndexError:
+            self.check(t)  # raises
+            raise
         finally:
-            done = self._twin.evaluations - before[0], self._twin.factorisations - before[1]
-            self._mechanism_system.count(*done)
+            system.count(twin.evaluations - before[0], twin.factorisations - before[1])
+            if self._twin is None:
+                given_back(system, twin)
 
     @cached_property
     def _lone_zones(self) -> bool:
@@ -85,7 +99,8 @@ class CompiledDenseOutput(DenseOutput):
     def _compile(self) -> Any:
         steps, extension = self._steps, self._extension
         return core.DenseOutput(  # type: ignore[union-attr]
-            self._twin,
+            self._mechanism_system.nq,
+            self._mechanism_system.nv,
             {
                 "rows": extension.rows,
                 "extra_A": extension.extra_A,
@@ -97,6 +112,8 @@ class CompiledDenseOutput(DenseOutput):
                 "spacing": hermite.SPACING,
                 "close": hermite.CLOSE,
                 "probes": hermite.PROBES,
+                "end": steps.end,
+                "slack": SLACK,
                 "count": steps.count,
                 "width": steps.rates.shape[1],
                 "corrected": steps.corrections.shape[1] > 0,

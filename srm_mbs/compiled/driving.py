@@ -11,6 +11,7 @@ import numpy as np
 
 from srm_mbs.compiled.handover import VERDICTS, history_from
 from srm_mbs.compiled.run import (
+    ARRIVAL,
     BREAKPOINT,
     CHUNK_FULL,
     CLOSURES,
@@ -51,21 +52,13 @@ class CompiledRecord(RunRecord):
         """The accepted steps as arrays."""
         if self.run is None:
             return super().data(scheme, tangent_size)
-        arrays = self.run.arrays()
+        arrays = self.run.arrays(self.t0, self.x0)
         zones = {
             step: (threshold, history_from(history))
             for step, (threshold, history) in arrays.pop("zones").items()
         }
-        times, states = arrays.pop("times"), arrays.pop("states")
         breaks = arrays.pop("breaks").astype(int)
-        return StepData(
-            breaks=breaks,
-            times=np.concatenate([[self.t0], times]),
-            states=np.concatenate([self.x0[None], states]),
-            zones=zones,
-            stop=self.stop,
-            **arrays,
-        )
+        return StepData(breaks=breaks, zones=zones, stop=self.stop, **arrays)
 
 
 def integrate(
@@ -98,12 +91,15 @@ def integrate(
         if events is not None:
             events.begin(run.t0, state)
         reason = CHUNK_FULL
-        while reason in (CHUNK_FULL, BREAKPOINT):
+        while reason in (CHUNK_FULL, BREAKPOINT, ARRIVAL):
             made = run.count
             steps = getattr(tick, "stride", 1) if events is None else 1
             reason = run.advance(steps if one_by_one else 0)
             if reason == BREAKPOINT and passing is not None:
                 run.pass_breakpoint(passing)
+                continue
+            if reason == ARRIVAL and passing is not None:
+                run.arrive(passing)
                 continue
             if reason not in (CHUNK_FULL, FINISHED):
                 trouble = why_stopped(reason, system, run)
@@ -129,7 +125,6 @@ def integrate(
     record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
     system.count(run.twin.evaluations, run.twin.factorisations)
     record.wall_time = time.perf_counter() - started
-    loop.log.info("%s", record.message)
     return record
 
 

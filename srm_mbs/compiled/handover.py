@@ -5,12 +5,14 @@ Matrices of the reference have their vectors in columns, those of the kernel in 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from srm_mbs.methods import branch, split, zone
 from srm_mbs.methods.base import Memory
+from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.stepping import (
     breakpoints,
@@ -52,6 +54,8 @@ CONSTANTS = {
     "clearance": placement.CLEARANCE,
     "ahead": kinks.AHEAD,
     "max_redone": placement.MAX_REDONE,
+    "beside": placement.BESIDE,
+    "arrival_change": placement.ARRIVAL,
     "turned": turning.TURNED,
     "guard_max_redone": guard.MAX_REDONE,
     "smallest_step": loop.SMALLEST_STEP,
@@ -65,6 +69,25 @@ CONSTANTS = {
     "allowed": breakpoints.ALLOWED,
 }
 """Every number of the algorithm, from the module of the reference that has it."""
+
+
+FIRST_STEP = (stepsize.OVERFLOW, stepsize.PROBE, stepsize.LONGEST_FIRST)
+"""Those of the first step."""
+
+
+@lru_cache(maxsize=64)
+def scheme_data(scheme: ButcherTableau) -> dict[str, Any]:
+    """``scheme`` as the kernel reads it."""
+    gaps = np.array(scheme.gaps)
+    return {
+        "A": scheme.A,
+        "b": scheme.b,
+        "c": scheme.c,
+        "error": scheme.error,
+        "controller_order": scheme.controller_order or 1,
+        "gap_centres": gaps[:, 0].copy(),
+        "gap_half_widths": gaps[:, 1].copy(),
+    }
 
 
 def history_data(history: MultiplierHistory | None) -> dict[str, Any] | None:

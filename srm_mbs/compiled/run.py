@@ -15,6 +15,7 @@ from srm_mbs.compiled.handover import (
     history_from,
     memory_data,
     memory_from,
+    scheme_data,
 )
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
 from srm_mbs.methods.psrm import PSRM
@@ -25,7 +26,16 @@ from srm_mbs.systems.base import Zone
 
 CHUNK = 0.1
 """Seconds after which the kernel returns, so that Ctrl-C is heard."""
-CHUNK_FULL, FINISHED, TOO_SHORT, STANDSTILL, CLOSURES, NOT_EVALUATED, BREAKPOINT = range(7)
+(
+    CHUNK_FULL,
+    FINISHED,
+    TOO_SHORT,
+    STANDSTILL,
+    CLOSURES,
+    NOT_EVALUATED,
+    BREAKPOINT,
+    ARRIVAL,
+) = range(8)
 """Why the kernel returned: ``Stop`` in run.hpp."""
 
 
@@ -46,6 +56,8 @@ class CompiledRun:
         Fixed step or None, first and longest step of step-size control (s).
     placed
         ``"automatic"`` or ``"off"``.
+    arrivals
+        Whether it returns before an end beside a singular configuration.
     """
 
     def __init__(
@@ -62,25 +74,16 @@ class CompiledRun:
         first_step: float,
         max_step: float,
         placed: str,
+        arrivals: bool = False,
     ) -> None:
         self.twin, self.method, self.norm = twin, method, norm
         self.start, self.t0, self.t_end = state.copy(), t0, float(pieces.ends[-1])
         self.adaptive = step is None
-        scheme = method.scheme
-        gaps = np.array(scheme.gaps)
         eps = method.regularisation
         self._run = core.Run(  # type: ignore[union-attr]
             twin,
             {
-                "scheme": {
-                    "A": scheme.A,
-                    "b": scheme.b,
-                    "c": scheme.c,
-                    "error": scheme.error,
-                    "controller_order": scheme.controller_order or 1,
-                    "gap_centres": gaps[:, 0].copy(),
-                    "gap_half_widths": gaps[:, 1].copy(),
-                },
+                "scheme": scheme_data(method.scheme),
                 "constants": CONSTANTS,
                 "norm": {
                     "atol": np.ascontiguousarray(norm.atol),
@@ -100,6 +103,7 @@ class CompiledRun:
                 "first_step": first_step,
                 "max_step": max_step,
                 "placement": placed,
+                "arrivals": arrivals,
             },
         )
 
@@ -160,6 +164,11 @@ class CompiledRun:
         if not known:
             self.remember(passing.resolved(t, state, before))
 
+    def arrive(self, passing: Passing) -> None:
+        """Prepare for the end beside a singular configuration before which the kernel stopped."""
+        run = self._run
+        self.remember(passing.arrive(run.t, run.state, self.memory(), run.piece))
+
     def remember(self, memory: Memory) -> None:
         """Carry ``memory`` to the next step."""
         self._run.remember(memory_data(memory))
@@ -167,7 +176,8 @@ class CompiledRun:
     def begin(self, t: float, state: FloatArray, memory: Memory, first_step: float) -> None:
         """Start again, from ``state`` at ``t`` (s); what was counted stays."""
         fresh = {"h": first_step, "xi_old": 1.0, "just_rejected": False, "index": 1, "slope": 0.0,
-                 "zero": np.nan, "redo": 0.0, "redone": 0, "limit": np.inf, "tries": 0}  # fmt: skip
+                 "zero": np.nan, "redo": 0.0, "redone": 0, "limit": np.inf, "tries": 0,
+                 "arrival": 0}  # fmt: skip
         self._run.restore(
             {
                 "t": t,

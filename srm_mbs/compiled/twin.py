@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from srm_mbs._kernel import core
 from srm_mbs.arrays import FloatArray
+from srm_mbs.compiled.handover import FIRST_STEP
+from srm_mbs.methods.base import ErrorNorm, Memory
+from srm_mbs.stepping.stepsize import initial_step
 from srm_mbs.systems.base import Zone
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+
+KEPT = 4
+"""Idle workspaces that a mechanism keeps at most."""
+LARGEST_KEPT = 64
+"""Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
 
 
 def twin_of(system: ClosedSystem | OpenSystem) -> Any:
@@ -20,6 +30,41 @@ def twin_of(system: ClosedSystem | OpenSystem) -> Any:
         for t, force in zip(held.times, held.values):
             twin.hold(t, force, True)
     return twin
+
+
+def shared(system: ClosedSystem | OpenSystem) -> bool:
+    """Whether a twin of ``system`` serves every run of its mechanism: no function of the user and
+    no motion from one start is in it, and it is small enough to be kept."""
+    return (
+        system.nv <= LARGEST_KEPT
+        and system.held is None
+        and not (system.controlled or system.calls_forces or system.mechanism.drives)
+    )
+
+
+def taken(system: ClosedSystem | OpenSystem) -> Any:
+    """A twin of ``system`` for one user: an idle one of its mechanism, or a new one.
+
+    :func:`given_back` returns it.  One that is not, because a run raised, is simply lost.
+    """
+    if shared(system):
+        with suppress(IndexError):  # deque: two threads never get the same
+            twin = _idle(system).pop()
+            twin.renew(**system.constants_of_start())
+            return twin
+    return twin_of(system)
+
+
+def given_back(system: ClosedSystem | OpenSystem, twin: Any) -> None:
+    """Nobody uses ``twin`` any more: keep it for the mechanism's next run, if it is :func:`shared`
+    and there are not KEPT already."""
+    if shared(system):
+        _idle(system).append(twin)
+
+
+def _idle(system: ClosedSystem | OpenSystem) -> deque[Any]:
+    idle: deque[Any] = system.mechanism.derived("idle twins", lambda: deque(maxlen=KEPT))
+    return idle
 
 
 class _TwinTerms:
@@ -60,6 +105,24 @@ class Evaluator:
         """Times of both within [``first``, ``last``] (s); see :mod:`..stepping.breakpoints`."""
         self._system.between(first, last)
         self._twin.between(first, last)
+
+    def first_step(
+        self,
+        state: FloatArray,
+        memory: Memory,
+        norm: ErrorNorm,
+        span: float,
+        order: int,
+        t: float,
+    ) -> float:
+        """:func:`~srm_mbs.stepping.stepsize.initial_step`, in the kernel."""
+        try:
+            return self._twin.first_step(  # type: ignore[no-any-return]
+                t, state, memory.rate, memory.magnitude, norm.atol, norm.one, norm.rtol, span,
+                order, FIRST_STEP,
+            )  # fmt: skip
+        except ArithmeticError:  # the reference says why
+            return initial_step(self, state, memory, norm, span, order, t)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.systems.base.System`."""

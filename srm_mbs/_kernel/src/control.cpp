@@ -114,10 +114,13 @@ bool Gaps::ends_on(double distance, double h) const {
 double Gaps::step_over(double distance) const { return distance / wide_ends_.back(); }
 
 SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner, const Scheme& scheme,
-                                           double t_end, const ControlConstants& constants)
+                                           double t_end, const ControlConstants& constants,
+                                           bool arrivals)
     : inner_(std::move(inner)),
       constants_(constants),
       t_end_(t_end),
+      watched_(arrivals && inner_->adaptive ? Arrival::watched : Arrival::none),
+      arrival_(watched_),
       gaps_(scheme, constants.clearance),
       abscissae_(with_end(scheme)),
       zero_(nan) {
@@ -133,6 +136,13 @@ Proposal SingularityPlacement::propose(double t, double limit, Memory& memory) {
     if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.sigma_change / slope_);
     memory.sigma_slope = slope_;
     const Proposal proposal = inner_->propose(t, limit, memory);
+    if (arrives(t, proposal)) {
+        arrival_ = Arrival::none;
+        return {proposal.h, proposal.t_new, proposal.placed, true};
+    }
+    // Where the multipliers are known, stages may lie anywhere.
+    known_ = memory.has_history && memory.history.known_until >= t_end_;
+    if (known_) return proposal;
     if (!(redo_ > 0.0) && zero_ > t) {
         const double h = placed_step(zero_ - t, proposal.h, t);
         if (h != proposal.h) {
@@ -141,6 +151,13 @@ Proposal SingularityPlacement::propose(double t, double limit, Memory& memory) {
         }
     }
     return proposal;
+}
+
+// Whether the end beside a singular configuration is to be prepared for.
+bool SingularityPlacement::arrives(double t, const Proposal& proposal) const {
+    if (arrival_ != Arrival::watched) return arrival_ == Arrival::due;
+    if (!(zero_ > t) || !(std::abs(zero_ - t_end_) * slope_ < constants_.beside)) return false;
+    return proposal.t_new >= t_end_ || (t_end_ - t) * slope_ <= constants_.arrival_change;
 }
 
 double SingularityPlacement::placed_step(double distance, double h, double t) const {
@@ -180,9 +197,15 @@ Verdict SingularityPlacement::judge(const Proposal& proposal, const StepResult* 
                          c > 0.0 ? std::abs(sigmas[middle_] - start) / c : 0.0) / h;
     } else if (result) {
         slope = sigma_slope(abscissae_, result->sigmas, h);
-        if (redone_ < constants_.max_redone) {
-            const double better =
-                better_step(h, result->sigmas, slope, proposal.t_new >= t_end_);
+        const bool last = proposal.t_new >= t_end_;
+        if (last && arrival_ == Arrival::watched && result->sigmas.back() < constants_.beside) {
+            arrival_ = Arrival::due;
+            redo_ = h;
+            ++replaced;
+            return Verdict::replaced;
+        }
+        if (redone_ < constants_.max_redone && !known_) {
+            const double better = better_step(h, result->sigmas, slope, last);
             if (0.0 < better && better < h) {
                 redo_ = better;
                 ++redone_;

@@ -16,6 +16,7 @@ enum class Verdict { accepted = 0, rejected = 1, replaced = 2 };
 struct Proposal {
     double h, t_new;
     bool placed = false;
+    bool arriving = false;  // to be proposed again, after Python has prepared for the end
 };
 
 // The constants of srm_mbs/stepping, passed in from Python.
@@ -24,6 +25,7 @@ struct ControlConstants {
         failed_evaluation;                                  // stepsize.py
     double sigma_change, too_close, clearance, ahead;       // placement.py, kinks.py
     int max_redone;
+    double beside, arrival_change;
     double turned;                                          // turning.py
     int guard_max_redone;
 };
@@ -37,6 +39,7 @@ struct ControlState {
     int redone = 0;
     double limit = std::numeric_limits<double>::infinity();
     int tries = 0;
+    int arrival = 0;
 };
 
 class Control {
@@ -121,15 +124,17 @@ private:
 class SingularityPlacement : public Control {
 public:
     SingularityPlacement(std::unique_ptr<Control> inner, const Scheme& scheme, double t_end,
-                         const ControlConstants& constants);
+                         const ControlConstants& constants, bool arrivals);
     Proposal propose(double t, double limit, Memory& memory) override;
     Verdict judge(const Proposal& proposal, const StepResult* result) override;
     void aim(double end) override {
         t_end_ = end;
+        arrival_ = watched_;
         inner_->aim(end);
     }
     void resume(const ControlState& s) override {
         inner_->resume(s);
+        arrival_ = static_cast<Arrival>(s.arrival);
         slope_ = s.slope;
         zero_ = s.zero;
         redo_ = s.redo;
@@ -137,6 +142,7 @@ public:
     }
     void save(ControlState& s) const override {
         inner_->save(s);
+        s.arrival = static_cast<int>(arrival_);
         s.slope = slope_;
         s.zero = zero_;
         s.redo = redo_;
@@ -147,10 +153,16 @@ public:
 private:
     double placed_step(double distance, double h, double t) const;
     double better_step(double h, const std::vector<double>& sigmas, double slope, bool last) const;
+    bool arrives(double t, const Proposal& proposal) const;
+
+    // What is known of an end beside a singular configuration.
+    enum class Arrival { none = 0, watched = 1, due = 2 };
 
     std::unique_ptr<Control> inner_;
     ControlConstants constants_;
     double t_end_;
+    Arrival watched_, arrival_;
+    bool known_ = false;
     Gaps gaps_;
     std::vector<double> abscissae_;
     int middle_;

@@ -2,41 +2,48 @@
 
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 
 #include "linear.hpp"
 
 namespace srm {
 
-DenseOutput::DenseOutput(System& system, Extension extension, std::vector<double> abscissae,
+DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double> abscissae,
                          HermiteConstants hermite, StepArrays steps)
-    : system_(system),
-      extension_(std::move(extension)),
+    : extension_(std::move(extension)),
       abscissae_(std::move(abscissae)),
       hermite_(std::move(hermite)),
       steps_(std::move(steps)),
-      n_(2 * system.nv),
-      nx_(system.nq + system.nv),
-      nq_(system.nq),
+      n_(2 * nv),
+      nx_(nq + nv),
       extra_(steps_.count),
       smooth_(steps_.count),
       near_(steps_.count, 0),
       delta_(n_),
       x_(nx_),
-      weights_(extension_.n_rates) {}
+      weights_(extension_.n_rates),
+      whole_(extension_.n_rates),
+      whole_count_(std::min<int>(extension_.n_rates, steps_.width)) {
+    weights(1.0, whole_.data());
+}
 
-void DenseOutput::states(const double* t, long k, double* out) {
+void DenseOutput::states(System& system, const double* t, long k, double* out) {
     const double* times = steps_.times;
     const long count = steps_.count;
+    const double slack = steps_.slack * std::max(std::abs(times[0]), std::abs(steps_.end));
+    for (long i = 0; i < k; ++i)
+        if (!(t[i] >= times[0] - slack && t[i] <= steps_.end + slack))
+            throw std::out_of_range("outside the run");
     for (long i = 0; i < k; ++i, out += nx_) {
         const long found = std::upper_bound(times, times + count + 1, t[i]) - times - 1;
         const long step = std::clamp(found, 0L, count - 1);
         const double theta = (t[i] - times[step]) / (times[step + 1] - times[step]);
         if (near_[step] == 0) near_[step] = close_to_singular(step) ? 2 : 1;
         if (near_[step] == 1) {
-            regular(step, theta, out);
+            regular(system, step, theta, out);
         } else {
-            value(smooth(step), theta, delta_.data());
-            system_.retract(steps_.states + step * nx_, delta_.data(), out);
+            value(smooth(system, step), theta, delta_.data());
+            system.retract(steps_.states + step * nx_, delta_.data(), out);
         }
     }
 }
@@ -79,9 +86,10 @@ void DenseOutput::weights(double theta, double* out) const {
     }
 }
 
-const std::vector<double>& DenseOutput::extra(long step, double h) {
-    std::vector<double>& out = extra_[step];
-    if (!out.empty() || extension_.n_extra == 0) return out;
+const std::vector<double>& DenseOutput::extra(System& system, long step, double h) {
+    std::vector<double>& kept = extra_[step];
+    if (!kept.empty() || extension_.n_extra == 0) return kept;
+    std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     std::vector<double> rate(n_);
     out.assign(static_cast<std::size_t>(extension_.n_extra) * n_, 0.0);
@@ -94,25 +102,26 @@ const std::vector<double>& DenseOutput::extra(long step, double h) {
                 k < steps_.width ? rates + k * n_ : &out[(k - steps_.width) * n_];
             add(h * a[k], from, delta_.data(), n_);
         }
-        system_.retract(steps_.states + step * nx_, delta_.data(), x_.data());
-        system_.evaluate(steps_.times[step] + extension_.extra_c[i] * h, x_.data(),
+        system.retract(steps_.states + step * nx_, delta_.data(), x_.data());
+        system.evaluate(steps_.times[step] + extension_.extra_c[i] * h, x_.data(),
                          System::ZoneView{});
-        system_.rate(rate.data());
-        system_.chart_rate(delta_.data(), rate.data(), &out[i * n_]);
+        system.rate(rate.data());
+        system.chart_rate(delta_.data(), rate.data(), &out[i * n_]);
     }
-    return out;
+    kept = std::move(out);
+    return kept;
 }
 
-void DenseOutput::regular(long step, double theta, double* out) {
+void DenseOutput::regular(System& system, long step, double theta, double* out) {
     const double h = steps_.times[step + 1] - steps_.times[step];
-    const std::vector<double>& more = extra(step, h);
+    const std::vector<double>& more = extra(system, step, h);
     const double* rates = steps_.rates + step * steps_.width * n_;
     weights(theta, weights_.data());
     std::fill(delta_.begin(), delta_.end(), 0.0);
     for (int k = 0; k < extension_.n_rates; ++k)
         add(h * weights_[k],
             k < steps_.width ? rates + k * n_ : &more[(k - steps_.width) * n_], delta_.data(), n_);
-    system_.retract(steps_.states + step * nx_, delta_.data(), out);
+    system.retract(steps_.states + step * nx_, delta_.data(), out);
     if (!steps_.corrected) return;
     // The correction at the step end, as a smooth ramp.
     const double* correction = steps_.corrections + step * n_;
@@ -122,23 +131,32 @@ void DenseOutput::regular(long step, double theta, double* out) {
         delta_[i] = -s * correction[i] - h * r * correction[nv + i];
         delta_[nv + i] = -s * correction[nv + i];
     }
-    system_.retract(out, delta_.data(), out);
+    system.retract(out, delta_.data(), out);
 }
 
 // Up to `count` ends of steps around the step, none too close together.
-std::vector<long> DenseOutput::nodes(long step, int count) const {
-    const double* times = steps_.times;
+std::vector<long> DenseOutput::nodes(const System& system, long step, int count) const {
+    const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double near = hermite_.spacing * (times[step + 1] - times[step]);
     std::vector<long> before{step}, after{step + 1};
     long i = step - 1, j = step + 2;
     // Rates jump at breakpoints: a polynomial goes no further.
-    const auto [first, last] = piece(step);
+    auto [first, last] = piece(step);
+    const auto reachable = [&](long node) {
+        return system.reachable(start, steps_.states + node * nx_);
+    };
     while (static_cast<int>(before.size() + after.size()) < count && (i >= first || j <= last)) {
         if (i >= first && (j > last || before.size() <= after.size())) {
-            if (times[before.back()] - times[i] >= near) before.push_back(i);
+            if (times[before.back()] - times[i] >= near) {
+                if (reachable(i)) before.push_back(i);
+                else first = i;
+            }
             --i;
         } else {
-            if (times[j] - times[after.back()] >= near) after.push_back(j);
+            if (times[j] - times[after.back()] >= near) {
+                if (reachable(j)) after.push_back(j);
+                else last = j;
+            }
             ++j;
         }
     }
@@ -147,17 +165,31 @@ std::vector<long> DenseOutput::nodes(long step, int count) const {
     return before;
 }
 
+// Motion of the positions from the step to a node, in the charts of the steps between: turns
+// included, however the rates change within a step.
+void DenseOutput::moved(long step, long node, double* out) const {
+    const int nv = n_ / 2;
+    std::fill(out, out + nv, 0.0);
+    const double sign = node > step ? 1.0 : -1.0;
+    for (long k = std::min(step, node); k < std::max(step, node); ++k) {
+        const double h = sign * (steps_.times[k + 1] - steps_.times[k]);
+        const double* rates = steps_.rates + k * steps_.width * n_;
+        for (int j = 0; j < whole_count_; ++j) add(h * whole_[j], rates + j * n_, out, nv);
+    }
+}
+
 // Divided differences of the states and rates at ends of steps, in the chart of the step.
-DenseOutput::Polynomial DenseOutput::through(long step, int count) {
+DenseOutput::Polynomial DenseOutput::through(System& system, long step, int count) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
     Polynomial out;
-    std::vector<double> slopes, rate(n_);
+    std::vector<double> slopes, rate(n_), near(n_ / 2);
     const long last = piece(step).second;
-    for (long i : nodes(step, count)) {
+    for (long i : nodes(system, step, count)) {
         const double at = (times[i] - times[step]) / h;
-        system_.difference(start, steps_.states + i * nx_, delta_.data());
-        system_.chart_rate(delta_.data(), rate_at(i, last), rate.data());
+        moved(step, i, near.data());
+        system.difference(start, steps_.states + i * nx_, near.data(), delta_.data());
+        system.chart_rate(delta_.data(), rate_at(i, last), rate.data());
         for (int twice = 0; twice < 2; ++twice) {
             out.points.push_back(at);
             out.coefficients.insert(out.coefficients.end(), delta_.begin(), delta_.end());
@@ -193,11 +225,11 @@ void DenseOutput::value(const Polynomial& polynomial, double theta, double* out)
 }
 
 // Degree 11 where degree 15 confirms it better than it confirms degree 7.
-const DenseOutput::Polynomial& DenseOutput::smooth(long step) {
+const DenseOutput::Polynomial& DenseOutput::smooth(System& system, long step) {
     Polynomial& out = smooth_[step];
     if (!out.points.empty()) return out;
     std::vector<Polynomial> tried;
-    for (int count : hermite_.nodes) tried.push_back(through(step, count));
+    for (int count : hermite_.nodes) tried.push_back(through(system, step, count));
     double changes[2] = {0.0, 0.0};
     std::vector<double> a(n_), b(n_);
     for (int k = 0; k < 2; ++k)

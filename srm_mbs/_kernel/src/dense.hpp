@@ -23,6 +23,7 @@ struct HermiteConstants {
 // The accepted steps, as arrays that the caller keeps alive.
 struct StepArrays {
     long count = 0;
+    double end = 0.0, slack = 0.0;  // of the run, and what of it may be read beyond
     int width = 0;  // rates per step
     bool corrected = false;
     const double *times, *states, *rates, *corrections, *sigmas, *end_rate;
@@ -33,10 +34,11 @@ struct StepArrays {
 
 class DenseOutput {
 public:
-    DenseOutput(System& system, Extension extension, std::vector<double> abscissae,
+    DenseOutput(int nq, int nv, Extension extension, std::vector<double> abscissae,
                 HermiteConstants hermite, StepArrays steps);
-    // States (k, nx) at the times t (k,).
-    void states(const double* t, long k, double* out);
+    // States (k, nx) at the times t (k,); `system` is any workspace of the mechanism.  Throws
+    // std::out_of_range for times outside the run.
+    void states(System& system, const double* t, long k, double* out);
 
 private:
     struct Polynomial {
@@ -47,23 +49,25 @@ private:
     const double* rate_at(long node, long last) const;
     bool close_to_singular(long step) const;
     void weights(double theta, double* out) const;
-    const std::vector<double>& extra(long step, double h);
-    void regular(long step, double theta, double* out);
-    const Polynomial& smooth(long step);
-    std::vector<long> nodes(long step, int count) const;
-    Polynomial through(long step, int count);
+    const std::vector<double>& extra(System& system, long step, double h);
+    void regular(System& system, long step, double theta, double* out);
+    const Polynomial& smooth(System& system, long step);
+    std::vector<long> nodes(const System& system, long step, int count) const;
+    void moved(long step, long node, double* out) const;
+    Polynomial through(System& system, long step, int count);
     void value(const Polynomial& polynomial, double theta, double* out) const;
 
-    System& system_;
     Extension extension_;
     std::vector<double> abscissae_;
     HermiteConstants hermite_;
     StepArrays steps_;
-    const int n_, nx_, nq_;
+    const int n_, nx_;
     std::vector<std::vector<double>> extra_;
     std::vector<Polynomial> smooth_;
     std::vector<char> near_;  // 0 unknown, 1 regular, 2 close to a singular configuration
     std::vector<double> delta_, x_, weights_;
+    std::vector<double> whole_;  // weights of the rates over a whole step,
+    const int whole_count_;      // as far as the steps have them: those of extra stages are zero
 };
 
 }  // namespace srm

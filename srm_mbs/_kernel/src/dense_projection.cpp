@@ -45,6 +45,17 @@ public:
         times_q(white);
     }
 
+    void multiplier(const double* white, double* g) const override {
+        const int n = count();
+        std::vector<double> x(white, white + n);
+        times_q_transposed(x.data());
+        std::fill(g, g + rows, 0.0);
+        for (int i = rank - 1; i >= 0; --i) {
+            const double z = g[order_[i]] = x[i] * inverse_pivots_[i];
+            add(-z, &A_[i * n], x.data(), i);
+        }
+    }
+
     void remove_normal(double* white) const override {
         times_q_transposed(white);
         std::fill(white, white + rank, 0.0);
@@ -79,7 +90,18 @@ public:
         }
     }
 
+    void complement(double* out) const override {
+        const int n = count();
+        for (int k = rank; k < n; ++k) {
+            double* column = out + (k - rank) * n;
+            std::fill(column, column + n, 0.0);
+            column[k] = 1.0;
+            times_q(column);
+        }
+    }
+
     bool sparse() const override { return false; }
+    std::size_t entries() const override { return A_.size(); }
 
 private:
     int count() const { return size ? size : nv; }
@@ -137,7 +159,7 @@ private:
         const int n = count();
         for (int j = 0; j < rows; ++j) {
             order_[j] = j;
-            squares_[j] = dot(&A_[j * n], &A_[j * n], n);
+            squares_[j] = row_squares_[j] = dot(&A_[j * n], &A_[j * n], n);
         }
         const int last = std::min(structural_rank, std::min(n, rows));
         for (int k = 0; k < last; ++k) {

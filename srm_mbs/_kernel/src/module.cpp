@@ -4,6 +4,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "algebra.hpp"
 #include "dense.hpp"
 #include "errors.hpp"
 #include "linear.hpp"
@@ -62,7 +63,8 @@ ControlConstants control_constants_of(const nb::dict& d) {
             number(d, "proportional"), number(d, "integral"),     number(d, "xi_old_floor"),
             number(d, "xi_floor"),     number(d, "failed_evaluation"),
             number(d, "sigma_change"), number(d, "too_close"),    number(d, "clearance"),
-            number(d, "ahead"),        whole(d, "max_redone"),    number(d, "turned"),
+            number(d, "ahead"),        whole(d, "max_redone"),    number(d, "beside"),
+            number(d, "arrival_change"), number(d, "turned"),
             whole(d, "guard_max_redone")};
 }
 
@@ -143,6 +145,7 @@ ControlState control_of(const nb::dict& d) {
     c.redone = whole(d, "redone");
     c.limit = number(d, "limit");
     c.tries = whole(d, "tries");
+    c.arrival = whole(d, "arrival");
     return c;
 }
 
@@ -158,6 +161,7 @@ nb::dict dict_of(const ControlState& c) {
     out["redone"] = c.redone;
     out["limit"] = c.limit;
     out["tries"] = c.tries;
+    out["arrival"] = c.arrival;
     return out;
 }
 
@@ -264,7 +268,9 @@ struct PySystem {
                                    nb::cast<int>(group[3])});
         }
         data.series = vector_of(d["series"]);
+        data.turning = nb::cast<std::vector<int>>(d["turning"]);
         data.largest_rotation = number(d, "largest_rotation");
+        data.farthest_node = number(d, "farthest_node");
         data.rotation_per_step = number(d, "rotation_per_step");
         Controller act;
         if (!controller.is_none()) {
@@ -302,6 +308,20 @@ struct PySystem {
         return out;
     }
 
+    // Length of the first step; see initial_step.
+    double first_step(double t, const Array& state, const Array& rate, const Array& magnitude,
+                      const Array& atol, const Array& one, double rtol, double span, int order,
+                      const nb::tuple& constants) {
+        ErrorNorm norm;
+        norm.atol = vector_of(atol);
+        norm.one = vector_of(one);
+        norm.rtol = rtol;
+        return initial_step(*system, norm, t, state.data(), rate.data(), magnitude.data(), span,
+                            order,
+                            {nb::cast<double>(constants[0]), nb::cast<double>(constants[1]),
+                             nb::cast<double>(constants[2])});
+    }
+
     // Evaluates the stage `repeats` times: the cost of one evaluation in the loop.
     void repeat(double t, const Array& state, long repeats) {
         std::vector<double> rate(2 * system->nv);
@@ -311,6 +331,13 @@ struct PySystem {
             system->evaluate(t, x, System::ZoneView{});
             system->rate(rate.data());
         }
+    }
+
+    // The part of `repeat` that is Pinocchio's: the pass over the tree.
+    void repeat_tree(const Array& state, long repeats) {
+        const double* x = state.data();
+        nb::gil_scoped_release released;
+        for (long i = 0; i < repeats; ++i) system->tree_terms(x);
     }
 };
 
@@ -337,7 +364,8 @@ struct PyRun {
         const auto placement = nb::cast<std::string>(d["placement"]);
         if (s.constrained() && placement == "automatic") {
             control = std::make_unique<SingularityPlacement>(std::move(control), scheme, t_end,
-                                                             control_constants);
+                                                             control_constants,
+                                                             nb::cast<bool>(d["arrivals"]));
             control = std::make_unique<BranchGuard>(std::move(control), s, control_constants);
         } else if (s.constrained()) {
             control = std::make_unique<SlopeOfSigma>(std::move(control), scheme);
@@ -417,15 +445,17 @@ struct PyRun {
                               run->zones_before + static_cast<long>(run->zones.size()));
     }
 
-    // The records since the start, which are handed over.
-    nb::dict arrays() {
+    // The records since the start `state` at `t0`, which are handed over.
+    nb::dict arrays(double t0, const Array& state) {
         Run& r = *run;
         const auto count = static_cast<std::size_t>(r.count());
         const auto n = static_cast<std::size_t>(2 * s.nv), nx = static_cast<std::size_t>(s.nq + s.nv);
         const auto width = static_cast<std::size_t>(r.step.scheme.stages + 1);
         nb::dict out;
-        out["times"] = owned(r.times, {count});
-        out["states"] = owned(r.states, {count, nx});
+        r.times.insert(r.times.begin(), t0);
+        r.states.insert(r.states.begin(), state.data(), state.data() + nx);
+        out["times"] = owned(std::move(r.times), {count + 1});
+        out["states"] = owned(std::move(r.states), {count + 1, nx});
         out["rates"] = owned(std::move(r.rates), {count, width, n});
         out["corrections"] = owned(std::move(r.corrections), {count, s.constrained() ? n : 0});
         out["sigmas"] = owned(std::move(r.sigmas), {count, width});
@@ -486,11 +516,11 @@ struct PyRun {
 };
 
 struct PyDense {
-    nb::object system, steps;  // kept alive
+    nb::object steps;  // kept alive
     std::unique_ptr<DenseOutput> dense;
     int nx;
 
-    PyDense(PySystem& owner, nb::object system_, const nb::dict& d) : system(system_), steps(d) {
+    PyDense(int nq, int nv, const nb::dict& d) : steps(d), nx(nq + nv) {
         Extension extension;
         extension.rows = vector_of(d["rows"]);
         extension.extra_A = vector_of(d["extra_A"]);
@@ -508,6 +538,8 @@ struct PyDense {
         arrays.corrections = pointer("corrections");
         arrays.sigmas = pointer("sigmas");
         arrays.end_rate = pointer("end_rate");
+        arrays.end = number(d, "end");
+        arrays.slack = number(d, "slack");
         arrays.count = nb::cast<long>(d["count"]);
         for (double i : vector_of(d["breaks"])) arrays.breaks.push_back(static_cast<long>(i));
         arrays.break_rates = pointer("break_rates");
@@ -515,17 +547,15 @@ struct PyDense {
         arrays.corrected = nb::cast<bool>(d["corrected"]);
         arrays.in_zone.assign(arrays.count, 0);
         for (long step : nb::cast<std::vector<long>>(d["zones"])) arrays.in_zone[step] = 1;
-        nx = owner.system->nq + owner.system->nv;
-        dense = std::make_unique<DenseOutput>(*owner.system, std::move(extension),
-                                              vector_of(d["abscissae"]), std::move(hermite),
-                                              std::move(arrays));
+        dense = std::make_unique<DenseOutput>(nq, nv, std::move(extension), vector_of(d["abscissae"]),
+                                              std::move(hermite), std::move(arrays));
     }
 
-    nb::object states(const Array& t) {
+    nb::object states(PySystem& owner, const Array& t) {
         const auto k = t.size();
         std::vector<double> out(k * static_cast<std::size_t>(nx));
         // With the interpreter's lock held: threads may read one solution, and share its workspace.
-        dense->states(t.data(), static_cast<long>(k), out.data());
+        dense->states(*owner.system, t.data(), static_cast<long>(k), out.data());
         return owned(std::move(out), {k, static_cast<std::size_t>(nx)});
     }
 };
@@ -571,17 +601,31 @@ NB_MODULE(_core, m) {
             PyErr_SetString(PyExc_ArithmeticError, "the stage cannot be evaluated");
         }
     });
+    m.def("lean_data", [](nb::object model) {
+        const void* found = model_in(model.ptr());
+        if (!found) throw nb::type_error("not a pinocchio.Model");
+        return nb::steal(lean_data(found));
+    });
+    bind_algebra(m);
     nb::class_<PySystem>(
         m, "System", nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller>()))
         .def(nb::init<nb::object, const nb::dict&, nb::object>(), nb::arg("model"),
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
         .def("repeat", &PySystem::repeat)
+        .def("repeat_tree", &PySystem::repeat_tree)
         .def("between", [](PySystem& s, double first, double last) { s.system->between(first, last); })
         .def("hold", [](PySystem& s, double t, const Array& force, bool keep) {
             if (static_cast<int>(force.size()) != s.system->nv) throw nb::value_error("not (nv,)");
             s.system->hold(t, force.data(), keep);
         })
+        .def("renew", [](PySystem& s, nb::handle unit, nb::handle gap_scale, nb::handle damping,
+                         nb::handle friction) {
+            s.system->renew(vector_of(unit), vector_of(gap_scale), vector_of(damping),
+                            vector_of(friction));
+        }, nb::arg("unit"), nb::arg("gap_scale"), nb::arg("damping").none(),
+           nb::arg("friction").none())
+        .def("first_step", &PySystem::first_step)
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
         .def_prop_ro("factorisations", [](const PySystem& s) { return s.system->factorisations(); });
@@ -619,10 +663,7 @@ NB_MODULE(_core, m) {
             return owned(r.run->state, {r.run->state.size()});
         });
     nb::class_<PyDense>(
-        m, "DenseOutput", nb::type_slots(collected<PyDense, &PyDense::system, &PyDense::steps>()))
-        .def("__init__",
-             [](PyDense* self, nb::object system, const nb::dict& d) {
-                 new (self) PyDense(nb::cast<PySystem&>(system), system, d);
-             })
+        m, "DenseOutput", nb::type_slots(collected<PyDense, &PyDense::steps>()))
+        .def(nb::init<int, int, const nb::dict&>())
         .def("states", &PyDense::states);
 }

@@ -22,6 +22,7 @@ Projection::Projection(int nv, int rows, int structural_rank, double sigma_ref)
       white_multiplier(nv),
       gamma_(rows),
       pivots_(structural_rank),
+      row_squares_(rows),
       work_(nv) {
     held_.reserve(nv);
 }

@@ -7,6 +7,7 @@
 // pivots and sigma of W are the same for all, white vectors are not.
 #pragma once
 
+#include <cstddef>
 #include <memory>
 #include <string>
 #include <vector>
@@ -32,6 +33,8 @@ public:
     virtual void normal(const double* g, double* white) const = 0;
     // white = Q Q^T L^T w, held normals included.
     void white_project(const double* w, double* white) const;
+    // g = Pi R^-1 Q^T x, the transpose of normal(): zero in the rows that are not in use.
+    virtual void multiplier(const double* white, double* g) const = 0;
     // Subtracts Q Q^T x from x, in place.
     virtual void remove_normal(double* white) const = 0;
     // x = L^T x and x = L^-T x, in place.
@@ -39,7 +42,14 @@ public:
     virtual void unwhiten(double* x) const = 0;
     // M-orthonormal normals L^-T Q (nv, rank).
     virtual void normals(double* out) const = 0;
+    // Orthonormal white vectors (nv, nv - rank) that the rows in use do not see.
+    virtual void complement(double* out) const = 0;
+    // |R_kk| (structural rank,), and the squares of the columns of W (rows,).
+    const std::vector<double>& pivots() const { return pivots_; }
+    const std::vector<double>& row_squares() const { return row_squares_; }
     virtual bool sparse() const = 0;
+    // Numbers that Q and R hold: what a factorisation and a product with them cost grows with it.
+    virtual std::size_t entries() const = 0;
 
     int nv, rows, structural_rank;
     double sigma_ref;
@@ -53,12 +63,12 @@ public:
 protected:
     Projection(int nv, int rows, int structural_rank, double sigma_ref);
 
-    // white_force, gamma_ and |R_kk| (pivots_) down to the structural rank.
+    // white_force, gamma_, row_squares_ and |R_kk| (pivots_) down to the structural rank.
     virtual void factorise(const double* M, const double* f, const double* bias) = 0;
     // x = Q Q^T x
     virtual void keep_normal(double* white) const = 0;
 
-    std::vector<double> gamma_, pivots_;
+    std::vector<double> gamma_, pivots_, row_squares_;
 
 private:
     std::vector<double> held_;

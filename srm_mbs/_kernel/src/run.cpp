@@ -130,6 +130,7 @@ void Run::resume(double t, const double* from, const Memory& known, const Contro
 Stop Run::attempt(Verdict& verdict) {
     const double limit = std::min(max_step_, system.step_limit(state.data()));
     const Proposal proposal = control->propose(t_, limit, memory);
+    if (proposal.arriving) return Stop::arrival;
     const double h = h_ = proposal.h;
     const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;

@@ -16,6 +16,7 @@ enum class Stop {
     closures = 4,    // the step made last opens the loops
     evaluation = 5,  // a fixed step could not be evaluated
     breakpoint = 6,  // the next piece begins, and Python has to look at it first
+    arrival = 7,     // the end lies beside a singular configuration: Python prepares for it
 };
 
 // The constants of srm_mbs/stepping/loop.py.

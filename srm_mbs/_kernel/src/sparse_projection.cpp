@@ -10,26 +10,22 @@ namespace srm {
 
 namespace {
 
-using Word = SparseProjection::Word;
-
 // Entries and changes below this part of a column's norm are left out.
 constexpr double negligible = 1e-17;
 // Columns whose largest norm is remembered together.
 constexpr int block = 32;
+// Columns up to which the working matrix is not packed: their bits fill one word.
+constexpr int few = 64;
+// Part of the columns that is still open when it is.
+constexpr double packing = 0.5;
+// In a packed matrix, reflections of at least so many rows, which fill this part of those from the
+// first to the last, run over all of these: contiguous numbers cost half as much as gathered ones.
+constexpr int long_reflection = 8;
+constexpr double dense_part = 0.5;
 // Part of W's entries up to which the sparse algebra is chosen.  Measured on the bundled mechanisms
 // and random ones of 6 to 96 coordinates: above it both cost about the same, except that the dense
 // one is up to 1.8 times as fast where a long chain makes W full; below it the sparse one wins.
 constexpr double densest = 0.5;
-
-int words_for(int bits) { return (bits + 63) / 64; }
-
-void set(Word* bits, int i) { bits[i >> 6] |= Word{1} << (i & 63); }
-void unset(Word* bits, int i) { bits[i >> 6] &= ~(Word{1} << (i & 63)); }
-
-template <class Act>
-void each_bit(Word word, int first, const Act& act) {
-    for (; word; word &= word - 1) act(first + __builtin_ctzll(word));
-}
 
 inline double gathered(const double* values, const int* rows, int n, const double* x) {
     double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
@@ -42,6 +38,28 @@ inline double gathered(const double* values, const int* rows, int n, const doubl
     }
     for (; i < n; ++i) s0 += values[i] * x[rows[i]];
     return (s0 + s1) + (s2 + s3);
+}
+
+// Room for `more` numbers after the first `used`.
+template <class Number>
+Number* room(std::vector<Number>& numbers, int used, int more) {
+    const std::size_t needed = static_cast<std::size_t>(used) + more;
+    if (numbers.size() < needed) numbers.resize(std::max(needed, 2 * numbers.size()));
+    return numbers.data() + used;
+}
+
+// The largest of numbers >= -1, by four partial ones.
+inline double greatest(const double* values, int n) {
+    double m0 = -1.0, m1 = -1.0, m2 = -1.0, m3 = -1.0;
+    int i = 0;
+    for (; i + 4 <= n; i += 4) {
+        m0 = std::max(m0, values[i]);
+        m1 = std::max(m1, values[i + 1]);
+        m2 = std::max(m2, values[i + 2]);
+        m3 = std::max(m3, values[i + 3]);
+    }
+    for (; i < n; ++i) m0 = std::max(m0, values[i]);
+    return std::max(std::max(m0, m1), std::max(m2, m3));
 }
 
 inline void scattered(double a, const double* values, const int* rows, int n, double* x) {
@@ -71,49 +89,26 @@ bool sparse_pays(const Pattern& pattern) {
     return entries <= densest * pattern.parents.size() * pattern.supports.size();
 }
 
-SparseProjection::BitSets::BitSets(int sets, int bits)
-    : first(sets), last(sets), stride_(words_for(bits)), words_(sets * std::size_t(stride_)) {}
-
-void SparseProjection::BitSets::clear() {
-    std::fill(words_.begin(), words_.end(), Word{0});
-    std::fill(first.begin(), first.end(), static_cast<int>(stride_));
-    std::fill(last.begin(), last.end(), -1);
-}
-
-void SparseProjection::BitSets::set(int which, int i) {
-    const int w = i >> 6;
-    srm::set(&words_[which * stride_], i);
-    first[which] = std::min(first[which], w);
-    last[which] = std::max(last[which], w);
-}
-
-inline void SparseProjection::BitSets::add(int which, const Word* bits, int from, int to) {
-    Word* own = &words_[which * stride_];
-    for (int w = from; w <= to; ++w) own[w] |= bits[w];
-    first[which] = std::min(first[which], from);
-    last[which] = std::max(last[which], to);
-}
-
-inline void SparseProjection::BitSets::add_to(int which, Word* bits) const {
-    const Word* own = &words_[which * stride_];
-    for (int w = first[which]; w <= last[which]; ++w) bits[w] |= own[w];
-}
-
 SparseProjection::SparseProjection(int structural_rank, double sigma_ref, const Pattern& pattern)
     : Projection(static_cast<int>(pattern.parents.size()),
                  static_cast<int>(pattern.supports.size()), structural_rank, sigma_ref),
       diagonal_(nv),
       inverse_(nv),
       A_(static_cast<std::size_t>(nv) * rows),
-      row_words_(words_for(nv)),
-      column_words_(words_for(rows)),
+      row_at_(nv),
+      column_at_(rows),
+      place_of_(rows),
+      new_row_(nv),
       rows_of_(rows, nv),
+      packed_rows_of_(rows, nv),
       columns_of_(nv, rows),
-      open_rows_(row_words_),
-      open_columns_(column_words_),
-      met_(column_words_),
-      changed_(column_words_),
-      own_rows_(row_words_),
+      open_rows_(words_for(nv)),
+      open_columns_(words_for(rows)),
+      met_(words_for(rows)),
+      changed_(words_for(rows)),
+      own_rows_(words_for(nv)),
+      at_(nv),
+      window_(nv),
       met_columns_(rows),
       along_(rows),
       squares_(rows),
@@ -189,8 +184,8 @@ void SparseProjection::whiten_columns(const double* bias) {
         scattered(-white_force[k], L_.data() + first, ancestors_.data() + first, n,
                   white_force.data());
     }
-    rows_of_.clear();
-    columns_of_.clear();
+    rows_of_.clear(rows, nv);
+    columns_of_.clear(nv, rows);
     for (int j = 0; j < rows; ++j) {
         double* a = column(j);
         const int start = support_start_[j], end = support_start_[j + 1];
@@ -205,7 +200,7 @@ void SparseProjection::whiten_columns(const double* bias) {
             along += a[k] * white_force[k];
         }
         gamma_[j] = along + bias[j];
-        squares_[j] = first_squares_[j] = squares;
+        squares_[j] = first_squares_[j] = row_squares_[j] = squares;
         if (!std::isfinite(squares)) {
             std::fill(A_.begin(), A_.end(), 0.0);
             throw EvaluationError{Failure::closures};
@@ -224,50 +219,111 @@ void SparseProjection::whiten_columns(const double* bias) {
 }
 
 void SparseProjection::start_pivots() {
-    for (int j = 0; j < rows; ++j) order_[j] = position_[j] = j;
-    std::fill(stale_.begin(), stale_.end(), 1);
-    std::fill(open_rows_.begin(), open_rows_.end(), Word{0});
-    for (int i = 0; i < nv; ++i) set(open_rows_.data(), i);
-    std::fill(open_columns_.begin(), open_columns_.end(), Word{0});
-    for (int j = 0; j < rows; ++j) set(open_columns_.data(), j);
-    reflection_row_.clear();
-    reflection_.clear();
-    right_column_.clear();
-    right_.clear();
-    steps_ = 0;
+    for (int i = 0; i < nv; ++i) row_at_[i] = i;
+    for (int j = 0; j < rows; ++j) order_[j] = position_[j] = column_at_[j] = place_of_[j] = j;
+    open_all(nv, rows);
+    reflection_start_[0] = right_start_[0] = steps_ = 0;
 }
 
-// Moves the column of the largest norm, the first by position among equals, to position k.
+// Working rows and columns, all of them open.
+void SparseProjection::open_all(int row_count, int column_count) {
+    row_count_ = row_count;
+    column_count_ = column_count;
+    std::fill(open_rows_.begin(), open_rows_.end(), Word{0});
+    for (int i = 0; i < row_count; ++i) set(open_rows_.data(), i);
+    std::fill(open_columns_.begin(), open_columns_.end(), Word{0});
+    for (int j = 0; j < column_count; ++j) set(open_columns_.data(), j);
+    std::fill(stale_.begin(), stale_.end(), 1);
+}
+
+// Leaves closed rows and columns out of the working matrix, and entries that have become negligible:
+// the open ones, far apart by now, are next to each other again, and so are their bits.
+void SparseProjection::pack(int open_columns) {
+    int row_count = 0;
+    for (int i = 0; i < row_count_; ++i) {
+        if (!has(open_rows_.data(), i)) continue;
+        row_at_[row_count] = row_at_[i];
+        new_row_[i] = row_count++;
+    }
+    packed_rows_of_.clear(open_columns, row_count);
+    columns_of_.clear(row_count, open_columns);
+    double* const A = A_.data();
+    const int* const new_row = new_row_.data();
+    int to = 0;
+    for (int j = 0; j < column_count_; ++j) {
+        const bool open = has(open_columns_.data(), j);
+        const Word* own = rows_of_.words(j);
+        double* const from = A + j * static_cast<std::size_t>(row_count_);
+        double* const packed = A + to * static_cast<std::size_t>(row_count);
+        const double least = least_[j];
+        int last = -1;
+        Word bits = 0;
+        for (int w = rows_of_.first[j]; w <= rows_of_.last[j]; ++w) {
+            const Word kept = open ? own[w] & open_rows_[w] : 0;
+            each_bit(own[w] & ~kept, w << 6, [&](int i) { from[i] = 0.0; });
+            // Numbers only move down, in ascending order: what is written has been read.
+            each_bit(kept, w << 6, [&](int i) {
+                const double value = from[i];
+                from[i] = 0.0;
+                if (!(std::abs(value) > least)) return;
+                const int row = new_row[i];
+                packed[row] = value;
+                if (row >> 6 != last) {
+                    if (last >= 0) packed_rows_of_.add(to, bits, last);
+                    last = row >> 6;
+                    bits = 0;
+                }
+                bits |= Word{1} << (row & 63);
+                columns_of_.set(row, to);
+            });
+        }
+        if (last >= 0) packed_rows_of_.add(to, bits, last);
+        if (!open) continue;
+        column_at_[to] = column_at_[j];
+        place_of_[column_at_[to]] = to;
+        position_[to] = position_[j];
+        squares_[to] = squares_[j];
+        first_squares_[to] = first_squares_[j];
+        least_[to] = least_[j];
+        ++to;
+    }
+    std::swap(rows_of_, packed_rows_of_);
+    open_all(row_count, to);
+}
+
+// Moves the column of the largest norm, the first by position among equals, to position k; its
+// place in the working matrix.
 int SparseProjection::next_pivot(int k) {
-    const auto before = [&](int a, int b) {
-        return squares_[a] > squares_[b] ||
-               (squares_[a] == squares_[b] && position_[a] < position_[b]);
-    };
-    const int blocks = static_cast<int>(best_.size());
+    const int blocks = (column_count_ + block - 1) / block;
     double largest = -1.0;
     for (int b = 0; b < blocks; ++b) {
         if (stale_[b]) {
-            const int first = b * block, end = std::min(rows, first + block);
-            int best = first;
-            for (int j = first + 1; j < end; ++j)
-                if (before(j, best)) best = j;
-            best_[b] = best;
-            best_square_[b] = squares_[best];
+            const int first = b * block, end = std::min(column_count_, first + block);
+            best_square_[b] = greatest(&squares_[first], end - first);
+            best_[b] = -1;
             stale_[b] = 0;
         }
         largest = std::max(largest, best_square_[b]);
     }
     int pivot = -1;
-    for (int b = 0; b < blocks; ++b)
-        if (best_square_[b] == largest && (pivot < 0 || position_[best_[b]] < position_[pivot]))
-            pivot = best_[b];
-    const int other = order_[k], place = position_[pivot];
-    order_[place] = other;
+    for (int b = 0; b < blocks; ++b) {
+        if (best_square_[b] != largest) continue;
+        int& best = best_[b];
+        if (best < 0) {
+            const int first = b * block, end = std::min(column_count_, first + block);
+            for (int j = first; j < end; ++j)
+                if (squares_[j] == largest && (best < 0 || position_[j] < position_[best])) best = j;
+        }
+        if (pivot < 0 || position_[best] < position_[pivot]) pivot = best;
+    }
+    const int other = place_of_[order_[k]], place = position_[pivot];
+    order_[place] = order_[k];
     position_[other] = place;
-    order_[k] = pivot;
+    order_[k] = column_at_[pivot];
     position_[pivot] = k;
     // Equal norms are told apart by positions.
-    stale_[pivot / block] = stale_[other / block] = 1;
+    best_[other / block] = -1;
+    stale_[pivot / block] = 1;
     squares_[pivot] = -1.0;
     unset(open_columns_.data(), pivot);
     return pivot;
@@ -275,29 +331,35 @@ int SparseProjection::next_pivot(int k) {
 
 // Reflection k, which takes what is left of a column to its largest row; false if nothing is left.
 bool SparseProjection::reflection(int k, int column) {
-    const std::size_t start = reflection_.size();
-    const double* a = this->column(column);
+    const double* a = working(column);
+    const double least = least_[column];
     const Word* own = rows_of_.words(column);
-    double squares = 0.0;
-    std::size_t top = start;
+    int* const at = at_.data();
+    double* const values = room(reflection_, reflection_start_[k], nv);
+    double squares = 0.0, largest = 0.0;
+    int n = 0, top = 0;
     own_first_ = rows_of_.first[column];
     own_last_ = rows_of_.last[column];
     for (int w = own_first_; w <= own_last_; ++w) {
-        own_rows_[w] = 0;
+        Word kept = 0;
         each_bit(own[w] & open_rows_[w], w << 6, [&](int i) {
             const double value = a[i];
-            if (!(std::abs(value) > least_[column])) return;
-            reflection_row_.push_back(i);
-            reflection_.push_back(value);
-            own_rows_[w] |= Word{1} << (i & 63);
+            if (!(std::abs(value) > least)) return;
+            kept |= Word{1} << (i & 63);
             squares += value * value;
-            if (std::abs(value) > std::abs(reflection_[top])) top = reflection_.size() - 1;
+            if (std::abs(value) > largest) {
+                largest = std::abs(value);
+                top = n;
+            }
+            at[n] = i;
+            values[n++] = value;
         });
+        own_rows_[w] = kept;
     }
-    const std::size_t n = reflection_.size() - start;
     if (n == 0) return false;
-    const double alpha = reflection_[top];
-    pivot_row_[k] = reflection_row_[top];
+    const double alpha = values[top];
+    pivot_ = at[top];
+    pivot_row_[k] = row_at_[pivot_];
     if (n == 1) {
         tau_[k] = 0.0;
         right_diagonal_[k] = alpha;
@@ -306,20 +368,24 @@ bool SparseProjection::reflection(int k, int column) {
         tau_[k] = (beta - alpha) / beta;
         right_diagonal_[k] = beta;
         const double scale = 1.0 / (alpha - beta);
-        for (std::size_t i = start; i < start + n; ++i) reflection_[i] *= scale;
+        for (int i = 0; i < n; ++i) values[i] *= scale;
     }
-    reflection_[top] = 1.0;
+    values[top] = 1.0;
+    int* const rows_at = room(reflection_row_, reflection_start_[k], n);
+    for (int i = 0; i < n; ++i) rows_at[i] = row_at_[at[i]];
+    reflection_start_[k + 1] = reflection_start_[k] + n;
     return true;
 }
 
 // Reflects the other columns, and takes the pivot row out of their norms.
 void SparseProjection::apply(int k) {
     const int start = reflection_start_[k], n = reflection_start_[k + 1] - start;
-    const int* at = reflection_row_.data() + start;
+    const int* at = at_.data();
     const double* v = reflection_.data() + start;
-    const int pivot = pivot_row_[k];
+    const int pivot = pivot_;
     const double tau = tau_[k];
-    int first = column_words_, last = -1;
+    int first = static_cast<int>(met_.size()), last = -1;
+    int first_changed = column_count_, last_changed = -1;
     for (int i = 0; i < n; ++i) {
         first = std::min(first, columns_of_.first[at[i]]);
         last = std::max(last, columns_of_.last[at[i]]);
@@ -335,44 +401,59 @@ void SparseProjection::apply(int k) {
     }
     double* const A = A_.data();
     const double* const least = least_.data();
-    const std::size_t stride = nv;
+    const std::size_t stride = row_count_;
     double* const along = along_.data();
-    if (tau != 0.0) {
+    const int low = at[0], span = at[n - 1] - low + 1;
+    const bool dense = row_count_ < nv && n >= long_reflection && n >= dense_part * span;
+    double* const window = window_.data();
+    if (dense) {
+        std::fill_n(window, span, 0.0);
+        for (int i = 0; i < n; ++i) window[at[i] - low] = v[i];
+        for (int c = 0; c < count; ++c)
+            along[c] = tau * dot(window, A + met[c] * stride + low, span);
+    } else if (tau != 0.0) {
         for (int c = 0; c < count; ++c) along[c] = tau * gathered(v, at, n, A + met[c] * stride);
-        const double length = std::sqrt(2.0 / tau);
-        for (int c = 0; c < count; ++c) {
-            const int j = met[c];
-            if (!(std::abs(along[c]) * length > least[j])) continue;
-            scattered(-along[c], v, at, n, A + j * stride);
-            rows_of_.add(j, own_rows_.data(), own_first_, own_last_);
-            srm::set(changed_.data(), j);
-        }
+    } else {
+        std::fill_n(along, count, 0.0);
     }
-    const std::size_t start_right = right_.size();
-    right_.resize(start_right + count);
-    right_column_.resize(start_right + count);
-    double* const right = right_.data() + start_right;
-    int* const right_column = right_column_.data() + start_right;
+    // A change by along v is one of length |along| |v|.
+    const double length = tau != 0.0 ? std::sqrt(2.0 / tau) : 0.0;
+    double* const right = room(right_, right_start_[k], count);
+    int* const right_column = room(right_column_, right_start_[k], count);
     int kept = 0;
     for (int c = 0; c < count; ++c) {
         const int j = met[c];
-        const double value = A[j * stride + pivot];
+        double* const a = A + j * stride;
+        if (std::abs(along[c]) * length > least[j]) {
+            if (dense)
+                add(-along[c], window, a + low, span);
+            else
+                scattered(-along[c], v, at, n, a);
+            rows_of_.add(j, own_rows_.data(), own_first_, own_last_);
+            set(changed_.data(), j);
+            first_changed = std::min(first_changed, j >> 6);
+            last_changed = j >> 6;
+        }
+        const double value = a[pivot];
         if (!(std::abs(value) > least[j])) continue;
-        right_column[kept] = j;
+        right_column[kept] = column_at_[j];
         right[kept++] = value;
-        squares_[j] -= value * value;
-        if (squares_[j] <= norm_lost * first_squares_[j])
-            squares_[j] = first_squares_[j] = remaining_squares(j);
         // Norms only fall: those of the others in a block stay below its largest.
-        if (best_[j / block] == j) stale_[j / block] = 1;
+        if (squares_[j] == best_square_[j / block]) stale_[j / block] = 1;
+        squares_[j] -= value * value;
+        if (squares_[j] <= norm_lost * first_squares_[j]) {
+            squares_[j] = first_squares_[j] = remaining_squares(j);
+            stale_[j / block] = 1;
+        }
     }
-    right_.resize(start_right + kept);
-    right_column_.resize(start_right + kept);
-    for (int i = 0; i < n; ++i) columns_of_.add(at[i], changed_.data(), first, last);
+    right_start_[k + 1] = right_start_[k] + kept;
+    if (last_changed < 0) return;
+    for (int i = 0; i < n; ++i)
+        columns_of_.add(at[i], changed_.data(), first_changed, last_changed);
 }
 
 double SparseProjection::remaining_squares(int column) const {
-    const double* a = &A_[static_cast<std::size_t>(column) * nv];
+    const double* a = working(column);
     const Word* own = rows_of_.words(column);
     double squares = 0.0;
     for (int w = rows_of_.first[column]; w <= rows_of_.last[column]; ++w)
@@ -383,14 +464,11 @@ double SparseProjection::remaining_squares(int column) const {
 void SparseProjection::pivoted_qr() {
     start_pivots();
     for (int k = 0; k < structural_rank; ++k) {
+        if (column_count_ > few && rows - k <= packing * column_count_) pack(rows - k);
         const int column = next_pivot(k);
-        reflection_start_[k] = static_cast<int>(reflection_.size());
-        right_start_[k] = static_cast<int>(right_.size());
         // All columns left are zero: no pivot from here on is used.
         if (!reflection(k, column)) break;
-        reflection_start_[k + 1] = static_cast<int>(reflection_.size());
         apply(k);
-        right_start_[k + 1] = static_cast<int>(right_.size());
         steps_ = k + 1;
     }
     for (int k = 0; k < structural_rank; ++k)
@@ -399,8 +477,8 @@ void SparseProjection::pivoted_qr() {
 
 // The working columns are zero again, but for the supports that the next evaluation writes.
 void SparseProjection::clear() {
-    for (int j = 0; j < rows; ++j) {
-        double* a = column(j);
+    for (int j = 0; j < column_count_; ++j) {
+        double* a = working(j);
         const Word* own = rows_of_.words(j);
         for (int w = rows_of_.first[j]; w <= rows_of_.last[j]; ++w)
             each_bit(own[w], w << 6, [&](int i) { a[i] = 0.0; });
@@ -449,6 +527,18 @@ void SparseProjection::normal(const double* g, double* white) const {
     times_q(white);
 }
 
+void SparseProjection::multiplier(const double* white, double* g) const {
+    std::vector<double> x(white, white + nv);
+    times_q_transposed(x.data());
+    std::fill(g, g + rows, 0.0);
+    for (int k = rank - 1; k >= 0; --k) {
+        const int start = right_start_[k];
+        const double known = gathered(right_.data() + start, right_column_.data() + start,
+                                      right_start_[k + 1] - start, g);
+        g[order_[k]] = (x[pivot_row_[k]] - known) / right_diagonal_[k];
+    }
+}
+
 void SparseProjection::keep_normal(double* white) const {
     times_q_transposed(white);
     double* kept = scratch_.data();
@@ -485,6 +575,18 @@ void SparseProjection::normals(double* out) const {
             high = std::max(high, at[n - 1]);
         }
         unwhiten(x);
+    }
+}
+
+void SparseProjection::complement(double* out) const {
+    std::vector<char> in_use(nv);
+    for (int k = 0; k < rank; ++k) in_use[pivot_row_[k]] = 1;
+    for (int i = 0; i < nv; ++i) {
+        if (in_use[i]) continue;
+        std::fill(out, out + nv, 0.0);
+        out[i] = 1.0;
+        times_q(out);
+        out += nv;
     }
 }
 

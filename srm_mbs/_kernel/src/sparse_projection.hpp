@@ -8,16 +8,17 @@
 //
 // Along a chain of loops the entries of Q and R decay geometrically without becoming zero: what
 // falls below `negligible` of a column's norm, a tenth of the rounding error of the dense
-// algebra, is left out.  That makes the cost proportional to the number of loops.
+// algebra, is left out.  That bounds the rows of a reflection and the columns that it meets.  What
+// is left when half of the columns are done is packed, so that it lies together.
 //
 // Equal norms are told apart by position as in the dense algebra, but rounding differs: of two
 // columns whose norms agree to rounding, either may be the pivot.
 #pragma once
 
 #include <cstddef>
-#include <cstdint>
 #include <vector>
 
+#include "bit_sets.hpp"
 #include "projection.hpp"
 
 namespace srm {
@@ -34,41 +35,34 @@ public:
 
     double* column(int row) override { return &A_[static_cast<std::size_t>(row) * nv]; }
     void normal(const double* g, double* white) const override;
+    void multiplier(const double* white, double* g) const override;
     void remove_normal(double* white) const override;
     void whiten_velocity(double* x) const override;
     void unwhiten(double* x) const override;
     void normals(double* out) const override;
+    void complement(double* out) const override;
     bool sparse() const override { return true; }
-
-    using Word = std::uint64_t;
+    std::size_t entries() const override {
+        return static_cast<std::size_t>(reflection_start_[steps_]) + right_start_[steps_];
+    }
 
 private:
-    // Sets of bits, each with the range of its words that are not zero.
-    class BitSets {
-    public:
-        BitSets(int sets, int bits);
-        void clear();
-        void set(int which, int i);
-        void add(int which, const Word* bits, int from, int to);
-        void add_to(int which, Word* bits) const;
-        const Word* words(int which) const { return &words_[which * stride_]; }
-        std::vector<int> first, last;
-
-    private:
-        std::ptrdiff_t stride_;
-        std::vector<Word> words_;
-    };
-
     void factorise(const double* M, const double* f, const double* bias) override;
     void keep_normal(double* white) const override;
     void cholesky(const double* M);
     void whiten_columns(const double* bias);
     void pivoted_qr();
     void start_pivots();
+    void open_all(int row_count, int column_count);
+    void pack(int open_columns);
     int next_pivot(int k);
     bool reflection(int k, int column);
     void apply(int k);
     double remaining_squares(int column) const;
+    double* working(int place) { return &A_[static_cast<std::size_t>(place) * row_count_]; }
+    const double* working(int place) const {
+        return &A_[static_cast<std::size_t>(place) * row_count_];
+    }
     void clear();
     void times_q(double* x) const;
     void times_q_transposed(double* x) const;
@@ -80,18 +74,26 @@ private:
     // Rows of W's columns, ascending, with all ancestors.
     std::vector<int> support_start_, support_;
 
-    // Working columns (nv, rows), zero outside their rows; bit sets of the rows of each column and
-    // of the columns of each row.
+    // Working columns (row_count_, column_count_), zero outside their rows; bit sets of the rows of
+    // each column and of the columns of each row.  All of W at first; then pack() keeps those that
+    // are open, in their order: working row i is row row_at_[i], working column j is column
+    // column_at_[j], and place_of_ its inverse.
     std::vector<double> A_;
-    int row_words_, column_words_;
-    BitSets rows_of_, columns_of_;
+    int row_count_ = 0, column_count_ = 0;
+    std::vector<int> row_at_, column_at_, place_of_, new_row_;
+    BitSets rows_of_, packed_rows_of_, columns_of_;
     std::vector<Word> open_rows_, open_columns_, met_, changed_, own_rows_;
+    // The reflection at hand: its working rows and its pivot's, and its values from the first of
+    // these rows to the last.
+    std::vector<int> at_;
+    int pivot_ = 0;
+    std::vector<double> window_;
     int own_first_ = 0, own_last_ = -1;
     std::vector<int> met_columns_;
     std::vector<double> along_, squares_, first_squares_, least_;
 
-    // Pivots: columns by position as in the dense algebra, which swaps them; blocks of columns
-    // remember their largest norm.
+    // Pivots: columns by position as in the dense algebra, which swaps them (order_), and positions
+    // of the working columns; blocks of these remember their largest norm.
     std::vector<int> order_, position_, best_;
     std::vector<char> stale_;
     std::vector<double> best_square_;

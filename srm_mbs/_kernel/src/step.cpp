@@ -17,6 +17,34 @@ double ErrorNorm::ratio(const double* error, const double* weights, int n) {
     return std::sqrt(sum / n);
 }
 
+double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
+                    const double* rate, const double* magnitude, double span, int order,
+                    const FirstStepConstants& constants) {
+    const int n = 2 * system.nv;
+    std::vector<double> weights(n), error(n), there(n), probed(n), x(system.nq + system.nv);
+    for (int i = 0; i < n; ++i) {
+        weights[i] = norm.weight(i, magnitude[i]);
+        error[i] = std::max(magnitude[i], norm.one[i]);
+    }
+    const double d0 = ErrorNorm::ratio(error.data(), weights.data(), n);
+    if (!finite(rate, n) || !(largest(rate, n) < constants.overflow))
+        throw EvaluationError{Failure::not_finite};
+    const double d1 = ErrorNorm::ratio(rate, weights.data(), n);
+    if (!(d1 > 0.0)) return constants.probe * span;
+    const double h0 = std::min(constants.probe * d0 / d1, span);
+    for (int i = 0; i < n; ++i) error[i] = h0 * rate[i];
+    system.retract(state, error.data(), x.data());
+    system.evaluate(t + h0, x.data(), System::ZoneView{});
+    system.rate(there.data());
+    system.chart_rate(error.data(), there.data(), probed.data());
+    for (int i = 0; i < n; ++i) probed[i] -= rate[i];
+    const double d2 = ErrorNorm::ratio(probed.data(), weights.data(), n) / h0;
+    const double longest = constants.longest * h0;
+    if (!(d2 > 0.0)) return std::min(longest, span);
+    const double tau = d1 / d2;
+    return std::min({longest, tau * std::pow(constants.probe / (tau * d1), 1.0 / order), span});
+}
+
 SplitStep::SplitStep(System& system, Scheme scheme_, StepConstants constants_, ErrorNorm norm_)
     : scheme(std::move(scheme_)),
       norm(std::move(norm_)),

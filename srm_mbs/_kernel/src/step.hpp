@@ -31,6 +31,14 @@ struct ErrorNorm {
     static double ratio(const double* error, const double* weights, int n);
 };
 
+// Twin of srm_mbs/stepping/stepsize.py, initial_step, and its constants.
+struct FirstStepConstants {
+    double overflow, probe, longest;
+};
+double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
+                    const double* rate, const double* magnitude, double span, int order,
+                    const FirstStepConstants& constants);
+
 struct Memory {
     std::vector<double> rate, magnitude;  // (n,)
     double sigma = 0.0, sigma_slope = 0.0;

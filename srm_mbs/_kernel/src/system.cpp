@@ -207,6 +207,19 @@ void System::hold(double t, const double* force, bool keep) {
     held_.insert(held_.end(), force, force + nv);
 }
 
+void System::renew(std::vector<double> unit, std::vector<double> gap_scale,
+                   std::vector<double> damping, std::vector<double> friction) {
+    data_.unit = std::move(unit);
+    data_.gap_scale = std::move(gap_scale);
+    data_.damping = std::move(damping);
+    data_.friction = std::move(friction);
+    held_from_.clear();
+    held_.clear();
+    between(-std::numeric_limits<double>::infinity(), std::numeric_limits<double>::infinity());
+    evaluations = 0;
+    if (closed_) projection_->factorisations = 0;
+}
+
 bool System::holds(const double* force) const {
     return held_.size() >= static_cast<std::size_t>(nv) &&
            std::equal(force, force + nv, held_.end() - nv);
@@ -243,6 +256,16 @@ void System::update_drives(double t, bool with_bias) {
         if (drive.wound)  // the turn that is nearest
             g_[row] = drive.factor * std::remainder(g_[row] / drive.factor, two_pi);
     }
+}
+
+void System::tree_terms(const double* state) {
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    if (closed_)
+        pinocchio_model::compute_terms(w);
+    else
+        pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
 }
 
 void System::evaluate(double t, const double* state, const ZoneView& zone) {
@@ -372,7 +395,18 @@ void System::retract(const double* state, const double* delta, double* out) {
     std::copy(w.q2.data(), w.q2.data() + nq, out);
 }
 
-void System::difference(const double* start, const double* end, double* out) {
+bool System::reachable(const double* start, const double* end) const {
+    if (data_.groups.empty()) return true;
+    const Eigen::VectorXd from = Eigen::Map<const Eigen::VectorXd>(start, nq);
+    const Eigen::VectorXd to = Eigen::Map<const Eigen::VectorXd>(end, nq);
+    Eigen::VectorXd moved(nv);
+    pinocchio::difference(work_->model, from, to, moved);
+    return std::all_of(data_.groups.begin(), data_.groups.end(), [&](const GroupJoint& joint) {
+        return joint.rotation(moved.data()) <= data_.farthest_node;
+    });
+}
+
+void System::difference(const double* start, const double* end, const double* near, double* out) {
     if (flat_) {
         for (int i = 0; i < 2 * nv; ++i) out[i] = end[i] - start[i];
         return;
@@ -390,6 +424,8 @@ void System::difference(const double* start, const double* end, double* out) {
     from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
     pinocchio::difference(w.model, from, to, step);
     for (int i = 0; i < nv; ++i) out[i] += step[i];
+    constexpr double turn = 2.0 * EIGEN_PI;
+    for (int i : data_.turning) out[i] += turn * std::nearbyint((near[i] - out[i]) / turn);
 }
 
 void System::chart_rate(const double* delta, const double* rate, double* out) const {

@@ -72,7 +72,8 @@ struct SystemData {
     double coincident = 0.0;
     std::vector<GroupJoint> groups;
     std::vector<double> series;         // of dexp^-1
-    double largest_rotation = 0.0, rotation_per_step = 0.0;
+    std::vector<int> turning;           // velocity indices of (cos, sin) joints
+    double largest_rotation = 0.0, farthest_node = 0.0, rotation_per_step = 0.0;
 };
 
 class System {
@@ -90,6 +91,8 @@ public:
     };
 
     void evaluate(double t, const double* state, const ZoneView& zone);
+    // The pass over the tree that an evaluation begins with, alone: to measure it.
+    void tree_terms(const double* state);
     // Evaluates at times within [first, last] only: on one side of a breakpoint.
     void between(double first, double last) {
         first_ = first;
@@ -98,6 +101,9 @@ public:
     // From t on a constant force (nv,) acts, beside all others; with `keep` those before stay in
     // force at earlier times.
     void hold(double t, const double* force, bool keep);
+    // As if it were new, at another start: what depends on that.
+    void renew(std::vector<double> unit, std::vector<double> gap_scale,
+               std::vector<double> damping, std::vector<double> friction);
     // Whether `force` (nv,) is what acts now.
     bool holds(const double* force) const;
 
@@ -116,7 +122,9 @@ public:
 
     // The manifold.
     void retract(const double* state, const double* delta, double* out);
-    void difference(const double* start, const double* end, double* out);
+    // Angles that count no turns take the one nearest to the motion near (nv,).
+    void difference(const double* start, const double* end, const double* near, double* out);
+    bool reachable(const double* start, const double* end) const;
     void chart_rate(const double* delta, const double* rate, double* out) const;
     double size(const double* positions) const;  // of dq (nv,), in units
     void magnitudes(const double* state, double* out) const;

@@ -3,6 +3,7 @@
 
 #include <pinocchio/multibody.hpp>
 
+#include "lean_data.hpp"
 #include "terms.hpp"
 
 namespace pinocchio_model {
@@ -13,12 +14,9 @@ using Argument = Eigen::Ref<const Eigen::VectorXd>;
 
 struct Workspace {
     explicit Workspace(const pinocchio::Model& model)
-        : model(model), data(model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv),
+        : model(model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv),
           one_pass(has_usual_joints(model)) {
-        // nv^3 numbers each, for second derivatives: gigabytes from some hundred joints.
-        for (auto* tensor : {&data.d2tau_dqdq, &data.d2tau_dvdv, &data.d2tau_dqdv, &data.d2tau_dadq,
-                             &data.kinematic_hessians})
-            tensor->resize(0, 0, 0);
+        prepare(data, model);
     }
     const pinocchio::Model& model;
     pinocchio::Data data;

@@ -1,0 +1,10 @@
+// The constraint algebra on its own, for the analysis of a mechanism.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace srm {
+
+void bind_algebra(nanobind::module_& m);
+
+}  // namespace srm

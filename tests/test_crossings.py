@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
 from srm_mbs.stepping import crossings as crossings_module
 from tests import reduced
-from tests.mechanisms import ball_dead_point, floating_slider_crank
+from tests.mechanisms import along_x, ball_dead_point, floating_slider_crank, rod
 
 PI = np.pi
 
@@ -240,3 +241,38 @@ def test_what_is_expensive_is_computed_when_it_is_read(monkeypatch: pytest.Monke
     assert first.loops == ("pin",)
     assert len(first.branches) == 2
     assert len(calls) == 1
+
+
+def slender_slider_crank(thickness: float) -> srm.Mechanism:
+    """slider_crank with ball joints, which closures hold as hinges, and rods of that ratio of axial
+    to transverse inertia."""
+    base = srm.load("slider_crank")
+    model = pin.Model()
+    model.name = "slender_slider_crank"
+    model.gravity.linear = base.model.gravity.linear
+    crank = model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "crank")
+    tip = model.addJoint(crank, pin.JointModelSpherical(), along_x(2.0), "rod")
+    for joint, name in ((crank, "crank"), (tip, "rod")):
+        model.appendBodyToJoint(joint, rod(1.0, 2.0, thickness), pin.SE3.Identity())
+        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+    axis = (0.0, 1.0, 0.0)
+    ends = srm.Anchor("crank", xyz=(2.0, 0.0, 0.0)), srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
+    loops = (
+        srm.LoopClosure("revolute", srm.Anchor("crank"), srm.Anchor("world"), axis, "pivot"),
+        srm.LoopClosure("revolute", srm.Anchor("rod"), ends[0], axis, "hinge"),
+        srm.LoopClosure("point_on_plane", ends[1], srm.Anchor("world"), (0.0, 0.0, 1.0), "pin"),
+    )
+    halves = -0.5 * base.q0
+    q = [x for half in halves for x in (0.0, np.sin(half), 0.0, np.cos(half))]
+    return srm.Mechanism(model, loops, q0=q)
+
+
+@pytest.mark.parametrize("thickness", [1e-4, 1e-2, 1.0])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+def test_passages_are_listed_where_slender_bodies_make_the_last_pivot_small_everywhere(
+    thickness: float, rtol: float
+) -> None:
+    expected = srm.simulate(srm.load("slider_crank"), 10.0, rtol=1e-10).crossings
+    found = srm.simulate(slender_slider_crank(thickness), 10.0, rtol=rtol).crossings
+    assert [c.time for c in found] == pytest.approx([c.time for c in expected], abs=1e-4)
+    assert all(c.loops == ("pin",) and not c.switched for c in found)

@@ -62,6 +62,11 @@ class Bifurcation:
         return self._passage.loops
 
     @property
+    def drives(self) -> tuple[str, ...]:
+        """Names of the drives whose rows do so with them."""
+        return self._passage.drives
+
+    @property
     def branches(self) -> FloatArray:
         """Velocity directions (k, nv) of the branches that meet there; see
         :attr:`~srm_mbs.stepping.crossings.Crossing.branches`."""
@@ -74,15 +79,15 @@ class Bifurcation:
         return self._passage.arrived_on
 
     def __str__(self) -> str:
-        loops = ", ".join(map(repr, self.loops))
         span = f"From t = {self.start:.6g} to {self.end:.6g} s the motion stayed"
         moment = f"At t = {self.start:.6g} s the motion turned back"
         kept = "" if self.kept is None else f", number {self.kept}"
         did = "stopped there" if self.stopped else f"kept the one it came along{kept}"
         return (
-            f"{span if self.end > self.start else moment} next to a singular configuration of the "
-            f"closures (loops {loops}) without the momentum to choose one of the "
-            f"{len(self.branches)} branches that meet there: the run {did} (solution.bifurcations)"
+            f"{span if self.end > self.start else moment} next to a singular "
+            f"configuration of {self._passage.participants} without the "
+            f"momentum to choose one of the {len(self.branches)} branches that meet there: the run "
+            f"{did} (solution.bifurcations)"
         )
 
 
@@ -118,7 +123,7 @@ def _turn(watched: Watched, t: FloatArray) -> float:
     """When, within the times t (k,), the motion turns back."""
     from scipy.optimize import brentq
 
-    unit = watched.geometry.unit
+    unit = watched.geometry.coordinate_unit
 
     def rates(times: FloatArray) -> FloatArray:
         return np.array([v for _, v in watched.states(times)]) / unit
@@ -151,7 +156,7 @@ def find_bifurcations(
     failed
         Whether the run could not go on from its last state.
     """
-    if not isinstance(system, ClosedSystem) or not steps.count or not system.mechanism.loops:
+    if not isinstance(system, ClosedSystem) or not steps.count:
         return ()
     if not steps.held.any() and not steps.sigmas.min() < LOOKED_AT:
         return ()
@@ -171,7 +176,7 @@ def find_bifurcations(
         # Where a motion turns back tells whether it had the momentum to pass: it may have passed
         # and come back within the step.
         closest = _closest(watched, t) if stayed or stopped else _turn(watched, t)
-        q = watched.q(closest)
+        q = watched.place(closest)
         singular = nearest_singular(watched.geometry, q, watched.rank, WITHIN)
         if singular is None:
             continue

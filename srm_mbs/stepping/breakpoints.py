@@ -19,6 +19,7 @@ from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.methods.base import ErrorNorm, Memory, Method
 from srm_mbs.methods.branch import ROUNDING
 from srm_mbs.methods.zone import ZONE_LARGEST
+from srm_mbs.stepping.arriving import arrive
 from srm_mbs.stepping.starting import LOOK, start
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 
@@ -163,7 +164,8 @@ def beside_singular(
 
 
 class Passing:
-    """What happens at the breakpoints of a run; used by the drivers.
+    """What happens at the breakpoints of a run, and before those, or an end, that lie beside a
+    singular configuration; used by the drivers.
 
     Parameters
     ----------
@@ -178,6 +180,8 @@ class Passing:
     ----------
     sample
         Called with (t, state) at the marked breakpoints, before anything is evaluated there.
+    arrivals
+        Whether :meth:`arrive` can do anything.
     """
 
     def __init__(
@@ -194,6 +198,7 @@ class Passing:
         self._norm = norm
         self._evaluator = system if evaluator is None else evaluator
         self.sample: Callable[[float, FloatArray], None] | None = None
+        self.arrivals = isinstance(system, ClosedSystem)
         self._index = 0
         self._nearness = Nearness()
         self._evaluate_within(0)
@@ -252,6 +257,19 @@ class Passing:
         return beside_singular(
             self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
         )
+
+    def arrive(
+        self, t: float, state: FloatArray, memory: Memory, index: int | None = None
+    ) -> Memory:
+        """``memory`` with the multipliers known up to the end of the piece, which lies beside a
+        singular configuration; see :func:`~srm_mbs.stepping.arriving.arrive`.
+
+        ``index``: of that piece, if the kernel went on to it by itself.
+        """
+        if index is not None and index != self._index:
+            self._index = index
+            self._evaluate_within(index)
+        return arrive(self._system, t, state, memory, self._norm, self.end)
 
     def done(self) -> None:
         """The run is over: the system may be evaluated at any time."""

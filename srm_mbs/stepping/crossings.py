@@ -1,6 +1,7 @@
 """Singular passages of a run, found after the fact on its dense output.
 
-The recorded sigmas tell between which stages sigma may have passed zero.  There the smallest
+The recorded sigmas tell between which stages sigma may have passed zero; where they are blunt, the
+smallest singular values of the closures at the stages do.  There the smallest
 singular value of the closures is followed on the dense output.  A minimum of it is a passage if the
 part of G that loses rank changes sign across it, as it does when the motion goes through, or
 changes altogether, when it leaves on another branch; a motion that turns back, or passes by, keeps
@@ -18,12 +19,14 @@ from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.dense import PLACEMENTS, DenseOutput, StepData
 from srm_mbs.systems.branches import branch_tangents
-from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.driven_geometry import geometry_of
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 from srm_mbs.systems.singular import (
+    Participants,
     SingularConfiguration,
     analyse_singular,
     nearest_singular,
+    participants,
     smallest_singular_value,
 )
 
@@ -33,6 +36,9 @@ NEAR_ZERO = 0.05
 """Part of the sigmas around that sigma must be able to reach between two stages."""
 LINGERS = 0.05
 """sigma below which a motion is close to a singular configuration, wherever it comes from."""
+BLUNT = 0.1
+"""Usual size of the last pivot below which it is small for other reasons than singular
+configurations nearby, such as a slender body whose turning about its axis a closure holds."""
 SUBDIVISION = 4
 """Samples on the dense output per interval between two stages."""
 LEFT_AT = 0.02
@@ -48,6 +54,8 @@ TURNED_BACK = 0.9
 """Cosine from which what is lost is the same before and after: the motion did not go through."""
 TOUCHES = 1e-6
 """Below this part of the values around, it touched the singular configuration nevertheless."""
+ALIKE = 2.0
+"""Singular values up to this multiple of the smallest vanish with it."""
 REFINEMENTS = 12
 WITHIN = 0.3
 """How far (units) from the dense output the singular configuration is looked for."""
@@ -56,12 +64,12 @@ BESIDE = 0.05
 
 
 class Watched:
-    """The closures along the dense output of a run."""
+    """The closures and drives along the dense output of a run."""
 
     def __init__(self, system: ClosedSystem, dense: DenseOutput) -> None:
         mechanism = system.mechanism
-        self.geometry = ClosureGeometry(mechanism, mechanism.q0)
-        self.rank = mechanism.structure.loop_rank
+        self.geometry = geometry_of(mechanism, mechanism.q0)
+        self.rank = mechanism.structure.rank
         self._system = system
         self._dense = dense
 
@@ -69,15 +77,15 @@ class Watched:
         """(q, v) at the times t (k,)."""
         return [self._system.split(state) for state in self._dense(t)]
 
-    def q(self, t: float) -> FloatArray:
-        """Configuration (nq,) at t."""
-        return self.states(np.array([t]))[0][0]
+    def place(self, t: float) -> FloatArray:
+        """Configuration at t, as the geometry takes it."""
+        return self.geometry.at(self.states(np.array([t]))[0][0], t)
 
     def smallest(self, t: FloatArray) -> FloatArray:
         """Last structural singular value of the normalised G at the times t (k,)."""
-        return np.array(
-            [smallest_singular_value(self.geometry, q, self.rank) for q, _ in self.states(t)]
-        )
+        geometry = self.geometry
+        places = (geometry.at(q, time) for time, (q, _) in zip(t.tolist(), self.states(t)))
+        return np.array([smallest_singular_value(geometry, x, self.rank) for x in places])
 
     def minimum(self, t: FloatArray, values: FloatArray) -> tuple[float, float]:
         """Time and value of the minimum bracketed by t (3,), values (3,) there.
@@ -142,28 +150,43 @@ class Crossing:
         """The local analysis at the exactly singular configuration nearest to the passage; None
         if there is none close to it."""
         watched = self._watched
-        q = watched.q(self.time)
-        found = nearest_singular(watched.geometry, q, watched.rank, WITHIN)
+        found = nearest_singular(watched.geometry, watched.place(self.time), watched.rank, WITHIN)
         return None if found is None else analyse_singular(watched.geometry, found, watched.rank)
 
     @property
     def configuration(self) -> FloatArray | None:
         """That configuration (nq,)."""
-        return None if self.singular is None else self.singular.q
+        return None if self.singular is None else self.singular.q[: self._watched.geometry.model.nq]
+
+    @cached_property
+    def participants(self) -> Participants:
+        """The rows that lose rank; that nearly do if there is no singular configuration, as where
+        a drive leads almost up to its dead point."""
+        if self.singular is not None:
+            return self.singular.participants
+        watched = self._watched
+        left, size, _ = np.linalg.svd(watched.geometry.normalised(watched.place(self.time)))
+        size = size[: watched.rank]
+        return participants(watched.geometry, left[:, : watched.rank][:, size < ALIKE * size[-1]])
 
     @property
     def loops(self) -> tuple[str, ...]:
         """Names of the loops whose rows lose rank."""
-        return () if self.singular is None else self.singular.loops
+        return self.participants.loops
 
     @property
     def rows(self) -> tuple[str, ...]:
         """Names of those rows, ``loop.row``."""
-        return () if self.singular is None else self.singular.rows
+        return self.participants.rows
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Names of the drives whose rows lose rank with those of the loops."""
+        return self.participants.drives
 
     @cached_property
     def _velocities(self) -> tuple[FloatArray | None, FloatArray | None]:
-        """Velocities (nv,) in units, extrapolated to the passage from before and from behind."""
+        """Rates (n,) in units, extrapolated to the passage from before and from behind."""
         out: list[FloatArray | None] = []
         for side in (-1.0, 1.0):
             times = self.time + side * self._beside * np.array([1.0, 2.0])
@@ -171,30 +194,38 @@ class Crossing:
                 out.append(None)
                 continue
             (_, near), (_, far) = self._watched.states(times)
-            out.append((2.0 * near - far) / self._watched.geometry.unit)
+            out.append(self._watched.geometry.rates(2.0 * near - far))
         return out[0], out[1]
 
     @cached_property
-    def branches(self) -> FloatArray:
-        """Velocity directions (k, nv) of the branches that meet there, of unit length in units.
-
-        With more than one degree of freedom: on each branch the one nearest to the arriving
-        velocity (:func:`srm_mbs.systems.branches.branch_tangents`).  Empty if they are not
-        isolated.
-        """
+    def _tangents(self) -> FloatArray:
+        """Directions (k, n) of the branches."""
         singular = self.singular
         if singular is None:
             return np.zeros((0, len(self._watched.geometry.unit)))
         arriving, leaving = self._velocities
         return branch_tangents(singular, leaving if arriving is None else arriving)
 
+    @property
+    def branches(self) -> FloatArray:
+        """Velocity directions (k, nv) of the branches that meet there, of unit length in units.
+
+        With more than one degree of freedom: on each branch the one nearest to the arriving
+        velocity (:func:`srm_mbs.systems.branches.branch_tangents`).  Empty if they are not
+        isolated; of a driven mechanism also where it has freedom besides its drives.
+        """
+        tangents = self._tangents[:, : self._watched.geometry.model.nv]
+        size = np.linalg.norm(tangents, axis=1, keepdims=True)
+        out: FloatArray = tangents / np.where(size > 0.0, size, 1.0)
+        return out
+
     def _branch_of(self, u: FloatArray | None) -> int | None:
-        """Index in ``branches`` of the branch with the velocity u (nv,)."""
+        """Index in ``branches`` of the branch with the rates u (n,)."""
         singular = self.singular
-        if u is None or singular is None or not len(self.branches):
+        if u is None or singular is None or not len(self._tangents):
             return None
         off = []
-        for direction in self.branches:
+        for direction in self._tangents:
             tangent = singular.branch(direction)
             outside = u if tangent is None else u - tangent @ (tangent.T @ u)
             off.append(float(np.linalg.norm(outside)))
@@ -288,7 +319,7 @@ def _turned(
     configuration must lie close to the motion, compared with how far that moves.
     """
     geometry = watched.geometry
-    q, q_before, q_after = (watched.q(t) for t in (time, before, after))
+    q, q_before, q_after = (watched.place(t) for t in (time, before, after))
     if not certain:
         found = nearest_singular(geometry, q, watched.rank, WITHIN)
         if found is None:
@@ -337,7 +368,7 @@ def find_crossings(
     dense: DenseOutput,
 ) -> tuple[Crossing, ...]:
     """All passages of a run, in order of time."""
-    if not isinstance(system, ClosedSystem) or not steps.count or not system.mechanism.loops:
+    if not isinstance(system, ClosedSystem) or not steps.count:
         return ()
     abscissae = np.append(scheme.c, 1.0)
     t, sigma = _recorded(abscissae, steps)
@@ -346,6 +377,9 @@ def find_crossings(
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
     watched = Watched(system, dense)
+    if system.structure.sigma_ref < BLUNT:
+        sigma = watched.smallest(t)
+        sigma = sigma / np.median(sigma)
     found: list[Crossing] = []
     for times in _windows(t, _may_vanish(t, sigma, scheme.n_stages)):
         values = watched.smallest(times)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from srm_mbs.methods.base import StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.stepping.hermite import HermiteStep, close_to_singular
+from srm_mbs.stepping.reading_times import check_within
 from srm_mbs.systems.base import System, Zone
 
 PLACEMENTS = ("", "a priori", "redone")
@@ -144,6 +146,12 @@ def step_data(
     )
 
 
+@lru_cache(maxsize=64)
+def _abscissae(scheme: ButcherTableau) -> FloatArray:
+    """Those of the stages, and of the end."""
+    return np.append(scheme.c, 1.0)
+
+
 class DenseOutput:
     """Evaluates the continuous extension of a run.
 
@@ -160,7 +168,7 @@ class DenseOutput:
     def __init__(self, system: System, scheme: ButcherTableau, steps: StepData) -> None:
         self._system = system
         self._extension = scheme.dense
-        self._abscissae = np.append(scheme.c, 1.0)
+        self._abscissae = _abscissae(scheme)
         self._smooth: dict[int, HermiteStep] = {}
         self._steps = steps
         self._extra: dict[int, FloatArray] = {}
@@ -187,14 +195,8 @@ class DenseOutput:
         return out
 
     def check(self, t: FloatArray) -> None:
-        """Raise ValueError if a time of ``t`` (k,) lies outside the run."""
-        start, end = self._steps.times[0], self._steps.end
-        slack = 1e-12 * max(abs(start), abs(end))
-        if len(t) and not (np.min(t) >= start - slack and np.max(t) <= end + slack):
-            raise ValueError(
-                f"dense output covers t = {start:.9g} to {end:.9g} s, "
-                f"asked for {np.min(t):.9g} to {np.max(t):.9g} s"
-            )
+        """Raise InputError if a time of ``t`` (k,) lies outside the run."""
+        check_within(t, float(self._steps.times[0]), self._steps.end)
 
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         """Times (n + 1,) and states (n + 1, nx) at the ends of the steps, the start first; the
@@ -219,6 +221,13 @@ class DenseOutput:
                 rates[step] = self._all_rates(step, h)
         return replace(data, rates=rates)
 
+    @cached_property
+    def _whole(self) -> FloatArray:
+        """Weights of the rates over a whole step, as far as the steps have them: those of extra
+        stages are zero."""
+        weights: FloatArray = self._extension.weights(np.ones(1))[0]
+        return weights[: self._steps.rates.shape[1]]
+
     def _between_neighbours(self, step: int) -> bool:
         """Whether a step is read from its neighbours (:mod:`.hermite`), not from its stages."""
         data = self._steps
@@ -231,15 +240,16 @@ class DenseOutput:
         data, system = self._steps, self._system
         if self._between_neighbours(step):
             if step not in self._smooth:
-                self._smooth[step] = HermiteStep(system, data, step)
+                self._smooth[step] = HermiteStep(system, data, step, self._whole)
             return self._smooth[step](theta)
         h = data.times[step + 1] - data.times[step]
         start = data.states[step]
-        delta = (h * self._extension.weights(theta)) @ self._all_rates(step, h)
+        weights, rates = h * self._extension.weights(theta), self._all_rates(step, h)
         ramps = self._ramps(step, theta, h)
         states = []
         for k in range(len(theta)):
-            x = system.retract(start, delta[k])
+            # One at a time: how BLAS sums would depend on what else is read with it.
+            x = system.retract(start, weights[k] @ rates)
             states.append(x if ramps is None else system.retract(x, ramps[k]))
         return np.array(states)
 

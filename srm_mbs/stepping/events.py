@@ -14,7 +14,9 @@ downwards.  Four points are settled where SciPy leaves them open:
 * A zero on the boundary of two steps is one event, passed in the direction in which it was
   reached.
 * A terminal event ends the run with the state of the dense output there; other events are kept up
-  to and including that time.
+  to and including that time.  Those within round-off of it are at that time: what happens at once,
+  by symmetry, has times that differ by rounding, and a run that goes on from there would not count
+  them.
 
 The machinery works on states, for mechanisms and DAEs alike::
 
@@ -44,8 +46,9 @@ from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.stepping.dense import DenseOutput, step_data
 from srm_mbs.systems.base import System
 
-AT_START = 1e-10
-"""A zero within this fraction of the first step after the start counts as lying on it."""
+TOGETHER = 1e-10
+"""A zero within this fraction of the first step after the start counts as lying on it, and within
+this fraction of the last step after the end of a run as lying there."""
 RETURNS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
 NEAR_ZERO = 0.5
@@ -75,6 +78,9 @@ class Event:
         Whether the run starts at an occurrence, from where the value moves away.
     floor
         Size of values that count as zero: of an event that closures hold at zero, the rounding.
+    guard
+        Time after the start of the run up to which a zero lies on it; None for TOGETHER of the
+        first step.  A segment of a run begins where its predecessor stopped to count.
     """
 
     name: str
@@ -84,6 +90,7 @@ class Event:
     acts: bool = False
     departs: bool = False
     floor: float = 0.0
+    guard: float | None = None
 
     def __call__(self, t: float, state: FloatArray) -> float:
         """The value at ``t``; ``state`` must not be needed any more, the user may write to it.
@@ -163,8 +170,8 @@ def _prepared(event: Any, i: int, adapt: Callable[[Callable[..., Any]], StateFun
         )
     label = place if name == "<lambda>" else repr(name)
     acts, departs = (bool(getattr(event, name, False)) for name in ("acts", "departs"))
-    floor = float(getattr(event, "floor", 0.0))
-    return Event(label, adapt(event), occurrences, _number(direction), acts, departs, floor)
+    floor, guard = float(getattr(event, "floor", 0.0)), getattr(event, "guard", None)
+    return Event(label, adapt(event), occurrences, _number(direction), acts, departs, floor, guard)
 
 
 def acting(events: Any) -> bool:
@@ -269,7 +276,7 @@ class EventWatch:
             self._values[i] = values[-1]
         if not found:
             return None
-        return self._record(sorted(found), dense)
+        return self._record(sorted(found), dense, TOGETHER * (t_new - t))
 
     def _departing(
         self, i: int, dense: DenseOutput, nodes: list[tuple[float, float]]
@@ -291,7 +298,10 @@ class EventWatch:
         event = self._events[i]
         earliest = -math.inf
         if nodes[0][0] == self._start and not event.departs:
-            earliest = self._start + AT_START * (nodes[-1][0] - self._start)
+            guard = event.guard
+            if guard is None:
+                guard = TOGETHER * (nodes[-1][0] - self._start)
+            earliest = self._start + guard
         zeros = []
         for left, right in pairwise(nodes):
             before, now = self._signs[i], event.sign(right[1])
@@ -303,11 +313,15 @@ class EventWatch:
                 zeros.append(zero)
         return zeros
 
-    def _record(self, found: list[tuple[float, int]], dense: DenseOutput) -> Stop | None:
+    def _record(
+        self, found: list[tuple[float, int]], dense: DenseOutput, together: float
+    ) -> Stop | None:
         stop: Stop | None = None
         for time, i in found:
-            if stop is not None and time > stop.time:
-                break
+            if stop is not None:
+                if time > stop.time + together:
+                    break
+                time = stop.time
             self._times[i].append(time)
             self._states[i].append(dense(np.array([time]))[0])
             event, count = self._events[i], len(self._times[i])

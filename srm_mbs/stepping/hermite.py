@@ -46,12 +46,20 @@ class HermiteStep:
 
     Degree 11 where degree 15 confirms it better than it confirms degree 7: between steps of very
     different lengths a higher degree is not better.
+
+    Parameters
+    ----------
+    system, steps, step
+        The run, and the number of the step.
+    weights : (k,)
+        Those of the rates over a whole step, as far as they are in ``steps``.
     """
 
-    def __init__(self, system: System, steps: StepData, step: int) -> None:
+    def __init__(self, system: System, steps: StepData, step: int, weights: FloatArray) -> None:
         self._system = system
         self._steps = steps
         self._step = step
+        self._weights = weights
         # Rates jump at breakpoints: a polynomial goes no further.
         self._piece = steps.piece(step)
         self._start = steps.states[step]
@@ -64,6 +72,7 @@ class HermiteStep:
     def _nodes(self, count: int) -> list[int]:
         """Indices of up to ``count`` ends of steps around the step, none too close together."""
         times, near = self._steps.times, SPACING * self._h
+        states, reachable = self._steps.states, self._system.reachable
         first, last = self._piece
         before, after = [self._step], [self._step + 1]
         i, j = self._step - 1, self._step + 2
@@ -71,13 +80,29 @@ class HermiteStep:
             left = i >= first and (j > last or len(before) <= len(after))
             if left:
                 if times[before[-1]] - times[i] >= near:
-                    before.append(i)
+                    if reachable(self._start, states[i]):
+                        before.append(i)
+                    else:
+                        first = i
                 i -= 1
             else:
                 if times[j] - times[after[-1]] >= near:
-                    after.append(j)
+                    if reachable(self._start, states[j]):
+                        after.append(j)
+                    else:
+                        last = j
                 j += 1
         return sorted(before + after)
+
+    def _moved(self, node: int) -> FloatArray:
+        """Motion (m,) from the step to a node, in the charts of the steps between: turns included,
+        however the rates change within a step."""
+        steps = self._steps
+        own = slice(min(node, self._step), max(node, self._step))
+        count = len(self._weights)
+        h = np.diff(steps.times[own.start : own.stop + 1])
+        moved: FloatArray = self._weights @ np.tensordot(h, steps.rates[own, :count], axes=1)
+        return moved if node > self._step else -moved
 
     def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
         from scipy.interpolate import KroghInterpolator
@@ -88,7 +113,7 @@ class HermiteStep:
         points: list[float] = []
         values: list[FloatArray] = []
         for i in self._nodes(count):
-            delta = self._system.difference(self._start, steps.states[i])
+            delta = self._system.difference(self._start, steps.states[i], self._moved(i))
             rate = steps.rate_at(i, last)
             points += 2 * [(steps.times[i] - t0) / self._h]
             values += [delta, self._h * self._system.chart_rate(delta, rate)]

@@ -37,6 +37,8 @@ LEFT = 0.02
 DIRECT_SIGMA = ZONE_LARGEST
 """sigma from which a node is solved directly."""
 ROUNDS = 8
+FORESEEN = 4
+"""Nodes that the first multipliers are extrapolated from."""
 CONVERGED = 1e-11
 CONTRACTED = 1e-6
 """Change of the multiplier, relative to it, up to which rounding may end the contraction."""
@@ -60,23 +62,24 @@ def free_acceleration(system: ClosedSystem, t: float, state: FloatArray) -> Floa
 
 
 def _solved(
-    system: ClosedSystem, geometry: ClosureGeometry, t: float, x: FloatArray
+    system: ClosedSystem, geometry: ClosureGeometry, t: float, x: FloatArray, direct: float
 ) -> Point | None:
     """The point of the motion at x (nx,), which is moved onto the closures; None if it cannot."""
     sigma = system.evaluate(t, x).sigma
-    if sigma >= DIRECT_SIGMA:
+    if sigma >= direct:
         for _ in range(2):  # the rates again, where the corrected position is
             x = system.retract(x, -system.evaluate(t, x).correction())
         terms = system.evaluate(t, x)
         return Point(x, terms.rate().copy(), terms.multiplier().copy(), terms.sigma)
     nothing = np.zeros(system.nv)
-    strong = Zone(2.0 * DIRECT_SIGMA, lambda _: nothing)
+    strong = Zone(2.0 * direct, lambda _: nothing)
     x = system.retract(x, -system.evaluate(t, x, strong).correction())
     q, v = system.split(x)
-    _, limit = branch_next_to(geometry, system.mechanism.structure.loop_rank, q, v / geometry.unit)
+    rank = system.mechanism.structure.rank
+    _, limit = branch_next_to(geometry, rank, geometry.at(q, t), geometry.rates(v))
     if limit is None:
         return None
-    v = v - limit.projector @ v
+    v = v - limit.off_branch(v)
     x = np.concatenate([q, v])
     free = free_acceleration(system, t, x)
     multiplier = limit.multiplier(v, free)
@@ -92,34 +95,51 @@ def _span(rate: FloatArray, unit: FloatArray, longest: float) -> float:
     return longest if root == 0.0 else min(longest, float(2.0 * REACH / (speed + root)))
 
 
-def _block(
+def block_of(
     system: ClosedSystem,
     geometry: ClosureGeometry,
     start: Point,
     times: FloatArray,
     norm: ErrorNorm,
+    direct: float,
+    foreseen: bool = False,
 ) -> list[Point] | None:
-    """The motion at ``times``, the first of which is that of ``start``; None if it cannot be."""
+    """The motion at ``times``, the first of which is that of ``start``; None if it cannot be.
+
+    Parameters
+    ----------
+    direct
+        sigma from which a node is solved directly.
+    foreseen
+        At first the multiplier is extrapolated from node to node: from a start that is far enough
+        from the singular configuration.  Otherwise it is at first that of the start.
+    """
     method = PSRM("dop853")
     values = np.tile(start.multiplier, (len(times), 1))
     change = np.inf
-    for _ in range(ROUNDS):
+    for attempt in range(ROUNDS):
         points = [start]
         history = MultiplierHistory(times, values)
         for t, t_next in pairwise(times.tolist()):
             here = points[-1]
+            if foreseen and attempt == 0:
+                nodes = slice(max(0, len(points) - FORESEEN), len(points))
+                solved = np.array([point.multiplier for point in points[nodes]])
+                history = MultiplierHistory(times[nodes], solved)
             # Known everywhere: every stage takes the interpolated multiplier.
             known = replace(history, known_until=np.inf, known_below=np.inf)
             memory = Memory(here.rate, here.sigma, system.magnitudes(here.state), known)
             result = method.step(system, t, t_next - t, here.state, memory, norm)
-            point = _solved(system, geometry, t_next, result.state)
+            point = _solved(system, geometry, t_next, result.state, direct)
             if point is None:
                 return None
             points.append(point)
         improved = np.array([point.multiplier for point in points])
-        old, change = change, float(np.abs((improved - values) / geometry.unit).max())
+        old, change = change, float(np.abs((improved - values) / geometry.coordinate_unit).max())
         values = improved
-        scale = float(np.abs(values / geometry.unit).max())
+        scale = float(np.abs(values / geometry.coordinate_unit).max())
+        if attempt == 0:
+            continue
         if change <= CONVERGED * scale or not change < 0.5 * old:
             break
     return points if change <= CONTRACTED * scale else None
@@ -145,9 +165,9 @@ def known_multipliers(
     longest = SHARE / system.mechanism.structure.units.rate
     times, points = [t], [start]
     for _ in range(BLOCKS):
-        span = min(_span(points[-1].rate, geometry.unit, longest), t_end - times[-1])
+        span = min(_span(points[-1].rate, geometry.coordinate_unit, longest), t_end - times[-1])
         block_times = np.linspace(times[-1], times[-1] + span, AHEAD + 1)
-        block = _block(system, geometry, points[-1], block_times, norm)
+        block = block_of(system, geometry, points[-1], block_times, norm, DIRECT_SIGMA)
         if block is None:
             break
         times += block_times[1:].tolist()

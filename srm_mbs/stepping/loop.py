@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,8 +17,6 @@ from srm_mbs.stepping.dense import StepData, step_data
 from srm_mbs.stepping.events import EventWatch, Stop
 from srm_mbs.stepping.stepsize import StepSizeControl, Verdict
 from srm_mbs.systems.base import System
-
-log = logging.getLogger(__name__)
 
 SMALLEST_STEP = 1e-14
 """Steps shorter than this fraction of the run, or than round-off of t, end it."""
@@ -39,6 +36,27 @@ LOST = 1e-2
 
 BELOW_ROUND_OFF = "a step this short is below the round-off of the time"
 NOT_FINITE = "the state is no longer finite"
+
+
+@dataclass(frozen=True)
+class Words:
+    """What messages call the problem: what is singular, what drives it, what to check."""
+
+    singular: str
+    forces: str
+    goes_on: str
+
+
+MECHANISM = Words(
+    "The closures are close to a singular configuration",
+    "what acts on the mechanism",
+    "the mechanism can move on from there (solution.q[-1])",
+)
+DAE = Words(
+    "G B is almost singular there",
+    "its right-hand side",
+    "the problem has a solution from there on (solution.x[-1])",
+)
 
 
 @dataclass(frozen=True)
@@ -137,6 +155,7 @@ def integrate(
     tick: Tick | None = None,
     events: EventWatch | None = None,
     breakpoints: Passing | None = None,
+    words: Words = MECHANISM,
 ) -> RunRecord:
     """Integrate from ``t0`` to ``t_end``; never raises for what happens on the way.
 
@@ -156,6 +175,8 @@ def integrate(
         Looks for events in every accepted step.
     breakpoints
         Where the right-hand side is not smooth; None if it is.
+    words
+        What the message of a failure calls the problem.
 
     Returns
     -------
@@ -182,15 +203,20 @@ def integrate(
                 control.aim(breakpoints.end)
             limit = min(max_step, system.step_limit(x))
             proposal = control.propose(t, limit, memory)
+            if proposal.arriving and breakpoints is not None:
+                memory = breakpoints.arrive(t, x, memory)
+                continue
             h = proposal.h
             if not h > max(smallest, 4.0 * np.spacing(abs(t))):
                 if not (record.attempts and record.attempts[-1].t == t):
                     trouble = BELOW_ROUND_OFF
-                fail(record, t, h, memory.sigma, trouble, control.adaptive)
+                fail(record, t, h, memory.sigma, trouble, control.adaptive, words)
                 break
             if len(record.times) % WATCHED_STEPS == 0 and _stands_still(record, t, t_end):
                 covered = t - record.times[-WATCHED_STEPS]
-                fail(record, t, h, memory.sigma, standstill(covered), control.adaptive)
+                fail(
+                    record, t, h, memory.sigma, standstill(covered, words), control.adaptive, words
+                )
                 break
             result: StepResult | None
             try:
@@ -205,13 +231,13 @@ def integrate(
                 ratio = np.inf if result is None else result.error_ratio
                 record.attempts.append(Attempt(t, h, ratio, verdict))
                 if not control.adaptive and verdict is Verdict.REJECTED:
-                    fail(record, t, h, memory.sigma, trouble or NOT_FINITE, False)
+                    fail(record, t, h, memory.sigma, trouble or NOT_FINITE, False, words)
                     break
                 continue
             trouble = ""
             reason = closures.trouble(result)
             if reason:
-                fail(record, t, h, memory.sigma, reason, control.adaptive)
+                fail(record, t, h, memory.sigma, reason, control.adaptive, words)
                 break
             result.placement = placement
             method.accept(memory, result)
@@ -232,15 +258,14 @@ def integrate(
     del record.times[min(len(record.times), len(record.steps)) :]
     del record.steps[len(record.times) :]
     record.wall_time = time.perf_counter() - started
-    log.info("%s", record.message)
     return record
 
 
-def standstill(covered: float) -> str:
+def standstill(covered: float, words: Words = MECHANISM) -> str:
     """What is wrong where WATCHED_STEPS steps covered only ``covered`` (s)."""
     return (
-        f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; what acts on the mechanism "
-        "changes too fast or is not smooth"
+        f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; {words.forces} changes too "
+        "fast or is not smooth"
     )
 
 
@@ -252,9 +277,9 @@ def _stands_still(record: RunRecord, t: float, t_end: float) -> bool:
 
 
 def tell(tick: Tick, t: float, h: float, x: FloatArray) -> None:
-    """Call ``tick``; what it raises must not lose the run."""
+    """Call ``tick`` with a copy of ``x``; what it raises must not lose the run."""
     try:
-        tick(t, h, x)
+        tick(t, h, x.copy())
     except Exception as error:
         raise ControllerError(f"the progress callback raised {error!r} at t = {t:.6g} s") from error
 
@@ -291,7 +316,15 @@ class Closures:
         return ""
 
 
-def fail(record: RunRecord, t: float, h: float, sigma: float, trouble: str, adaptive: bool) -> None:
+def fail(
+    record: RunRecord,
+    t: float,
+    h: float,
+    sigma: float,
+    trouble: str,
+    adaptive: bool,
+    words: Words = MECHANISM,
+) -> None:
     """Mark ``record`` as failed at ``t`` with the step ``h`` and say why.
 
     Parameters
@@ -302,16 +335,14 @@ def fail(record: RunRecord, t: float, h: float, sigma: float, trouble: str, adap
         Why; empty if no step was short enough for the error estimate.
     adaptive
         Whether steps follow a tolerance.
+    words
+        What the message calls the problem.
     """
     record.status = "failed"
     reason = trouble or "the error estimate stays above the tolerance however small the step"
-    near = (
-        f" The closures are close to a singular configuration (sigma = {sigma:.1e})."
-        if sigma < 0.05
-        else ""
-    )
+    near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < 0.05 else ""
     record.message = (
         f"Stopped at t = {t:.6g} s with step {h:.1e} s: {reason}.{near} "
         f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
-        "tableau, or check that the mechanism can move on from there (solution.q[-1])."
+        f"tableau, or check that {words.goes_on}."
     )

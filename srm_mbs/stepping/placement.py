@@ -7,10 +7,15 @@ A wrapper of step-size control (docs/notation.md, "Singular configurations"):
   the tableau, or well behind the end;
 * sigma changes by at most 0.5 per step;
 * a posteriori, when a stage came too close, the zero is located from the stages of the step and
-  the step is redone, at most three times.
+  the step is redone, at most three times;
+* where the run, or its piece, ends beside a singular configuration, steps are not placed: the
+  multipliers up to the end are found first (:mod:`srm_mbs.stepping.arriving`).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
+from enum import IntEnum
 
 import numpy as np
 
@@ -27,6 +32,22 @@ TOO_CLOSE = 0.05
 CLEARANCE = 0.6
 """Distance of the zero from the abscissae that is good enough, over half the widest gap."""
 MAX_REDONE = 3
+BESIDE = 5e-3
+"""A run, or its piece, ends beside a singular configuration if sigma is smaller there: rounding in
+direct solves nearer than that exceeds the tightest tolerances."""
+ARRIVAL = 0.2
+"""Change of sigma from where such an end is prepared for, unless one step reaches further."""
+
+
+class Arrival(IntEnum):
+    """What is known of the end of the run, or its piece."""
+
+    NONE = 0
+    """It is no matter, or prepared for."""
+    WATCHED = 1
+    """It may lie beside a singular configuration."""
+    DUE = 2
+    """It does: a step that reached it was redone."""
 
 
 def inverse_abscissae(scheme: ButcherTableau) -> list[float]:
@@ -89,6 +110,8 @@ class SingularityPlacement:
         What is wrapped; the tableau of the run.
     t_end
         End of the run (s).
+    arrivals
+        Whether the driver prepares for ends beside singular configurations.
 
     Attributes
     ----------
@@ -97,7 +120,11 @@ class SingularityPlacement:
     """
 
     def __init__(
-        self, inner: StepSizeControl, scheme: ButcherTableau, t_end: float = np.inf
+        self,
+        inner: StepSizeControl,
+        scheme: ButcherTableau,
+        t_end: float = np.inf,
+        arrivals: bool = False,
     ) -> None:
         self._inner = inner
         self._t_end = t_end
@@ -114,6 +141,9 @@ class SingularityPlacement:
         self._zero: float | None = None
         self._redo: float | None = None
         self._redone = 0
+        self._watched = Arrival.WATCHED if arrivals and inner.adaptive else Arrival.NONE
+        self._arrival = self._watched
+        self._known = False
 
     def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
         """The inner proposal, shortened where a stage would come too close."""
@@ -125,6 +155,13 @@ class SingularityPlacement:
             if longest < limit:
                 limit = longest
         proposal = self._inner.propose(t, limit, memory)
+        if self._arrives(t, proposal):
+            self._arrival = Arrival.NONE
+            return replace(proposal, arriving=True)
+        # Where the multipliers are known, stages may lie anywhere.
+        self._known = memory.history is not None and memory.history.known_until >= self._t_end
+        if self._known:
+            return proposal
         if self._zero is not None and self._redo is None and self._zero > t:
             h = self._placed(self._zero - t, proposal.h, t)
             if h != proposal.h:
@@ -135,7 +172,18 @@ class SingularityPlacement:
     def aim(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.stepping.stepsize.StepSizeControl`."""
         self._t_end = end
+        self._arrival = self._watched
         self._inner.aim(end, grid)
+
+    def _arrives(self, t: float, proposal: Proposal) -> bool:
+        """Whether the end beside a singular configuration is to be prepared for."""
+        if self._arrival is not Arrival.WATCHED:
+            return self._arrival is Arrival.DUE
+        if self._zero is None or not self._zero > t:
+            return False
+        if not abs(self._zero - self._t_end) * self._slope < BESIDE:
+            return False
+        return proposal.t_new >= self._t_end or (self._t_end - t) * self._slope <= ARRIVAL
 
     def _placed(self, distance: float, h: float, t: float) -> float:
         if t + h >= self._t_end and self._gaps.ends_on(distance, h):
@@ -175,8 +223,12 @@ class SingularityPlacement:
         else:
             h = proposal.h
             slope = sigma_slope(self._inverse, result.sigmas, h)
-            if self._redone < MAX_REDONE:
-                last = proposal.t_new >= self._t_end
+            last = proposal.t_new >= self._t_end
+            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < BESIDE:
+                self._arrival, self._redo = Arrival.DUE, h
+                self.replaced += 1
+                return Verdict.REPLACED
+            if self._redone < MAX_REDONE and not self._known:
                 better = self._better_step(h, result.sigmas, slope, last)
                 if better is not None and 0.0 < better < h:
                     self._redo = better

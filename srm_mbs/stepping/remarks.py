@@ -52,7 +52,7 @@ def restarts(steps: Sequence[StepResult]) -> str:
     if not times:
         return ""
     return (
-        f" Next to singular configurations the sweeps gave up their own histories in {len(times)} "
-        f"steps, first at t = {times[0]:.6g} s: they were too far off the constraints to tell the "
-        "branch, and started again from the accepted state."
+        f" The sweeps gave up their own histories in {len(times)} steps, first at "
+        f"t = {times[0]:.6g} s: sigma was falling, they were too far off the constraints to tell "
+        "the branch if a singular configuration came, and started again from the accepted state."
     )

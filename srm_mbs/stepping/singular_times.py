@@ -91,6 +91,8 @@ class AvoidTimes:
         distances = self._times[self._times > t] - t
         if not len(distances) or self._clear(proposal.h, distances):
             return proposal
+        if proposal.arriving:
+            return proposal
         self.placed += 1
         longest = proposal.h
         if self._step is not None and self._end_blocked(longest, distances):
@@ -243,6 +245,7 @@ def placed(
     times: FloatArray,
     t_end: float,
     step: float | None = None,
+    arrivals: bool = False,
 ) -> tuple[StepSizeControl, tuple[Placing, ...]]:
     """``control`` with its steps placed, and the wrappers that do it.
 
@@ -258,10 +261,12 @@ def placed(
         End of the run (s).
     step
         The step (s) if it is fixed.
+    arrivals
+        As for :class:`~srm_mbs.stepping.placement.SingularityPlacement`.
     """
     wrappers: list[Placing] = []
     if placement == "automatic":
-        wrappers.append(SingularityPlacement(control, scheme, t_end))
+        wrappers.append(SingularityPlacement(control, scheme, t_end, arrivals))
     elif placement == "halved":
         wrappers.append(HalvedStep(control, scheme, t_end))
     elif placement == "off":

@@ -19,11 +19,12 @@ from srm_mbs.methods.base import ErrorNorm, Memory, Method
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.stepping.leaving import DIRECT_SIGMA, Point, free_acceleration, known_multipliers
 from srm_mbs.systems.base import System
-from srm_mbs.systems.branch_limit import NEAR, BranchLimit, branch_next_to
+from srm_mbs.systems.branch_limit import BranchLimit, branch_next_to
 from srm_mbs.systems.branches import branch_tangents
 from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.driven_geometry import geometry_of
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
-from srm_mbs.systems.singular import SingularConfiguration, nearest_singular
+from srm_mbs.systems.singular import SingularConfiguration
 
 LOOK = 0.05
 """sigma below which a singular configuration is looked for."""
@@ -59,7 +60,10 @@ def describe_branches(singular: SingularConfiguration, u: FloatArray) -> str:
     tangents = branch_tangents(singular, u if np.any(u) else None)
     if not len(tangents):
         return "its branches cannot be listed"
-    listed = [_rates(geometry.mechanism, tangent * geometry.unit) for tangent in tangents[:SHOWN]]
+    unit = geometry.coordinate_unit
+    listed = [
+        _rates(geometry.mechanism, tangent[: len(unit)] * unit) for tangent in tangents[:SHOWN]
+    ]
     more = f" and {len(tangents) - SHOWN} more" if len(tangents) > SHOWN else ""
     return (
         f"{len(tangents)} branches cross there, with rates in the ratios "
@@ -68,9 +72,8 @@ def describe_branches(singular: SingularConfiguration, u: FloatArray) -> str:
 
 
 def _refuse(singular: SingularConfiguration, u: FloatArray, why: str) -> InputError:
-    loops = ", ".join(map(repr, singular.loops))
     return InputError(
-        f"the start is a singular configuration of the closures (loops {loops}) {why}: "
+        f"the start is a singular configuration of {singular.participants} {why}: "
         f"{describe_branches(singular, u)}",
         element="v0",
         remedy="Give rates along one branch: srm.assemble(mechanism, q, v) with the rate of one "
@@ -79,7 +82,7 @@ def _refuse(singular: SingularConfiguration, u: FloatArray, why: str) -> InputEr
 
 
 def _limit(
-    geometry: ClosureGeometry, rank: int, q: FloatArray, v: FloatArray, sigma: float
+    geometry: ClosureGeometry, rank: int, place: FloatArray, v: FloatArray, sigma: float
 ) -> BranchLimit | None:
     """The algebra at the start, from its branch; None if the direct solve is accurate there.
 
@@ -88,8 +91,8 @@ def _limit(
     InputError
         If v does not choose one branch, or is not the velocity of any.
     """
-    u = v / geometry.unit
-    singular, limit = branch_next_to(geometry, rank, q, u)
+    u = geometry.rates(v)
+    singular, limit = branch_next_to(geometry, rank, place, u)
     if singular is None:
         if sigma >= UNDECIDED:
             return None
@@ -99,45 +102,19 @@ def _limit(
             element="q0",
             remedy="Start further away, at sigma above 1e-3",
         )
-    if float(np.linalg.norm(geometry.difference(singular.q, q))) >= DIRECT_FROM:
+    if float(np.linalg.norm(geometry.difference(singular.q, place))) >= DIRECT_FROM:
         return None
     speed = float(np.abs(u).max())
-    if limit is None and speed == 0.0:
+    if limit is None and not np.any(v):
         raise _refuse(singular, u, "at rest, from where the motion is not unique")
     if limit is None:
         raise _refuse(singular, u, "and its velocity does not choose one branch")
     if not limit.accuracy < FOLLOWED:
         raise _refuse(singular, u, "and the branch of its velocity cannot be followed")
-    off = float(np.abs(limit.projector @ v / geometry.unit).max())
+    off = float(np.abs(limit.off_branch(v) / geometry.coordinate_unit).max())
     if off > TANGENT * speed:
         raise _refuse(singular, u, "and its velocity is not tangent to any branch")
     return limit
-
-
-def _refuse_driven(
-    mechanism: Mechanism, geometry: ClosureGeometry, q: FloatArray, sigma: float
-) -> None:
-    """Refuse a start where the direct solve is not accurate and that drives lead through: what the
-    limit on a branch would be with their rows is not known here.
-
-    Raises
-    ------
-    InputError
-        There.
-    """
-    near = sigma < UNDECIDED
-    if not near and mechanism.loops:
-        found = nearest_singular(geometry, q, mechanism.structure.loop_rank, NEAR)
-        near = found is not None and (
-            float(np.linalg.norm(geometry.difference(found, q))) < DIRECT_FROM
-        )
-    if near:
-        raise InputError(
-            "the start is a singular configuration of the closures and drives "
-            f"(sigma = {sigma:.1e}), where a driven motion cannot begin",
-            element="q0",
-            remedy="Start further away; the motion may lead through it",
-        )
 
 
 def start(
@@ -177,12 +154,10 @@ def start(
         return memory
     mechanism = system.mechanism
     q, v = system.split(state)
-    geometry = ClosureGeometry(mechanism, q)
+    geometry = geometry_of(mechanism, q, t)
     try:
-        if mechanism.drives:
-            _refuse_driven(mechanism, geometry, q, memory.sigma)
-            return memory
-        limit = _limit(geometry, mechanism.structure.rank, q, v, memory.sigma)
+        rank = mechanism.structure.rank
+        limit = _limit(geometry, rank, geometry.at(q, t), v, memory.sigma)
     except InputError:
         if begins or memory.sigma < UNDECIDED:
             raise

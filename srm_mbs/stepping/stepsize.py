@@ -25,6 +25,11 @@ XI_OLD_FLOOR = 1e-4
 XI_FLOOR = 1e-10
 OVERFLOW = 1e100
 """Size of a rate from which its products may overflow."""
+PROBE = 0.01
+"""Length of the step that probes how fast rates change, over that in which the state would change
+by itself; the change that the first step may make."""
+LONGEST_FIRST = 100.0
+"""Longest first step, over that probe."""
 FAILED_EVALUATION = 1e6
 """Error ratio of a step whose stages could not be evaluated or are not finite."""
 
@@ -47,11 +52,14 @@ class Proposal:
     """A step of length ``h`` that ends at ``t_new`` (exactly, where that is a given time).
 
     ``placed``: it was made shorter so that no stage lies on a singular configuration.
+    ``arriving``: the run, or its piece, is about to end beside one; the multipliers up to there are
+    to be found first (:mod:`srm_mbs.stepping.arriving`), and a step proposed again.
     """
 
     h: float
     t_new: float
     placed: bool = False
+    arriving: bool = False
 
 
 class Propose(Protocol):
@@ -187,6 +195,9 @@ class FixedStep:
             (self._t0, self._step), self._index = grid, 1
 
 
+_TOO_TIGHT = "the rates at the start are beyond all measure of atol: it is far too small"
+
+
 def initial_step(
     system: System,
     state: FloatArray,
@@ -206,15 +217,21 @@ def initial_step(
     d0 = norm(np.maximum(memory.magnitude, norm.one), weights)
     if not np.abs(memory.rate).max() < OVERFLOW:
         raise EvaluationError("the rates at the start overflow: an input is far too large")
-    d1 = norm(memory.rate, weights)
+    with np.errstate(over="ignore"):
+        d1 = norm(memory.rate, weights)
+    if not np.isfinite(d1):
+        raise EvaluationError(_TOO_TIGHT)
     if not d1 > 0.0:
-        return 0.01 * span
-    h0 = min(0.01 * d0 / d1, span)
+        return PROBE * span
+    h0 = min(PROBE * d0 / d1, span)
     probe = system.retract(state, h0 * memory.rate)
     rate = system.chart_rate(h0 * memory.rate, system.evaluate(t + h0, probe).rate())
-    d2 = norm(rate - memory.rate, weights) / h0
-    longest = 100.0 * h0
+    with np.errstate(over="ignore"):
+        d2 = norm(rate - memory.rate, weights) / h0
+    if not np.isfinite(d2):
+        raise EvaluationError(_TOO_TIGHT)
+    longest = LONGEST_FIRST * h0
     if not d2 > 0.0:
         return min(longest, span)
     tau = d1 / d2
-    return float(min(longest, tau * (0.01 / (tau * d1)) ** (1.0 / order), span))
+    return float(min(longest, tau * (PROBE / (tau * d1)) ** (1.0 / order), span))

@@ -18,6 +18,9 @@ TURNED = 0.3
 """Part of the velocity by which it may differ from what is expected."""
 LEFT = 10.0
 """A passage is over when sigma is this many times its smallest value again."""
+PASSED = 0.1
+"""Smallest sigma from which nothing singular was passed: sweeps in their initial layers are off the
+closures, and velocities that change afterwards have not turned."""
 
 
 def jumped(system: System, before: FloatArray, after: FloatArray) -> bool:
@@ -64,10 +67,17 @@ class AmbiguousPassages:
             self._turned = self.turned()
             self._passage = None
 
+    @property
+    def under_way(self) -> bool:
+        """Whether a passage has begun and is not over."""
+        return self._passage is not None
+
     def turned(self) -> list[tuple[float, float]]:
         """Start and end (s) of the passages over which the velocity turned, one that the run ends
         in included."""
         passage = self._passage
-        if passage is None or not jumped(self._system, passage.rate, passage.end_rate):
+        if passage is None or not passage.lowest < PASSED:
+            return self._turned
+        if not jumped(self._system, passage.rate, passage.end_rate):
             return self._turned
         return [*self._turned, (passage.t, passage.end)]

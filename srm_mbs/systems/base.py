@@ -119,8 +119,18 @@ class System(Protocol):
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move along the tangent ``delta`` from ``state``; a new state."""
 
-    def difference(self, start: FloatArray, end: FloatArray) -> FloatArray:
-        """The tangent that moves ``start`` to ``end``: the inverse of :meth:`retract`."""
+    def difference(
+        self, start: FloatArray, end: FloatArray, near: FloatArray | None = None
+    ) -> FloatArray:
+        """The tangent that moves ``start`` to ``end``: the inverse of :meth:`retract`.
+
+        Angles that count no turns take the shortest way, or the turn nearest to that of the tangent
+        ``near``.
+        """
+
+    def reachable(self, start: FloatArray, end: FloatArray) -> bool:
+        """Whether ``end`` is within the chart at ``start``, and what is one step further cannot
+        seem to be."""
 
     def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
         """Rate of the chart coordinate ``delta`` for the tangent rate at retract(state, delta)."""

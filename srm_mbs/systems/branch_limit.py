@@ -8,8 +8,9 @@ singular.  There, however, the direct solve errs by round-off over sigma^2.  So 
 * at regular configurations on both sides of it from the direct solve,
 
 all on one curve in the branch, and interpolated to the configuration that is asked for.  The
-curve, q (+) tau w (+) a normal part, is kinematic: no forces, no time, and any w that leads away
-from the singular configurations.
+curve, q (+) tau w (+) a normal part, is kinematic: no forces, and any w that leads away from the
+singular configurations.  With drives it is one of places (q, t), with P and z of those times, and
+what the rows ask of the velocity, P v - E s', is an affine function of it.
 """
 
 from __future__ import annotations
@@ -43,27 +44,25 @@ NEAR = 1e-2
 
 
 class BranchLimit:
-    """P and z = E Gdot v on one branch at q.
+    """P and z = E (Gdot v - s'') on one branch at q.
 
     Parameters
     ----------
     centre
         The singular configuration on the curve, or q itself.
-    q : (nq,)
-        A configuration on the branch.
-    frame : (nv, d)
+    q
+        A configuration on the branch, as the geometry takes it (:meth:`ClosureGeometry.at`).
+    frame : (n, d)
         Velocities in units, close to the branch's tangents, along which the curve goes straight.
-    tangent : (nv, d)
+    tangent : (n, d)
         Tangent space of the branch at the centre, orthonormal, in units.
-    direction : (nv,)
+    direction : (n,)
         w: a velocity in that space that leads away from the singular configurations, in units.
 
     Attributes
     ----------
-    projector : (nv, nv)
-        P in the model's coordinates.
     accuracy
-        Estimated error of ``projector``; infinite if the branch could not be followed.
+        Estimated error of P; infinite if the branch could not be followed.
     """
 
     def __init__(
@@ -78,9 +77,9 @@ class BranchLimit:
         self._geometry = centre.geometry
         self._frame, self._tangent = frame, tangent
         direction = direction / np.abs(direction).max()
-        nv = len(self._geometry.unit)
+        self._unit = self._geometry.coordinate_unit
         self.accuracy = np.inf
-        self.projector = np.full((nv, nv), np.nan)
+        self._normal = np.full((len(self._unit), len(self._geometry.unit)), np.nan)
         gap = self._geometry.difference(q, centre.q)
         start = float(gap @ direction) / float(direction @ direction)
         for spacing in SPACINGS:
@@ -90,12 +89,12 @@ class BranchLimit:
             found = [node for node in nodes if node is not None]
             if len(found) < len(nodes):
                 continue
-            values = np.array([self._projector(k, node) for k, node in enumerate(found)])
-            projector = self._at_zero(times, values)
-            accuracy = float(np.abs(projector - self._at_zero(times[1:-1], values[1:-1])).max())
+            values = np.array([self._normal_part(k, node) for k, node in enumerate(found)])
+            normal = self._at_zero(times, values)
+            accuracy = float(np.abs(normal - self._at_zero(times[1:-1], values[1:-1])).max())
             if accuracy < self.accuracy:
-                self.accuracy, self.projector = accuracy, projector
-                self._times, self._nodes, self._projectors = times, found, values
+                self.accuracy, self._normal = accuracy, normal
+                self._times, self._nodes, self._normals = times, found, values
             if accuracy < ACCURATE:
                 break
 
@@ -122,44 +121,57 @@ class BranchLimit:
             return None
         return x
 
-    def _white(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Cholesky factor U of M in units, and W = L^-1 G^T = X diag(s) Y^T of structural rank."""
-        rank = self._centre.structural_rank
-        G = self._geometry.normalised(q)
+    def _generalised_inverse(self, q: FloatArray, right: FloatArray) -> FloatArray:
+        """E right (nv, k) in units, for ``right`` (rows, k) of the normalised G, at a regular q."""
+        rank, nv = self._centre.structural_rank, len(self._unit)
+        G = self._geometry.normalised(q)[:, :nv]
         U = cholesky(self._geometry.mass())
-        left, size, right = np.linalg.svd(whiten(U, np.asfortranarray(G.T)), full_matrices=False)
-        return U, left[:, :rank], size[:rank], right[:rank]
+        X, size, Yt = np.linalg.svd(whiten(U, np.asfortranarray(G.T)), full_matrices=False)
+        inner = (Yt[:rank] @ right) / size[:rank, None]
+        return unwhiten(U, np.asfortranarray(X[:, :rank] @ inner))
 
-    def _projector(self, k: int, node: FloatArray) -> FloatArray:
-        """P (nv, nv) at node k, model coordinates."""
-        unit = self._geometry.unit
-        if k == CENTRE:
-            tangent = self._tangent
-            self._geometry.closure(node)
-            M = self._geometry.mass()
-            onto = np.linalg.solve(tangent.T @ M @ tangent, tangent.T @ M)
-            P = np.eye(len(unit)) - tangent @ onto
-        else:
-            U, X, _, _ = self._white(node)
-            P = unwhiten(U, np.asfortranarray(X @ (X.T @ U)))
-        out: FloatArray = P * unit[:, None] / unit
+    def _normal_part(self, k: int, node: FloatArray) -> FloatArray:
+        """[P, -E s'] (nv, n) at node k, in units: P alone without drives."""
+        nv = len(self._unit)
+        if k != CENTRE:
+            return self._generalised_inverse(node, self._geometry.normalised(node))
+        self._geometry.closure(node)
+        M = self._geometry.mass()
+        # Of the branch's velocities with the time's own rate, the nearest in the mass metric.
+        tangent, ahead = _with_time(self._tangent, nv)
+        onto = tangent @ np.linalg.solve(tangent.T @ M @ tangent, tangent.T @ M)
+        P = np.eye(nv) - onto
+        return np.column_stack([P, -P @ ahead])
+
+    @property
+    def projector(self) -> FloatArray:
+        """P (nv, nv) in the model's coordinates."""
+        nv = len(self._unit)
+        out: FloatArray = self._normal[:, :nv] * self._unit[:, None] / self._unit
         return out
 
+    def _off(self, normal: FloatArray, v: FloatArray) -> FloatArray:
+        out: FloatArray = normal @ self._geometry.rates(v) * self._unit
+        return out
+
+    def off_branch(self, v: FloatArray) -> FloatArray:
+        """P v - E s' (nv,): what the velocity v (nv,) has besides one of the branch."""
+        return self._off(self._normal, v)
+
     def _bend(self, k: int, node: FloatArray, v: FloatArray) -> FloatArray:
-        """E Gdot v (nv,) at node k for the velocity v (nv,) of the branch there."""
+        """E (Gdot v - s'') (nv,) at node k for the velocity v (nv,) of the branch there."""
         if k == CENTRE:
             acceleration = self._centre.limit_acceleration(v, np.zeros(len(v)))
             return -acceleration if acceleration is not None else np.zeros(len(v))
-        unit = self._geometry.unit
-        bias = self._geometry.bias(node, v / unit)
-        U, X, size, Y = self._white(node)
-        return unwhiten(U, X @ ((Y @ bias) / size)) * unit
+        bias = self._geometry.bias(node, self._geometry.rates(v))
+        out: FloatArray = self._generalised_inverse(node, bias[:, None])[:, 0] * self._unit
+        return out
 
     def quadratic(self, v: FloatArray) -> FloatArray:
-        """z = E Gdot v (nv,) at q for the velocity v (nv,), model coordinates."""
+        """z = E (Gdot v - s'') (nv,) at q for the velocity v (nv,), model coordinates."""
         values = [
-            self._bend(k, node, v - P @ v)
-            for k, (node, P) in enumerate(zip(self._nodes, self._projectors))
+            self._bend(k, node, v - self._off(normal, v))
+            for k, (node, normal) in enumerate(zip(self._nodes, self._normals))
         ]
         return self._at_zero(self._times, np.array(values))
 
@@ -169,10 +181,21 @@ class BranchLimit:
         return self.projector @ free + self.quadratic(v)
 
 
-def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray) -> FloatArray:
-    """The shortest velocity (nv,) in the branch that leaves the singular configurations as u does.
+def _with_time(tangent: FloatArray, nv: int) -> tuple[FloatArray, FloatArray]:
+    """The velocities (nv, k) of a tangent space (n, d) in which time stands still, and if there is
+    time one (nv, 1) in which it has unit rate."""
+    if len(tangent) == nv:
+        return tangent, np.zeros((nv, 0))
+    passing = tangent[nv]
+    _, _, turned = np.linalg.svd(passing[None])
+    ahead = tangent[:nv] @ passing / (passing @ passing)
+    return tangent[:nv] @ turned[1:].T, ahead[:, None]
 
-    ``tangent`` (nv, d) is the branch's tangent space, u (nv,) a velocity in it, all in units.
+
+def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray) -> FloatArray:
+    """The shortest velocity (n,) in the branch that leaves the singular configurations as u does.
+
+    ``tangent`` (n, d) is the branch's tangent space, u (n,) a velocity in it, all in units.
     What no closure notices, such as the motion of a free base, is left out.
     """
     null = singular.null
@@ -186,7 +209,7 @@ def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray
 def branch_limit(
     singular: SingularConfiguration, q: FloatArray, u: FloatArray
 ) -> BranchLimit | None:
-    """The algebra at q on the branch that u (nv,), in units, is a velocity of.
+    """The algebra at q on the branch that u (n,), in units, is a velocity of.
 
     None if u does not single out one branch (see :meth:`SingularConfiguration.branch`), or if
     there is no singular configuration on the curve through q.
@@ -211,9 +234,9 @@ def branch_limit(
 def branch_next_to(
     geometry: ClosureGeometry, structural_rank: int, q: FloatArray, u: FloatArray
 ) -> tuple[SingularConfiguration | None, BranchLimit | None]:
-    """The singular configuration next to q (nq,), and the algebra at q on its branch.
+    """The singular configuration next to q, and the algebra at q on its branch.
 
-    The branch is that of the velocity u (nv,), in units, or if u does not choose one that of q.
+    The branch is that of the velocity u (n,), in units, or if u does not choose one that of q.
     None, None if there is no singular configuration within NEAR; None for the limit if neither
     chooses a branch.
     """

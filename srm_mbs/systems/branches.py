@@ -13,6 +13,7 @@ the branch kept.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.systems.singular import VANISHING, SingularConfiguration
@@ -81,25 +82,27 @@ def _newton(forms: FloatArray, metric: FloatArray, target: FloatArray | None) ->
 def branch_tangents(
     singular: SingularConfiguration, arriving: FloatArray | None = None
 ) -> FloatArray:
-    """Velocity directions (k, nv) of the branches, in units, of unit length there.
+    """Velocity directions (k, n) of the branches, in units, of unit length there.
 
     Parameters
     ----------
     singular
         An exactly singular configuration.
-    arriving : (nv,)
-        Arriving velocity in units.  Tangents point the way that makes the smaller angle with it.
+    arriving : (n,)
+        Arriving velocity in units.  Tangents point the way that makes the smaller angle with it,
+        or with drives the way that time passes; those without are then left out.
 
     Returns
     -------
-    (k, nv)
+    (k, n)
         Sorted by the angle with ``arriving``, if given.  Empty if no isolated ones were found (a
         singularity of higher order), or where they need an arriving velocity: where a branch has
-        more than one direction that the forms see.  With nullity above 4 some may be missing.
+        more than one direction that the forms see, which with drives is not done at all.  With
+        nullity above 4 some may be missing.
     """
     geometry, null, forms = singular.geometry, singular.null, singular.forms
-    nv, p = null.shape
-    none = np.zeros((0, nv))
+    n, p = null.shape
+    none = np.zeros((0, n))
     flat_forms = forms.reshape(len(forms), p * p)
     _, size, independent = np.linalg.svd(flat_forms, full_matrices=False)
     independent = independent[size > VANISHING]
@@ -107,7 +110,11 @@ def branch_tangents(
     if k < singular.nullity:
         return none
     geometry.closure(singular.q)
+    driven = n > len(geometry.coordinate_unit)
     M = geometry.mass()
+    if driven:
+        # Any metric does where every branch has one direction.
+        M = block_diag(M, np.trace(M) / len(M))
     metric = null.T @ M @ null
     _, size, right = np.linalg.svd(independent.reshape(k * p, p))
     seen = int(np.sum(size > VANISHING))
@@ -129,7 +136,7 @@ def branch_tangents(
             share = (lines @ inner @ target) / np.einsum("ia,ab,ib->i", lines, inner, lines)
             share[np.abs(share) < 1e-12 * speed] = speed
             lines = lines * share[:, None]
-    elif speed > 0.0:
+    elif speed > 0.0 and not driven:
         lines = _newton(bent, inner, target / speed) * speed
     else:
         return none
@@ -138,7 +145,13 @@ def branch_tangents(
     for direction in found:
         direction = direction / np.linalg.norm(direction)
         lead = direction[np.argmax(np.abs(direction) > 0.1 * np.abs(direction).max())]
-        if (lead if arriving is None else direction @ arriving) < 0.0:
+        if driven:
+            lead = direction[-1]
+            if abs(lead) < SAME:  # time stands still: no motion goes there
+                continue
+        elif arriving is not None:
+            lead = direction @ arriving
+        if lead < 0.0:
             direction = -direction
         if all(np.linalg.norm(direction - other) > SAME for other in unique):
             unique.append(direction)
@@ -146,4 +159,4 @@ def branch_tangents(
         unique.sort(key=lambda direction: -float(direction @ arriving))
     else:
         unique.sort(key=lambda direction: tuple(np.round(-direction, 6)))
-    return np.array(unique).reshape(-1, nv)
+    return np.array(unique).reshape(-1, n)

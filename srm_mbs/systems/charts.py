@@ -22,6 +22,10 @@ ROTATION_PER_STEP = 1.5
 LARGEST_ROTATION = 2.5
 """Rotation (rad) of a stage that the charts accept: the series errs by 2e-11 there."""
 
+FARTHEST_NODE = 2.0
+"""Rotation (rad) of a node of an interpolant.  With one step more (by ROTATION_PER_STEP, and a part
+of it that was skipped) a joint that has turned on does not seem to be within it again."""
+
 
 def _bernoulli_terms(count: int) -> tuple[float, ...]:
     """B_{2n} / (2n)! for n = 1 .. count, exact before rounding."""

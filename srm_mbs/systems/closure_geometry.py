@@ -1,6 +1,7 @@
 """Closure rows without forces: g, G and Gdot v as pure numbers, for geometry on the loops.
 
-Drives are not part of it: what is singular here is singular whatever the motion.
+Drives are not part of it: what is singular here is singular whatever the motion.  With them, and
+time as one more coordinate, it is :mod:`srm_mbs.systems.driven_geometry`.
 
 Coordinates count in their units (1 rad, the scene diagonal), rows in theirs; *normalised* rows are
 divided by their usual size, so that ranks can be judged.
@@ -19,6 +20,7 @@ from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics, world_jacobian
 from srm_mbs.systems.structure import ROUNDING_ROW
 from srm_mbs.systems.units import coordinate_units, row_units
+from srm_mbs.workspaces import workspace
 
 
 class ClosureGeometry:
@@ -33,8 +35,12 @@ class ClosureGeometry:
 
     Attributes
     ----------
-    unit : (nv,), length, row_unit : (rows,)
+    coordinate_unit : (nv,), length, row_unit : (rows,)
         Units of the coordinates, the scene diagonal (m), units of the rows.
+    unit : (n,)
+        Units of all that moves here: the coordinates, n = nv.
+    drives
+        Names of the drives whose rows follow those of the loops: none.
     """
 
     def __init__(self, mechanism: Mechanism, start: FloatArray) -> None:
@@ -43,12 +49,13 @@ class ClosureGeometry:
         # Gravity cancels in Gdot v, but its rounding would not at small rates.
         self.model = mechanism.model.copy()
         self.model.gravity.linear = np.zeros(3)
-        self.data = self.model.createData()
+        self.data = workspace(self.model)
         self.rows = LoopKinematics(self.model, mechanism.loops)
         units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
-        self.unit = units.coordinate
+        self.unit = self.coordinate_unit = units.coordinate
         self.length = units.length
         self.row_unit = row_units(mechanism, units)
+        self.drives: tuple[str, ...] = ()
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
@@ -98,8 +105,17 @@ class ClosureGeometry:
 
     def mass(self) -> FloatArray:
         """Mass matrix (nv, nv) for rates in units, where the closures were evaluated last."""
-        upper = np.triu(self.data.M)
-        out: FloatArray = (upper + np.triu(upper, 1).T) * self.unit * self.unit[:, None]
+        upper, unit = np.triu(self.data.M), self.coordinate_unit
+        out: FloatArray = (upper + np.triu(upper, 1).T) * unit * unit[:, None]
+        return out
+
+    def at(self, q: FloatArray, t: float) -> FloatArray:
+        """What the other methods take for the configuration q (nq,) at the time t (s): q itself."""
+        return q
+
+    def rates(self, v: FloatArray) -> FloatArray:
+        """Rates (n,) in units of a motion with the velocity v (nv,)."""
+        out: FloatArray = v / self.unit
         return out
 
     def move(self, q: FloatArray, delta: Any, free: IndexArray | None = None) -> FloatArray:

@@ -15,7 +15,8 @@ Controller = Callable[[float, FloatArray, FloatArray], Any]
 
 
 def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-    """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v``.
+    """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v`` and may
+    return the same array every time.
 
     Raises
     ------
@@ -23,7 +24,7 @@ def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> Fl
         If it raises, or returns anything but nv finite numbers.
     """
     try:
-        tau = np.asarray(controller(t, q.copy(), v.copy()), dtype=float)
+        tau = np.array(controller(t, q.copy(), v.copy()), dtype=float, order="C")
     except Exception as error:
         raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
     if tau.shape != v.shape or not np.isfinite(tau).all():
@@ -31,4 +32,4 @@ def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> Fl
             f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
             f"it must return {len(v)} finite generalised forces"
         )
-    return np.ascontiguousarray(tau)
+    return tau

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import CallbackError, EvaluationError, InputError
@@ -107,7 +108,10 @@ class DaeSystem:
             If it returns values that are not finite.
         """
         try:
-            value = np.array(getattr(self.problem, name)(t, x.copy()), dtype=float)
+            returned = getattr(self.problem, name)(t, x.copy())
+            if np.iscomplexobj(returned):
+                raise TypeError("complex values")
+            value = np.array(returned, dtype=float)
         except Exception as error:
             raise CallbackError(f"{name} raised {error!r} at t = {t:.6g}") from error
         if value.shape not in self._accepted(name):
@@ -127,7 +131,11 @@ class DaeSystem:
         try:
             value = np.asarray(self.problem.g(t, x.copy()), dtype=float)
         except Exception as error:
-            raise InputError(f"g raised {error!r} at the start", element="g") from error
+            raise InputError(
+                f"g raised {error!r} at the start",
+                element="g",
+                remedy="Give a function of (t, x) that returns (ny,) values",
+            ) from error
         if value.ndim > 1 or not 1 <= value.size <= self.nx:
             raise InputError(
                 f"g returns shape {value.shape} for {self.nx} states",
@@ -167,7 +175,7 @@ class DaeSystem:
                 raise InputError(
                     f"{what} {int(np.argmin(sizes))} of {name} vanishes around the start",
                     element=name,
-                    remedy="The equations must have index 2: G B regular",
+                    remedy="Give equations of index 2: G B regular",
                 )
         measured = ObliqueProjection(rows, columns)
         sizes_seen = []
@@ -182,7 +190,7 @@ class DaeSystem:
             raise InputError(
                 "G B is singular at the start and around it",
                 element="G",
-                remedy="The equations must have index 2: G B regular but for isolated points",
+                remedy="Give equations of index 2: G B regular but for isolated points",
             )
         reference = np.median(sizes_seen, axis=0)
         return ObliqueProjection(rows, columns, reference)
@@ -206,7 +214,7 @@ class DaeSystem:
                     f"G[{row}, {i}] = {G[row, i]:.6g} at the start, but dg/dx there is "
                     f"{slope[row]:.6g} by finite differences",
                     element="G",
-                    remedy="G must return the derivative of g with respect to x",
+                    remedy="Return the derivative of g with respect to x from G",
                 )
 
     def _time_derivative_known(self, t0: float, x: FloatArray, t_end: float) -> bool:
@@ -235,7 +243,7 @@ class DaeSystem:
             raise InputError(
                 f"g_t = {given} at the start, but dg/dt there is {slope} by finite differences",
                 element="g_t",
-                remedy="g_t must return the partial derivative of g with respect to t",
+                remedy="Return the partial derivative of g with respect to t from g_t",
             )
         return True
 
@@ -276,7 +284,13 @@ class DaeSystem:
         """max |dx|; see :class:`~srm_mbs.systems.base.System`."""
         return float(np.abs(delta).max())
 
-    def difference(self, start: FloatArray, end: FloatArray) -> FloatArray:
+    def reachable(self, start: FloatArray, end: FloatArray) -> bool:
+        """True: there is one chart."""
+        return True
+
+    def difference(
+        self, start: FloatArray, end: FloatArray, near: FloatArray | None = None
+    ) -> FloatArray:
         """end - start; see :class:`~srm_mbs.systems.base.System`."""
         return end - start
 
@@ -290,6 +304,15 @@ class DaeSystem:
         return float(np.max(np.abs(g) / self.projection.rows)) / max(
             1.0, float(np.abs(state).max())
         )
+
+    def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:
+        """Eigenvalues (ny,) of G B T: the rates at which sweeps reduce g, times eps."""
+        if self.T == "inverse":
+            return np.ones(self.ny, dtype=np.complex128)
+        product = self.call("G", t, state) @ self.call("B", t, state)
+        if self.T == "transpose":
+            product = product @ product.T
+        return np.linalg.eigvals(product).astype(np.complex128)
 
     def step_limit(self, state: FloatArray) -> float:
         """No limit."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import EvaluationError
 
 if TYPE_CHECKING:
     from srm_mbs.systems.dae import DaeSystem
@@ -97,6 +98,10 @@ class DaeTerms:
         if self._system.carries_yhat:
             yhat = self._completed(self._p.project(previous) + self._p.lift(g) / eps)
             return self.f - yhat, yhat
-        scaled = g if self._system.T == "identity" else (self.G @ self.B).T @ g
-        y = previous + scaled / eps
-        return self.f - self.B @ y, y
+        with np.errstate(over="ignore", invalid="ignore"):  # of sweeps that are unstable
+            scaled = g if self._system.T == "identity" else (self.G @ self.B).T @ g
+            y = previous + scaled / eps
+            rate = self.f - self.B @ y
+        if not (np.isfinite(rate).all() and np.isfinite(y).all()):
+            raise EvaluationError("the multiplier of a sweep grows beyond all numbers")
+        return rate, y

@@ -22,6 +22,7 @@ from srm_mbs.laws import Curve
 from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics, all_rows, closure_errors
+from srm_mbs.workspaces import workspace
 
 if TYPE_CHECKING:
     from srm_mbs.systems.closure_geometry import ClosureGeometry
@@ -88,6 +89,11 @@ class DrivenKinematics:
         ]
         self._in_v = [model.joints[model.getJointId(d.joint)].idx_v for d in self._joints]
 
+    def pattern(self) -> BoolArray:
+        """Which entries of G (m, nv) may differ from zero."""
+        joints = self.G[self._closed.stop :] != 0.0
+        return np.concatenate([self._inner.pattern(), joints])
+
     def constants(self) -> dict[str, Any]:
         """What the compiled kernel needs of the closures, those of driven points included."""
         return self._inner.constants()
@@ -144,7 +150,7 @@ def constraint_errors(
     if not mechanism.drives:
         return closure_errors(model, mechanism.loops, q, v, all_rows(mechanism))
     rows = DrivenKinematics(model, mechanism.loops, mechanism.drives, mechanism.drive_curves)
-    data = model.createData()
+    data = workspace(model)
     g = np.empty((len(q), len(rows.g)))
     c = np.empty_like(g)
     for i in range(len(q)):

@@ -27,6 +27,7 @@ from srm_mbs.systems.link_forces import BushingEvaluator, SpringDamperEvaluator,
 from srm_mbs.systems.loops import world_jacobian
 from srm_mbs.systems.projection import cholesky, whiten
 from srm_mbs.user_forces import UserForce
+from srm_mbs.workspaces import workspace
 
 
 class _UserForceEvaluator:
@@ -77,7 +78,7 @@ def friction_time(mechanism: Mechanism) -> float:
     rough = np.flatnonzero(model.friction)
     if not rough.size:
         return np.inf
-    U = cholesky(pin.crba(model, model.createData(), mechanism.q0))
+    U = cholesky(pin.crba(model, workspace(model), mechanism.q0))
     roots = np.zeros((model.nv, rough.size), order="F")
     roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / mechanism.friction_speed)
     return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)

@@ -39,6 +39,7 @@ from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.joint_rows import JointRows
 from srm_mbs.systems.vectors import cross, cross3, dot, from_world, minus, plus_cross, to_world
+from srm_mbs.workspaces import workspace
 
 COINCIDENT = 1e-9
 """Distance of two points, over the length that it should have, from which it has a direction."""
@@ -273,6 +274,13 @@ class LoopKinematics:
         other._allocate()
         return other
 
+    def pattern(self) -> BoolArray:
+        """Which entries of G (m, nv) may differ from zero."""
+        out: BoolArray = self._support != 0.0
+        for own, entries in self._constant:
+            out[own] = entries != 0.0
+        return out
+
     def constants(self) -> dict[str, Any]:
         """What the compiled kernel needs of the rows: ``loops`` between anchors, ``joint_rows``."""
         return {
@@ -326,7 +334,7 @@ def closure_errors(
     ``rows``: from :func:`all_rows`, where a mechanism is at hand.
     """
     rows = LoopKinematics(model, loops) if rows is None else rows
-    data = model.createData()
+    data = workspace(model)
     g = np.empty((len(q), len(rows.g)))
     c = np.empty_like(g)
     for i in range(len(q)):

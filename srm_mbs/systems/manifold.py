@@ -16,6 +16,7 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.charts import (
+    FARTHEST_NODE,
     LARGEST_ROTATION,
     ROTATION_PER_STEP,
     SERIES,
@@ -52,6 +53,17 @@ class Manifold:
     def _planar(self) -> tuple[GroupJoint, ...]:
         return tuple(joint for joint in self._groups if joint.group == "se2")
 
+    @cached_property
+    def _turning(self) -> IndexArray:
+        """Velocity indices of the joints whose angle is (cos, sin)."""
+        turning: IndexArray = self.mechanism.derived(
+            "turning",
+            lambda: np.array(
+                [j.idx_v for j in list(self.model.joints)[1:] if (j.nq, j.nv) == (2, 1)], dtype=int
+            ),
+        )
+        return turning
+
     def _vector_coordinates(self) -> IndexArray:
         """Index into q of each velocity component, -1 where q is not a vector space there."""
         index = np.full(self.nv, -1)
@@ -68,7 +80,9 @@ class Manifold:
             "position_of": [int(i) for i in self._position_of],
             "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
             "series": np.array(SERIES),
+            "turning": [int(i) for i in self._turning],
             "largest_rotation": LARGEST_ROTATION,
+            "farthest_node": FARTHEST_NODE,
             "rotation_per_step": ROTATION_PER_STEP,
         }
 
@@ -88,7 +102,17 @@ class Manifold:
         out[self.nq :] = state[self.nq :] + delta[self.nv :]
         return out
 
-    def difference(self, start: FloatArray, end: FloatArray) -> FloatArray:
+    def reachable(self, start: FloatArray, end: FloatArray) -> bool:
+        """Whether no group joint turns by more than ``FARTHEST_NODE``; see
+        :class:`~srm_mbs.systems.base.System`."""
+        if not self._groups:
+            return True
+        moved = pin.difference(self.model, start[: self.nq], end[: self.nq])
+        return all(joint.rotation(moved) <= FARTHEST_NODE for joint in self._groups)
+
+    def difference(
+        self, start: FloatArray, end: FloatArray, near: FloatArray | None = None
+    ) -> FloatArray:
         """(q_end (-) q_start, v_end - v_start); see :class:`~srm_mbs.systems.base.System`."""
         if self._flat:
             return end - start
@@ -99,6 +123,10 @@ class Manifold:
         # The logarithm loses digits at small angles, the exponential does not.
         moved = self.retract(start, delta)
         delta[: self.nv] += pin.difference(self.model, moved[:nq], end[:nq])
+        if near is not None:
+            turning = self._turning
+            turns = np.round((near[turning] - delta[turning]) / (2.0 * np.pi))
+            delta[turning] += 2.0 * np.pi * turns
         return delta
 
     def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:

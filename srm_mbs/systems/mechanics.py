@@ -18,6 +18,7 @@ from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.loops import COINCIDENT
 from srm_mbs.systems.manifold import Manifold
+from srm_mbs.workspaces import workspace
 
 _NO_ROWS = np.zeros(0)
 
@@ -35,17 +36,21 @@ class Mechanics(Manifold):
         self.evaluations = 0
         self._controller = controller
         damping, friction = self.model.damping, self.model.friction
-        self._damping = damping.copy() if damping.any() else None
-        self._friction = friction.copy() if friction.any() else None
+        self._damping = damping.copy() if np.count_nonzero(damping) else None
+        self._friction = friction.copy() if np.count_nonzero(friction) else None
         self._friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Terms and workspaces share memory, which copies of them would not.
+        return type(self), (self.mechanism, self._controller)
 
     # Made when the reference first evaluates: the compiled kernel has its own.
     @cached_property
     def data(self) -> pin.Data:
         """Pinocchio's workspace."""
-        return self.model.createData()
+        return workspace(self.model)
 
     @property
     def controlled(self) -> bool:
@@ -113,7 +118,11 @@ class Mechanics(Manifold):
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel (:mod:`srm_mbs.compiled`)."""
         fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
-        return fixed | {
+        return fixed | self.constants_of_start()
+
+    def constants_of_start(self) -> dict[str, Any]:
+        """Those among :meth:`constants` that depend on the start, or that the model may change."""
+        return {
             "unit": self._unit,
             "gap_scale": _NO_ROWS,
             "damping": self._damping,

@@ -17,7 +17,9 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.driven import DriveRows
 from srm_mbs.systems.loops import world_jacobian
+from srm_mbs.systems.ranks import null_basis
 from srm_mbs.systems.structure import Walker, row_names
+from srm_mbs.workspaces import workspace
 
 if TYPE_CHECKING:
     from srm_mbs.mechanism import Mechanism
@@ -108,10 +110,10 @@ def mobility(mechanism: Mechanism) -> Mobility:
     idle = [len(columns) for _, columns in compounds]
     for q in samples if names else ():
         G = geometry.normalised(q) if rows else np.zeros((0, nv))
-        _, singular, right = np.linalg.svd(G)
-        if int(np.sum(singular > RANK)) != rank:
+        null = null_basis(G, RANK)
+        if nv - null.shape[1] != rank:
             continue
-        np.maximum(rates, np.linalg.norm(right[rank:], axis=0), out=rates)
+        np.maximum(rates, np.linalg.norm(null, axis=1), out=rates)
         for k, (_, columns) in enumerate(compounds):
             if not idle[k]:
                 continue
@@ -119,10 +121,9 @@ def mobility(mechanism: Mechanism) -> Mobility:
             idle[k] = min(idle[k], len(columns) - moved)
         if driven.drives:
             G = np.vstack([G, DriveRows(driven, geometry, q).rows])
-        left, singular, _ = np.linalg.svd(G)
-        own = int(np.sum(singular > RANK))
-        if own == driven.structure.rank:
-            np.maximum(undetermined, 1.0 - (left[:, :own] ** 2).sum(axis=1), out=undetermined)
+        dependent = null_basis(G.T, RANK)
+        if len(G) - dependent.shape[1] == driven.structure.rank:
+            np.maximum(undetermined, (dependent**2).sum(axis=1), out=undetermined)
     return Mobility(
         joint_freedoms=nv,
         rows=rows,
@@ -199,7 +200,7 @@ def _compounds(mechanism: Mechanism) -> list[tuple[tuple[str, ...], IndexArray]]
 def _planar(mechanism: Mechanism, samples: list[FloatArray]) -> bool:
     """Whether all links move parallel to one plane."""
     model = mechanism.model
-    data = model.createData()
+    data = workspace(model)
     turns, shifts = [], []
     for q in samples[:: max(1, len(samples) - 1)]:
         pin.computeJointJacobians(model, data, q)

@@ -121,8 +121,12 @@ class ClosedSystem(Mechanics):
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
-        own = super().constants() | {"gap_scale": self._gap_scale}
+        own = super().constants()
         return own if self._driven is None else own | {"drives": self._driven.moving()}
+
+    def constants_of_start(self) -> dict[str, Any]:
+        """As for open mechanisms, and the scales of the closures."""
+        return super().constants_of_start() | {"gap_scale": self._gap_scale}
 
     def _constants(self) -> dict[str, Any]:
         own = {

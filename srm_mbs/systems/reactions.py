@@ -19,6 +19,7 @@ from srm_mbs.systems.driven import DrivenKinematics
 from srm_mbs.systems.loops import row_wrenches
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
 from srm_mbs.systems.projection import cholesky, whiten
+from srm_mbs.workspaces import workspace
 
 
 def reactions_at(
@@ -70,7 +71,7 @@ def _multipliers(
     model = mechanism.model
     rows = DrivenKinematics(model, mechanism.loops, mechanism.drives)
     scale = mechanism.structure.row_scale
-    data = model.createData()
+    data = workspace(model)
     for i in range(len(t)):
         terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
         yhat = terms.multiplier().copy()

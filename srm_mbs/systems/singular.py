@@ -11,7 +11,9 @@ Lie groups too, and D^3 g[v, v, v] means d/dtau (Gdot v) along q (+) tau v with 
 Permanent redundancies (rows that depend on each other everywhere) have left null vectors as well;
 their forms vanish on the velocities that keep the loops closed.
 
-Everything is in units (:mod:`srm_mbs.systems.closure_geometry`) unless it says otherwise.
+Everything is in units (:mod:`srm_mbs.systems.closure_geometry`) unless it says otherwise.  What is
+called a configuration q (nq,) with rates (nv,) is with drives a place (q, t), (nq + 1,), with rates
+(nv + 1,): :mod:`srm_mbs.systems.driven_geometry`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.ranks import singular_value
 
 SINGULAR = 1e-7
 """Singular value of the normalised G that counts as zero: the square root of round-off, because a
@@ -34,6 +37,8 @@ DETERMINED = 1e-8
 they single out one branch."""
 PARTICIPATES = 1e-6
 """Share in a left null vector from which a row takes part."""
+SPARE = 8
+"""Values of the forms more than there are forms."""
 BRANCH_ITERATIONS = 8
 SEARCH_ITERATIONS = 20
 SEARCH_DIFFERENCE = 1e-6
@@ -88,7 +93,7 @@ def sharpened(
     (nq,) or None
         The singular configuration, or None if there is none within reach.
     """
-    free = np.arange(geometry.model.nv) if free is None else free
+    free = np.arange(len(geometry.unit)) if free is None else free
 
     def equations(x: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
         g, G = geometry.closure(x)
@@ -162,8 +167,46 @@ def smallest_singular_value(
     geometry: ClosureGeometry, q: FloatArray, structural_rank: int
 ) -> float:
     """The last structural singular value of the normalised G at q."""
-    values = np.linalg.svd(geometry.normalised(q), compute_uv=False)
-    return float(values[structural_rank - 1])
+    return singular_value(geometry.normalised(q), structural_rank)
+
+
+@dataclass(frozen=True)
+class Participants:
+    """What loses rank at a singular configuration.
+
+    Attributes
+    ----------
+    rows, loops, drives
+        Names of the closure rows that take part, ``loop.row``, of their loops, and of the drives.
+    """
+
+    rows: tuple[str, ...] = ()
+    loops: tuple[str, ...] = ()
+    drives: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> str:
+        """Loops and drives in one list."""
+        return ", ".join((*self.loops, *self.drives))
+
+    def __str__(self) -> str:
+        kinds = (("loops", self.loops), ("drives", self.drives))
+        named = "; ".join(f"{kind} {', '.join(map(repr, own))}" for kind, own in kinds if own)
+        return f"the closures and drives ({named})" if self.drives else f"the closures ({named})"
+
+
+def participants(geometry: ClosureGeometry, left: FloatArray) -> Participants:
+    """Those of the left null vectors ``left`` (rows, k) of the normalised G."""
+    takes_part = (np.linalg.norm(left, axis=1) > PARTICIPATES).tolist()
+    loops = geometry.mechanism.loops
+    rows = [(name, loop.name) for loop in loops for name in loop.row_names]
+    own = [row for row, involved in zip(rows, takes_part) if involved]
+    drives = zip(geometry.drives, takes_part[len(rows) :])
+    return Participants(
+        tuple(name for name, _ in own),
+        tuple(dict.fromkeys(loop for _, loop in own)),
+        tuple(name for name, involved in drives if involved),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,15 +218,13 @@ class SingularConfiguration:
     geometry
         The closures.
     q : (nq,)
-        The configuration.
+        The configuration, with drives its place (:meth:`ClosureGeometry.at`).
     structural_rank, rank
         Rank of the closures in regular configurations, and here.
     left : (rows, n)
         Orthonormal left null vectors of the normalised G, permanent redundancies included.
     null : (nv, p)
         Orthonormal basis of the velocities (in units) that keep the loops closed.
-    forms : (n, p, p)
-        u_j^T Gdot, symmetric, on that basis.
     """
 
     geometry: ClosureGeometry
@@ -192,7 +233,20 @@ class SingularConfiguration:
     rank: int
     left: FloatArray
     null: FloatArray
-    forms: FloatArray
+
+    @cached_property
+    def forms(self) -> FloatArray:
+        """u_j^T Gdot (n, p, p), symmetric, on the basis ``null``."""
+        geometry, q, left, null = self.geometry, self.q, self.left, self.null
+        p = null.shape[1]
+        forms = np.zeros((left.shape[1], p, p))
+        for a in range(p):
+            forms[:, a, a] = left.T @ geometry.bias(q, null[:, a])
+            for b in range(a):
+                plus = geometry.bias(q, null[:, a] + null[:, b])
+                minus = geometry.bias(q, null[:, a] - null[:, b])
+                forms[:, a, b] = forms[:, b, a] = 0.25 * (left.T @ (plus - minus))
+        return forms
 
     @property
     def nullity(self) -> int:
@@ -202,29 +256,23 @@ class SingularConfiguration:
     @cached_property
     def true_left(self) -> FloatArray:
         """Left null vectors (rows, k) whose forms do not vanish: the singularity proper."""
-        if not len(self.forms):
+        if self.left.shape[1] == self.nullity:  # no permanent redundancies
             return self.left
-        turned, size, _ = np.linalg.svd(
-            self.forms.reshape(len(self.forms), -1), full_matrices=False
-        )
+        # As many values of the forms as there are forms tell which combinations vanish; the forms
+        # themselves have as many entries as there are pairs of velocities.
+        count = self.left.shape[1] + SPARE
+        motions = self.null @ np.random.default_rng(0).standard_normal((self.null.shape[1], count))
+        values = np.array([self.curvature(motion) for motion in motions.T]).T
+        turned, size, _ = np.linalg.svd(values / np.sqrt(count), full_matrices=False)
         out: FloatArray = self.left @ turned[:, size > VANISHING]
         return out
 
     @cached_property
-    def rows(self) -> tuple[str, ...]:
-        """Names of the closure rows that take part, ``loop.row``."""
-        names = [name for loop in self.geometry.mechanism.loops for name in loop.row_names]
+    def participants(self) -> Participants:
+        """The rows that take part."""
         # At a singularity of higher order every left null vector is all there is to show.
         vectors = self.true_left if self.true_left.shape[1] else self.left
-        share = np.linalg.norm(vectors, axis=1)
-        return tuple(name for name, part in zip(names, share) if part > PARTICIPATES)
-
-    @cached_property
-    def loops(self) -> tuple[str, ...]:
-        """Names of the loops whose rows take part."""
-        taking_part = {name.rpartition(".")[0] for name in self.rows}
-        loops = self.geometry.mechanism.loops
-        return tuple(loop.name for loop in loops if loop.name in taking_part)
+        return participants(self.geometry, vectors)
 
     def curvature(self, u: FloatArray) -> FloatArray:
         """u_j^T Gdot(v) v (n,) for the rates u (nv,); zero for the tangent of a branch."""
@@ -289,8 +337,8 @@ class SingularConfiguration:
         the closures to third order, the one nearest to ``free`` (nv,) = M^-1 f in the mass metric
         (Gauss).  None if v does not single out one branch.
         """
-        geometry = self.geometry
-        u = v / geometry.unit
+        geometry, unit = self.geometry, self.geometry.coordinate_unit
+        u = geometry.rates(v)
         size = float(np.abs(u).max())
         if self.branch(u) is None:
             return None
@@ -301,26 +349,18 @@ class SingularConfiguration:
         right = np.concatenate(
             [-geometry.bias(self.q, direction), -self.third_derivative(direction)]
         )
-        gap = right * size**2 - rows @ (free / geometry.unit)
+        rows = rows[:, : len(unit)]  # time passes evenly
+        gap = right * size**2 - rows @ (free / unit)
         white = np.linalg.solve(U.T, rows.T).T
         fit = determined_solution(white / np.linalg.norm(white, 2), gap / np.linalg.norm(white, 2))
-        out: FloatArray = free + geometry.unit * np.linalg.solve(U, fit)
+        out: FloatArray = free + unit * np.linalg.solve(U, fit)
         return out
 
 
 def analyse_singular(
     geometry: ClosureGeometry, q: FloatArray, structural_rank: int
 ) -> SingularConfiguration:
-    """Null vectors and second-order forms at q (nq,), an exactly singular configuration."""
+    """Null vectors at q (nq,), an exactly singular configuration; the rest when it is asked for."""
     left, singular, right = np.linalg.svd(geometry.normalised(q))
     rank = int(np.sum(singular > SINGULAR))
-    left, null = left[:, rank:], right[rank:].T
-    p = null.shape[1]
-    forms = np.zeros((left.shape[1], p, p))
-    for a in range(p):
-        forms[:, a, a] = left.T @ geometry.bias(q, null[:, a])
-        for b in range(a):
-            plus = geometry.bias(q, null[:, a] + null[:, b])
-            minus = geometry.bias(q, null[:, a] - null[:, b])
-            forms[:, a, b] = forms[:, b, a] = 0.25 * (left.T @ (plus - minus))
-    return SingularConfiguration(geometry, q, structural_rank, rank, left, null, forms)
+    return SingularConfiguration(geometry, q, structural_rank, rank, left[:, rank:], right[rank:].T)

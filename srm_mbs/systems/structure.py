@@ -16,11 +16,15 @@ import pinocchio as pin
 
 from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.drives import in_order_of_rows
+from srm_mbs.errors import EvaluationError
+from srm_mbs.inertias import check_inertia
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.driven import DrivenKinematics
-from srm_mbs.systems.loops import LoopKinematics, world_jacobian
-from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
+from srm_mbs.systems.loops import world_jacobian
+from srm_mbs.systems.pivoting import RowAlgebra, row_algebra, trees
+from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, unwhiten, whiten
 from srm_mbs.systems.units import Units, coordinate_units, row_units
+from srm_mbs.workspaces import workspace
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +38,10 @@ ROUNDING_ROW = 1e-12
 """Rows of one kind whose rms stays below this part of their uncancelled terms are rounding."""
 ZERO_ROW = 1e-9
 """A scaled row that stays below this in every closed sample is zero."""
+NULL = 1e-7
+"""Pivots (of scaled rows) below this leave their direction free on the walk."""
+CLOSING_RANK = 1e-9
+"""Pivots below this part of the largest do not close loops."""
 RANK_GAP = 1e3
 """Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
@@ -107,44 +115,57 @@ class Walker:
 
     def __init__(self, mechanism: Mechanism, units: Units) -> None:
         self.model = mechanism.model
-        self.data = self.model.createData()
+        self.data = workspace(self.model)
         self.units = units
-        self.rows = LoopKinematics(self.model, mechanism.loops)
         self.row_unit = row_units(mechanism, units)
-        self._all = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
-        self.closed = len(self.rows.g)
-        self.scale = np.ones(len(self._all.g))
+        self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        self.closed = len(self.row_unit)
+        self.scale = np.ones(len(self._rows.g))
+        pattern = self._rows.pattern()
+        self._all = row_algebra(pattern, self.model)
+        driven = self.closed < len(self.scale)
+        self._loops = row_algebra(pattern[: self.closed], self.model) if driven else self._all
+        self._plain = row_algebra(pattern[: self.closed])
+        self._trees = trees(self.model)
+        self._factorised: FloatArray | None = None
 
-    def evaluate(self, q: FloatArray) -> None:
-        """g and G of ``rows``, the loops', and M in ``data``, at q."""
+    def _evaluate(self, q: FloatArray) -> None:
+        """g and G of all rows, and M in ``data``, at q."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self.rows.update(self.data, q, with_bias=False)
+        self._rows.update(self.data, q, with_bias=False)
+        self._factorised = None
 
-    def white(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """W = L^-1 G^T (nv, m) of all scaled rows, those of the loops first, and the Cholesky
-        factor U (nv, nv), at q."""
-        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self._all.update(self.data, q, with_bias=False)
-        U = cholesky(self.data.M)
-        return whiten(U, np.asfortranarray((self._all.G / self.scale[:, None]).T)), U
+    def factorised(self, q: FloatArray) -> tuple[RowAlgebra, RowAlgebra]:
+        """The algebra of all scaled rows, and that of the loops', in the mass metric at q."""
+        if self._factorised is not q:
+            self._evaluate(q)
+            G = self._rows.G / self.scale[:, None]
+            self._all.factor(self.data.M, G, NULL)
+            if self._loops is not self._all:
+                self._loops.factor(self.data.M, G[: self.closed], NULL)
+            self._factorised = q
+        return self._all, self._loops
 
     def close(self, q: FloatArray, iterations: int = 30) -> tuple[FloatArray, float]:
-        """Gauss-Newton onto the closure manifold; q and the largest error left, in row units."""
+        """Newton's iteration onto the closure manifold by shortest steps in units; q and the
+        largest error left, in row units."""
         if not self.closed:
             return q, 0.0
-        unit = self.units.coordinate
-        for _ in range(iterations):
-            self.evaluate(q)
-            g = self.rows.g / self.row_unit
-            if np.abs(g).max() < 1e-14:
+        unit, own = self.units.coordinate, slice(self.closed)
+        for iteration in range(iterations + 1):
+            self._evaluate(q)
+            g = self._rows.g[own] / self.row_unit
+            error = float(np.abs(g).max())
+            if error < 1e-14 or iteration == iterations:
                 break
-            by_unit = self.rows.G / self.row_unit[:, None] * unit
-            step = np.linalg.lstsq(by_unit, g, rcond=1e-9)[0] * unit
-            if not np.isfinite(step).all():
+            by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
+            try:
+                longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
+                self._plain.factor(None, by_unit, CLOSING_RANK * longest)
+            except EvaluationError:
                 break
-            q = pin.integrate(self.model, q, -step)
-        self.evaluate(q)
-        return q, float(np.abs(self.rows.g / self.row_unit).max())
+            q = pin.integrate(self.model, q, -self._plain.solve(g) * unit)
+        return q, error
 
     def set_scale(self, mechanism: Mechanism, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""
@@ -152,13 +173,16 @@ class Walker:
         uncancelled = np.zeros(2)
         for _ in range(OPEN_SAMPLES):
             spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
-            W, U = self.white(pin.integrate(self.model, mechanism.q0, spread))
-            squares += (W**2).sum(axis=0)
+            rows, _ = self.factorised(pin.integrate(self.model, mechanism.q0, spread))
+            squares += rows.row_squares
             # What rows would measure if nothing in them cancelled: their rounding is eps of it.
             J = world_jacobian(self.data)
             turn = np.linalg.norm(J[3:], axis=0)
             shift = np.linalg.norm(J[:3], axis=0) + self.units.length * turn
-            uncancelled += [(whiten(U, np.diag(each)) ** 2).sum() for each in (shift, turn)]
+            for tree in self._trees:
+                U = cholesky(self.data.M[tree, tree])
+                mobility = (whiten(U, np.eye(len(U))) ** 2).sum(axis=0)
+                uncancelled += [mobility @ each[tree] ** 2 for each in (shift, turn)]
         squares /= OPEN_SAMPLES
         uncancelled /= OPEN_SAMPLES
         at = 0
@@ -175,6 +199,13 @@ class Walker:
             at += loop.rows.count
         driven = squares[at:]
         self.scale[at:] = np.sqrt(np.where(driven > 0.0, driven, 1.0))
+
+    def _isotropic(self, white: FloatArray) -> FloatArray:
+        """L^-T white (nv,), where M was evaluated last: no direction preferred in its metric."""
+        out = np.empty_like(white)
+        for tree in self._trees:
+            out[tree] = unwhiten(cholesky(self.data.M[tree, tree]), white[tree])
+        return out
 
     def step(self, q: FloatArray, direction: FloatArray, reach: float) -> FloatArray | None:
         """A closed configuration about ``reach`` units from q along ``direction``; None if none."""
@@ -206,15 +237,11 @@ class Walker:
         for restart in range(restarts):
             q = start
             for k in range(steps):
-                W, U = self.white(q)
                 # Drives take no part: they lead along the closed configurations, wherever that is.
-                left, singular, _ = np.linalg.svd(W[:, : self.closed], full_matrices=True)
-                rank = int(np.sum(singular > 1e-7))
-                null = left[:, rank:]
-                if null.shape[1] == 0:
+                _, rows = self.factorised(q)
+                if rows.rank == self.model.nv:
                     break
-                # Projected, not combined from the columns of null: their choice is LAPACK's.
-                direction = unwhiten(U, null @ (null.T @ rng.standard_normal(len(U))))
+                direction = rows.tangential(self._isotropic(rng.standard_normal(self.model.nv)))
                 if k == 0 and restart < len(along):
                     direction = along[restart]
                 closed = self.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
@@ -234,12 +261,11 @@ def _closed_samples(
     largest = np.zeros(rows)
 
     def record(q: FloatArray) -> None:
-        W, _ = walker.white(q)
-        np.maximum(largest, np.linalg.norm(W, axis=0), out=largest)
-        pivots.append(pivoted_qr(W)[3])
+        every, loops = walker.factorised(q)
+        np.maximum(largest, np.sqrt(every.row_squares), out=largest)
+        pivots.append(every.pivots)
         if closed_rows < rows:
-            W = W[:, :closed_rows]
-            of_loops.append(pivoted_qr(W)[3] if closed_rows else np.zeros(0))
+            of_loops.append(loops.pivots)
 
     start, error = walker.close(mechanism.q0, iterations=100)
     if error < 1e-11:
@@ -270,9 +296,12 @@ def analyse(mechanism: Mechanism) -> Structure:
 
     Raises
     ------
+    InputError
+        If a joint moves no inertia.
     EvaluationError
-        If the mass matrix is not positive definite.
+        If the mass matrix is not positive definite where the walk evaluates it.
     """
+    check_inertia(mechanism.model)
     units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
     names = row_names(mechanism)
     if not names:

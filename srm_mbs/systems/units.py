@@ -18,9 +18,11 @@ from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.loops import world_jacobian
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
+from srm_mbs.workspaces import workspace
 
 ROUNDING = 1e-12
-"""Accelerations below this part of the largest are rounding of zero."""
+"""Accelerations below this part of the largest are rounding of zero; and so is a scene diagonal
+below this part of the distance from the origin, or of the largest radius of gyration."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,8 @@ class Units:
     Attributes
     ----------
     length
-        Scene diagonal (m): bounding box of joints, centres of mass and anchors at q0.
+        Scene diagonal (m): bounding box of joints, centres of mass and anchors at q0; 1 where they
+        are all at one point.
     coordinate : (nv,)
         1 rad for angles, ``length`` for translations.
     rate
@@ -67,18 +70,48 @@ def _row_angles(mechanism: Mechanism) -> BoolArray:
 
 def joint_turns(model: pin.Model, name: str) -> bool:
     """Whether the coordinate of a joint with one degree of freedom is an angle."""
-    data = model.createData()
+    return bool(turning_coordinates(model)[model.joints[model.getJointId(name)].idx_v])
+
+
+def turning_coordinates(model: pin.Model) -> BoolArray:
+    """Which velocity components (nv,) are in rad/s; the others are in m/s."""
+    data = workspace(model)
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    return bool(_turning(data)[model.joints[model.getJointId(name)].idx_v])
+    return _turning(data)
+
+
+def counted_turns(model: pin.Model) -> BoolArray:
+    """Which velocity components (nv,) belong to angles that count turns in q, while a whole turn
+    leads back to the same place: those of hinges and universal joints, not those of screws."""
+    out: BoolArray = np.zeros(model.nv, dtype=bool)
+    joints = [(i, joint) for i, joint in enumerate(model.joints) if i and joint.nq == joint.nv]
+    turning = turning_coordinates(model)
+    data = workspace(model)
+    start = pin.neutral(model)
+    pin.forwardKinematics(model, data, start)
+    before = {i: data.liMi[i].copy() for i, _ in joints}
+    for k in range(max((joint.nv for _, joint in joints), default=0)):  # one of each at a time
+        q = start.copy()
+        moved = [(i, joint.idx_v + k) for i, joint in joints if k < joint.nv]
+        q[[model.joints[i].idx_q + k for i, _ in moved]] += 2.0 * np.pi
+        pin.forwardKinematics(model, data, q)
+        for i, component in moved:
+            out[component] = turning[component] and data.liMi[i].isApprox(before[i], 1e-9)
+    return out
+
+
+def constraint_angles(mechanism: Mechanism) -> BoolArray:
+    """Which rows (rows,) are in rad, those of the drives after those of the loops."""
+    driven = [
+        drive.joint is not None and joint_turns(mechanism.model, drive.joint)
+        for drive in in_order_of_rows(mechanism.drives)
+    ]
+    return np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
 
 
 def row_dimensions(mechanism: Mechanism) -> tuple[str, ...]:
     """Units that closure errors have, drives included: "m", "rad" or both, in this order."""
-    driven = [
-        drive.joint is not None and joint_turns(mechanism.model, drive.joint)
-        for drive in mechanism.drives
-    ]
-    angles = np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
+    angles = constraint_angles(mechanism)
     return tuple(unit for unit, own in (("m", ~angles), ("rad", angles)) if own.any())
 
 
@@ -122,7 +155,7 @@ def constraint_units(mechanism: Mechanism, units: Units) -> FloatArray:
 def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
     """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
     model = mechanism.model
-    data = model.createData()
+    data = workspace(model)
     pin.computeJointJacobians(model, data, q)
     points = []
     for joint in range(1, model.njoints):
@@ -133,7 +166,8 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
         points.append(data.oMi[joint].act(point))
     corners = np.array(points) if points else np.zeros((1, 3))
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
-    length = diagonal if diagonal > 0.0 else 1.0
+    known_to = ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
+    length = diagonal if diagonal > known_to else 1.0
     coordinate = np.where(_turning(data), 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
     if rate == 0.0:
@@ -144,6 +178,19 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
         rates = rates[rates > 0.0]
         rate = float(np.median(rates)) if rates.size else 1.0
     return Units(length, coordinate, rate)
+
+
+def _gyration(model: pin.Model) -> float:
+    """The largest radius of gyration (m) of a body about its centre of mass."""
+    return max(
+        (
+            # Rounding of what was lumped or shifted may leave a point mass with a negative trace.
+            float(np.sqrt(max(np.trace(body.inertia), 0.0) / body.mass))
+            for body in model.inertias.tolist()
+            if body.mass > 0.0
+        ),
+        default=0.0,
+    )
 
 
 def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
@@ -163,7 +210,7 @@ def _acceleration_by_forces(mechanism: Mechanism, q: FloatArray) -> FloatArray:
     """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
     model = mechanism.model
     forces = resolved_forces(mechanism)
-    data = model.createData()
+    data = workspace(model)
     rest = np.zeros(model.nv)
     if forces is None:
         return rest

@@ -9,7 +9,7 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.dae_solution import DaeSolution
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
-from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method
+from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method, SweepNode
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.options import (
     checked_method,
@@ -22,15 +22,17 @@ from srm_mbs.options import (
     step_size_control,
 )
 from srm_mbs.progress import progress_of
-from srm_mbs.records import Statistics
+from srm_mbs.records import Settings, Statistics, attempt_array
+from srm_mbs.run_log import log_end, log_start
 from srm_mbs.semi_explicit import SemiExplicitDAE
 from srm_mbs.stepping.dense import step_data
 from srm_mbs.stepping.events import EventWatch, prepare_events
-from srm_mbs.stepping.loop import RunRecord, Tick, integrate
+from srm_mbs.stepping.loop import DAE, RunRecord, Tick, integrate
 from srm_mbs.stepping.rate_guard import RateGuard
 from srm_mbs.stepping.remarks import drift, restarts, turns
 from srm_mbs.stepping.singular_times import Placing, placed, suspected
 from srm_mbs.stepping.stepsize import Verdict, initial_step
+from srm_mbs.stepping.sweep_stability import instability
 from srm_mbs.systems.dae import DaeSystem
 
 CONSISTENT = 1e-8
@@ -40,6 +42,11 @@ MENDED = (
     "or PSRM in its split form."
 )
 """What to do about a passage that may have changed the branch."""
+CARRIED = (
+    'Use T = "inverse", which carries B y (SRM: with restart=True, carry=True), or PSRM in its '
+    "split form."
+)
+"""The same for sweeps that carry y, for which no shorter step does."""
 UNSTABLE = (
     " Sweeps with T = I or (GB)^T are stable only while h |G B T|/eps is about 1 or less: try "
     'T = "inverse", or a larger eps.'
@@ -133,8 +140,9 @@ def solve_dae(
         (``tests/test_dae.py``); without it they turn off.  Sweeps with own histories, whose first
         one is off the constraints by O(eps), would leave on another branch of g = 0; next to the
         singularity they are restarted, and the message says when.  Sweeps that carry y, which is
-        not bounded there, do leave on another branch, however small the step.  The message says so:
-        x' is compared across every passage.
+        not bounded there, would leave on another branch, however small the step: x' is compared
+        across every passage, and a run with sweeps that took another branch fails there, with a
+        message that names the remedy.
     tableau
         Runge-Kutta scheme for a method given by name.
     rtol
@@ -198,11 +206,13 @@ def solve_dae(
     system = DaeSystem(problem, t0, state, t_end, getattr(method, "T", "identity"))
     _check_start(system, method, t0, state)
 
+    log_start("DAE", t0, t_end, method, norm, step, "python")
     watch: EventWatch | None = None
     if events is not None:
         prepared = prepare_events(events, lambda event: event)
         watch = EventWatch(system, method.scheme, prepared, state.size)
     wrappers: tuple[Placing, ...] = ()
+    begun: tuple[SweepNode, ...] = ()
     with_sweeps = False
     carried: list[FloatArray] = []
     try:
@@ -213,9 +223,10 @@ def solve_dae(
                 element="x0",
                 remedy="Start beside that point",
             )
-        with_sweeps = bool(memory.sweeps)
+        begun = memory.sweeps
+        with_sweeps = bool(begun)
         if with_sweeps:
-            carried.append(memory.sweeps[-1].multiplier)
+            carried.append(begun[-1].multiplier)
 
         def chosen_first_step() -> float:
             if first_step is not None:
@@ -226,7 +237,8 @@ def solve_dae(
         control = step_size_control(method.scheme, t0, t_end, step, chosen_first_step)
         control, wrappers = placed(control, method.scheme, placement, avoided, t_end, step)
         if placement == "automatic":
-            guard = RateGuard(control, system)
+            unbounded = with_sweeps and not system.carries_yhat
+            guard = RateGuard(control, system, stops=with_sweeps, unbounded=unbounded)
             control, wrappers = guard, (*wrappers, guard)
         with progress_of(progress, system, t_end) as tick:
             record = integrate(
@@ -241,12 +253,28 @@ def solve_dae(
                 max_step=np.inf if max_step is None else max_step,
                 tick=tick,
                 events=watch,
+                words=DAE,
             )
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = {t0:.6g}: {error}."
     carried += [result.sweeps[-1].multiplier for result in record.steps if result.sweeps]
+    turned = suspected(wrappers)
+    unstable = ""
     if record.status == "failed" and with_sweeps and not system.carries_yhat:
+        eps = getattr(method, "regularisation", None)
+        unstable = instability(system, method.scheme, record, begun, eps)
+    if unstable:
+        if turned:  # that they turned follows from it
+            end = record.times[-1] if record.times else t0
+            record.message = f"Stopped at t = {end:.6g}: x' turned. Everything up to there is kept."
+        record.message += unstable
+    elif with_sweeps and turned:
+        if record.status != "failed":  # within the passage
+            record.status = "failed"
+            record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
+        record.message += " " + (MENDED if system.carries_yhat else CARRIED)
+    elif record.status == "failed" and with_sweeps and not system.carries_yhat:
         record.message += UNSTABLE
     data = step_data(
         t0, state, record.times, record.steps, method.scheme, system.tangent_size, record.stop
@@ -267,14 +295,26 @@ def solve_dae(
         data,
         carried,
         t_eval=times,
+        attempts=attempt_array(record.attempts),
+        settings=Settings(
+            type(method).__name__,
+            method.scheme.name,
+            rtol,
+            tuple(norm.atol.tolist()),
+            step,
+            False,
+            placement,
+            tuple(avoided.tolist()),
+        ),
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message
-        + turns(suspected(wrappers), "x' turned", MENDED)
+        + ("" if with_sweeps else turns(turned, "x' turned", MENDED))
         + restarts(record.steps)
         + drift(record.steps, norm),
         stats=stats,
     )
+    log_end("DAE", solution)
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)
     return solution

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import Method
-from srm_mbs.records import Statistics
+from srm_mbs.records import Settings, Statistics
 from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.stepping.reading_times import times_to_read
+from srm_mbs.stepping.stepped import Stepped
 from srm_mbs.systems.dae import DaeSystem
 from srm_mbs.systems.interpolation import lagrange_weights
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MULTIPLIER_POINTS = 5
 """Ends of steps through which the multiplier of sweeps is interpolated."""
 
 
-class DaeSolution:
+class DaeSolution(Stepped):
     """Result of :func:`srm_mbs.solve_dae`.
 
     Attributes
@@ -36,7 +43,11 @@ class DaeSolution:
         For each event in turn the times (k,) and states (k, nx) of its occurrences; None if no
         events were given.
     stats
-        :class:`~srm_mbs.solution.Statistics`.
+        :class:`~srm_mbs.records.Statistics`.
+    settings
+        :class:`~srm_mbs.records.Settings`.
+    attempts : (k,)
+        The steps that did not stand, a structured array of :data:`~srm_mbs.records.ATTEMPT`.
     steps
         :class:`~srm_mbs.stepping.dense.StepData`: what the stepping recorded, sigma included.
     """
@@ -49,12 +60,17 @@ class DaeSolution:
         carried: Sequence[FloatArray],
         *,
         t_eval: FloatArray | None,
+        attempts: NDArray[np.void],
+        settings: Settings,
         events: tuple[list[FloatArray], list[FloatArray]] | None,
         status: str,
         message: str,
         stats: Statistics,
     ) -> None:
         self.steps = steps
+        self.scheme = method.scheme
+        self.attempts = attempts
+        self.settings = settings
         self.status = status
         self.message = message
         self.success = status in ("finished", "event")
@@ -91,12 +107,10 @@ class DaeSolution:
 
         Raises
         ------
-        ValueError
+        InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = np.asarray(t, dtype=float)
-        if times.ndim > 1:
-            raise ValueError(f"t has shape {times.shape}; give a scalar or a vector of times")
+        times = times_to_read(t, scalar=True)
         x, y = self._at(np.atleast_1d(times))
         return (x[0], y[0]) if times.ndim == 0 else (x, y)
 
@@ -117,6 +131,41 @@ class DaeSolution:
             weights = lagrange_weights(nodes[near][:width], t)
             out[k] = weights @ known[near][:width]
         return out
+
+    @cached_property
+    def drift(self) -> FloatArray:
+        """||g|| (n,) at ``t``.
+
+        Raises
+        ------
+        CallbackError, EvaluationError
+            If the problem's g fails.
+        """
+        g = [self._system.call("g", t, x) for t, x in zip(self.t.tolist(), self.x)]
+        out: FloatArray = np.linalg.norm(np.array(g).reshape(len(g), self._system.ny), axis=1)
+        return out
+
+    def plot(self, path: str | Path | None = None, kind: str = "run") -> Figure:
+        """A picture of the run.
+
+        Parameters
+        ----------
+        path
+            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
+            omitted.
+        kind
+            ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind or suffix.
+        OSError
+            If the file cannot be written.
+        """
+        from srm_mbs.plotting import plot_dae
+
+        return plot_dae(self, None if path is None else Path(path), kind)
 
     def to_csv(self, path: str | Path) -> None:
         """Write t, x and y as a table of comma-separated values, one row per time ``t``.

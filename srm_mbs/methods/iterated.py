@@ -384,6 +384,6 @@ class IteratedSweeps:
             f"; h/eps = {h / eps:.3g} is beyond {limit:.3g}, up to which {self.scheme.name} is "
             "stable: use a larger eps or a smaller step"
             if h / eps > limit
-            else f" with h/eps = {h / eps:.3g}; use fewer sweeps or a smaller step"
+            else f" with h/eps = {h / eps:.3g}; use a larger eps, fewer sweeps or a smaller step"
         )
         raise EvaluationError(f"the sweeps leave the constraints{reason}")

@@ -17,7 +17,7 @@ from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.methods.iterated import First, IteratedSweeps
 from srm_mbs.methods.regularisation import Regularisation, parse_eps
 from srm_mbs.methods.split import split_accept, split_resume, split_start, split_step
-from srm_mbs.methods.sweeps import INTERPOLATIONS, checked_regulariser, checked_tableau, interpolant
+from srm_mbs.methods.sweeps import INTERPOLATIONS, checked_regulariser, interpolant
 from srm_mbs.methods.tableaus import get_tableau
 from srm_mbs.systems.base import System
 
@@ -83,10 +83,11 @@ class PSRM:
     interpolation: str = "stages"
 
     def __post_init__(self) -> None:
-        checked_tableau(self.tableau)
-        if self.correction is None and self.prediction in _FORMS:
-            object.__setattr__(self, "correction", _FORMS[self.prediction][0])
-        if self.correction not in _FORMS.get(self.prediction, ()):
+        get_tableau(self.tableau)
+        forms = _FORMS.get(self.prediction, ()) if isinstance(self.prediction, str) else ()
+        if self.correction is None and forms:
+            object.__setattr__(self, "correction", forms[0])
+        if self.correction not in forms:
             raise InputError(
                 f"there is no PSRM with prediction={self.prediction!r}, "
                 f"correction={self.correction!r}",

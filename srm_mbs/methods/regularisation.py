@@ -66,17 +66,22 @@ def parse_eps(value: Any) -> Regularisation:
     return Regularisation(factor, power)
 
 
+def stability_function(scheme: ButcherTableau, z: complex) -> complex:
+    """R(z): the factor of a step h of z' = lambda z, for h lambda = ``z``."""
+    s = scheme.n_stages
+    stages = np.linalg.solve(np.eye(s) - z * scheme.A, np.ones(s))
+    return complex(1.0 + z * (scheme.b @ stages))
+
+
 @lru_cache(maxsize=64)
 def real_stability_limit(scheme: ButcherTableau) -> float:
     """Largest x such that the scheme damps z' = -z/eps for all h/eps in [0, x].
 
     2 for fe, trap and heun, 2.51 tvd32, 2.79 erk4, 3.31 dopr54, 6.39 dop853.
     """
-    s = scheme.n_stages
 
     def growth(x: float) -> float:
-        stages = np.linalg.solve(np.eye(s) + x * scheme.A, np.ones(s))
-        return abs(1.0 - x * float(scheme.b @ stages))
+        return abs(stability_function(scheme, -x))
 
     grid = np.linspace(0.0, _FARTHEST, 2001)[1:]
     low, high = 0.0, _FARTHEST

@@ -12,13 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.iterated import First, IteratedSweeps
-from srm_mbs.methods.regularisation import parse_eps
-from srm_mbs.methods.sweeps import checked_regulariser, checked_tableau, interpolant
+from srm_mbs.methods.regularisation import Regularisation, parse_eps
+from srm_mbs.methods.sweeps import checked_regulariser, interpolant
 from srm_mbs.methods.tableaus import get_tableau
 from srm_mbs.systems.base import System
 
@@ -63,7 +65,8 @@ class SRM:
     carry
         With ``restart``: yhat_0 of a step is the last sweep's multiplier at its start instead of
         0, which would put an initial layer into every step.  Needs m <= 3: more sweeps amplify
-        what is carried.
+        what is carried.  It is stable up to smaller h/eps than the scheme: 2.0, 1.4, 1.2 with 1, 2,
+        3 sweeps of tvd32, 3.2, 2.5, 2.2 of dopr54, 2.7 of erk4 (measured).
     T
         For DAEs: ``"identity"``, ``"transpose"`` (GB)^T or ``"inverse"`` (GB)^-1.
     interpolation
@@ -85,10 +88,13 @@ class SRM:
     interpolation: str = "auto"
 
     def __post_init__(self) -> None:
-        scheme = checked_tableau(self.tableau)
+        scheme = get_tableau(self.tableau)
         m = self.iterations
         if m is None:
             m = min(scheme.order, LARGEST_CARRIED) if self.carry else scheme.order
+            object.__setattr__(self, "iterations", m)
+        if isinstance(m, np.integer):
+            m = int(m)
             object.__setattr__(self, "iterations", m)
         if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise InputError(
@@ -99,7 +105,9 @@ class SRM:
         for name in ("restart", "carry"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(
-                    f"{name} = {getattr(self, name)!r} is neither True nor False", element=name
+                    f"{name} = {getattr(self, name)!r} is neither True nor False",
+                    element=name,
+                    remedy="Give True or False",
                 )
         if self.carry and not self.restart:
             raise InputError(
@@ -122,13 +130,18 @@ class SRM:
         return get_tableau(self.tableau)
 
     @cached_property
+    def regularisation(self) -> Regularisation:
+        """eps as a function of the step."""
+        return parse_eps(self.eps)
+
+    @cached_property
     def _sweeps(self) -> IteratedSweeps:
         return IteratedSweeps(
             self.scheme,
             First.HELD if self.carry else First.ZERO,
             self.iterations or 1,
             not self.restart,
-            parse_eps(self.eps),
+            self.regularisation,
             interpolant(self.scheme, self.interpolation),
         )
 

@@ -17,7 +17,6 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.methods.branch import BranchStages
 from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
-from srm_mbs.methods.tableaus import get_tableau
 from srm_mbs.systems.base import System, Terms, Zone
 
 Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
@@ -33,20 +32,6 @@ REGULARISERS = ("identity", "transpose", "inverse")
 """The matrices T of (2.2): I, (GB)^T, (GB)^-1."""
 
 
-def checked_tableau(tableau: str | ButcherTableau) -> ButcherTableau:
-    """The tableau of that name.
-
-    Raises
-    ------
-    InputError
-        For an unknown name.
-    """
-    try:
-        return get_tableau(tableau)
-    except ValueError as error:
-        raise InputError(str(error), element="tableau") from error
-
-
 def checked_regulariser(T: str) -> None:
     """Refuse a matrix T that sweeps do not have.
 
@@ -59,7 +44,7 @@ def checked_regulariser(T: str) -> None:
         raise InputError(
             f"there is no T = {T!r}",
             element="T",
-            remedy=f"Use one of {', '.join(map(repr, REGULARISERS))}",
+            remedy=f"Known: {', '.join(map(repr, REGULARISERS))}",
         )
 
 
@@ -109,7 +94,7 @@ def interpolant(
         raise InputError(
             f"there is no interpolation {interpolation!r}",
             element="interpolation",
-            remedy=f"Use one of {', '.join(map(repr, known))}",
+            remedy=f"Known: {', '.join(map(repr, known))}",
         )
     if interpolation != "auto":
         return interpolation

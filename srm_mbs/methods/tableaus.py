@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
+from srm_mbs.errors import InputError
 from srm_mbs.methods import dop853_data
 from srm_mbs.methods.butcher import (
     ButcherTableau,
@@ -31,14 +32,18 @@ def get_tableau(name: str | ButcherTableau) -> ButcherTableau:
 
     Raises
     ------
-    ValueError
+    InputError
         For an unknown name; lists the known ones.
     """
     if isinstance(name, ButcherTableau):
         return name
     tableau = TABLEAUS.get(name) if isinstance(name, str) else None
     if tableau is None:
-        raise ValueError(f"unknown tableau {name!r}; known are {', '.join(TABLEAUS)}")
+        raise InputError(
+            f"there is no tableau {name!r}",
+            element="tableau",
+            remedy=f"Known: {', '.join(TABLEAUS)}",
+        )
     return tableau
 
 

@@ -23,6 +23,7 @@ from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism_checks import (
     check_names,
     check_tree,
+    checked_elements,
     checked_friction_speed,
     checked_start,
     without,
@@ -92,7 +93,7 @@ class Mechanism(Derivations):
         model = self.model
         set_ = object.__setattr__
         check_tree(model)
-        set_(self, "loops", tuple(self.loops))
+        set_(self, "loops", checked_elements("loop", self.loops, "LoopClosure"))
         set_(self, "name", self.name or model.name)
         self._take_start(
             pin.neutral(model) if self.q0 is None else self.q0,
@@ -102,11 +103,11 @@ class Mechanism(Derivations):
         for loop in self.loops:
             loop.check(model)
         set_(self, "loops", tuple(loop.measured(model, self.q0) for loop in self.loops))
-        set_(self, "forces", tuple(self.forces))
+        set_(self, "forces", checked_elements("force", self.forces, "SpringDamper"))
         check_names("force", [force.name for force in self.forces])
         for force in self.forces:
             force.check(model)
-        set_(self, "drives", tuple(self.drives))
+        set_(self, "drives", checked_elements("drive", self.drives, "Drive"))
         check_names("drive", [drive.name for drive in self.drives])
         for drive in self.drives:
             drive.check(model)
@@ -194,8 +195,9 @@ class Mechanism(Derivations):
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a pickle holds: the fields, and the analysis, which other processes then share."""
-        names = [*(entry.name for entry in fields(self)), "structure"]
+        """What a pickle holds: the fields, the analysis, which other processes then share, and the
+        motion of drives that did not begin with this state."""
+        names = [*(entry.name for entry in fields(self)), "structure", "drive_curves"]
         return {name: self.__dict__[name] for name in names if name in self.__dict__}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -14,12 +14,13 @@ from srm_mbs.errors import InputError
 
 
 def check_tree(model: pin.Model) -> None:
-    """Refuse a tree that cannot move, or whose joints are not in depth-first order.
+    """Refuse a tree that cannot move, or whose joints are not in depth-first order, or where
+    gravity or damping is not finite.
 
     Raises
     ------
     InputError
-        Naming the joint that is out of order.
+        Naming what is wrong, or the joint that is out of order.
     """
     if model.nv == 0:
         raise InputError(
@@ -27,6 +28,13 @@ def check_tree(model: pin.Model) -> None:
             element="model",
             remedy="Give it at least one joint that is neither fixed nor locked",
         )
+    for what, numbers in (("gravity", model.gravity.vector), ("damping", model.damping)):
+        if not np.isfinite(numbers).all():
+            raise InputError(
+                f"the {what} of the model is not finite: {numbers}",
+                element=f"model.{what}",
+                remedy="Give finite numbers",
+            )
     _check_order(model)
 
 
@@ -41,6 +49,29 @@ def _check_order(model: pin.Model) -> None:
                 remedy="Add the joints depth first, every branch to its tip; Pinocchio's mass "
                 "matrix is wrong otherwise",
             )
+
+
+Element = TypeVar("Element")
+
+
+def checked_elements(what: str, given: Iterable[Element], example: str) -> tuple[Element, ...]:
+    """The elements of the kind ``what`` as a tuple.
+
+    Raises
+    ------
+    InputError
+        If they are not several, or one has no name and cannot check itself.
+    """
+    several = isinstance(given, Iterable) and not isinstance(given, str)
+    elements: tuple[Any, ...] = tuple(given) if several else (given,)
+    for element in elements:
+        if not (several and hasattr(element, "name") and hasattr(element, "check")):
+            raise InputError(
+                f"{what}s = {given!r} is not a list of {what}s",
+                element=f"{what}s",
+                remedy=f"Give a list of them, such as [srm.{example}(...)]",
+            )
+    return elements
 
 
 def check_names(what: str, names: Sequence[str]) -> None:
@@ -79,10 +110,13 @@ def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, Float
 
 
 def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
-    array = np.array(values, dtype=float)
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(
-            f"{what} has shape {array.shape} or is not finite",
+            f"{what} has shape {array.shape} or does not consist of finite numbers",
             element=what,
             remedy=f"Give {shape[0]} finite numbers",
         )

@@ -15,11 +15,12 @@ import pinocchio as pin
 from srm_mbs.assembly import assemble
 from srm_mbs.coordinates import set_position, set_rate
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.inertias import check_inertia, undetermined_joint
 from srm_mbs.joint_limits import limit_springs
 from srm_mbs.loading.description import Description
 from srm_mbs.loading.entries import LimitSpringEntry, TorqueEntry, TorsionSpringEntry
 from srm_mbs.loading.parsing import parse_description
-from srm_mbs.loading.urdf import build_urdf, check_inertia, lock_joints, undetermined_joint
+from srm_mbs.loading.urdf import build_urdf, lock_joints
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.provenance import SimulationDefaults, Source
 from srm_mbs.systems.forces import friction_time
@@ -71,7 +72,7 @@ def _check_joint_names(description: Description, model: pin.Model, file: str) ->
     for i, name in enumerate(description.lock):
         if name in description.lock[:i]:
             raise InputError(
-                f"joint {name!r} stands there twice", file=file, element="lock", remedy="Keep one"
+                f"joint {name!r} is named twice", file=file, element="lock", remedy="Keep one"
             )
     for name in description.initial.q:
         if name in description.initial.guess:
@@ -232,8 +233,8 @@ def _in_gimbal_lock(source: Source, why: str) -> InputError:
         f"where the loops are closed the accelerations are not determined: {why}",
         file=source.path,
         element="initial",
-        remedy="Axes of massless links may be in line there (gimbal lock): give another guess, or "
-        "these links inertia",
+        remedy="Give another guess, or inertia to massless links whose axes may be in line there "
+        "(gimbal lock)",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tomllib
 import xml.etree.ElementTree as ET
@@ -12,10 +13,12 @@ from urllib.parse import urlsplit
 
 import tomli_w
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import CHECK_WRITING, InputError
 from srm_mbs.loading.assembling import unassembled
 from srm_mbs.loading.reading import Overrides, read
 from srm_mbs.loading.safe_xml import parse_urdf
+
+log = logging.getLogger(__name__)
 
 
 def convert(
@@ -74,8 +77,11 @@ def convert(
         description.write_text(tomli_w.dumps(entries), encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(error.filename or out)
+            f"it cannot be written: {error.strerror}",
+            file=str(error.filename or out),
+            remedy=CHECK_WRITING,
         ) from error
+    log.info("written: %s and %s", description, urdf)
     return description, urdf, mechanism.notes
 
 

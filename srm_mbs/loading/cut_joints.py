@@ -46,7 +46,7 @@ def closure(
     axis: Sequence[float] | None = None,
     child_axis: Sequence[float] | None = None,
     *,
-    fault: Callable[[str, str | None], Exception],
+    fault: Callable[[str, str], Exception],
 ) -> dict[str, Any]:
     """The ``[[loop]]`` of a joint of type ``kind`` between two links.
 
@@ -140,7 +140,7 @@ def bushing(
     return out
 
 
-def _unit(axis: Sequence[float], fault: Callable[[str, str | None], Exception]) -> FloatArray:
+def _unit(axis: Sequence[float], fault: Callable[[str, str], Exception]) -> FloatArray:
     direction = np.array(axis, dtype=float)
     length = float(np.linalg.norm(direction))
     if length == 0.0:

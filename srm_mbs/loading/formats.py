@@ -60,7 +60,11 @@ def _is_description(_: Path, text: str) -> bool:
 
 
 def _own_words(text: str, file: str, options: Options) -> Translation:
-    raise InputError("a description cannot stand for a model file", file=file)
+    raise InputError(
+        "a description cannot stand for a model file",
+        file=file,
+        remedy="Give the description itself to srm.load",
+    )
 
 
 DESCRIPTION = Format("TOML description", (".toml",), _is_description, _own_words)
@@ -90,9 +94,9 @@ def find_format(path: Path, text: str) -> Format:
     tag = root_tag(text)
     what = f"a file with the root element <{tag}>" if tag else f"a file of type {path.suffix!r}"
     raise InputError(
-        f"{what} is of no format that is read",
+        f"{what} is not of a format that is read",
         file=str(path),
-        remedy=f"Formats: {', '.join(known.name for known in FORMATS)}",
+        remedy=f"Known: {', '.join(known.name for known in FORMATS)}",
     )
 
 
@@ -106,7 +110,11 @@ def of_key(key: str, path: Path, text: str) -> Format:
     """
     wanted = next((known for known in FORMATS if known.key == key), None)
     if wanted is None:
-        raise InputError(f"files of this format ({key}) are not read by this version", element=key)
+        raise InputError(
+            f"files of this format ({key}) are not read by this version",
+            element=key,
+            remedy="Convert the file to one of the formats in docs/formats.md",
+        )
     tag = root_tag(text)
     if not wanted.recognises(path, text):
         other = next((known for known in FORMATS if known.recognises(path, text)), None)
@@ -120,7 +128,7 @@ def of_key(key: str, path: Path, text: str) -> Format:
             )
         if tag is not None and wanted.key != "urdf":
             raise InputError(
-                f"the root element of {path.name!r} is <{tag}>: it is no {wanted.name}",
+                f"the root element of {path.name!r} is <{tag}>: it is not a {wanted.name}",
                 element=key,
                 remedy=f"Give a {wanted.name}",
             )

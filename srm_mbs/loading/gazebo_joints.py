@@ -52,7 +52,7 @@ def _read_joint(joint: Element, elements: LoopElements) -> None:
                 where, f"unknown element <{node.tag}> in it", f"Known: {', '.join(known)}"
             )
         if node.tag in parts:
-            raise elements.fault(where, f"<{node.tag}> stands there twice", "Keep one")
+            raise elements.fault(where, f"<{node.tag}> is given twice", "Keep one")
         parts[node.tag] = node
         if node.tag in ("parent", "child", "pose"):
             elements.leaf(node, where)
@@ -135,7 +135,7 @@ def _axis(
                 where, f"unknown element <{inner.tag}> in <{tag}>", f"Known: {', '.join(known)}"
             )
         if len(node.findall(inner.tag)) > 1:
-            raise elements.fault(where, f"<{inner.tag}> stands there twice", "Keep one")
+            raise elements.fault(where, f"<{inner.tag}> is given twice", "Keep one")
         if inner.tag not in ("limit", "dynamics"):
             elements.leaf(inner, where)
     xyz = node.find("xyz")

@@ -51,7 +51,11 @@ def translate(text: str, file: str, options: Options) -> Translation:
     try:
         urdf = urdf_path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"it cannot be read: {error}", file=str(urdf_path)) from error
+        raise InputError(
+            f"it cannot be read: {error}",
+            file=str(urdf_path),
+            remedy="Put a readable URDF in UTF-8 there",
+        ) from error
     plain = urdf_loops.translate(urdf, str(urdf_path), options)
     root = parse_urdf(plain.urdf, str(urdf_path))
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
@@ -132,19 +136,19 @@ def _read(text: str, file: str) -> dict[str, list[Any]]:
             raise _fault(
                 file,
                 "closed_loop",
-                f"{reprlib.repr(pair)} is no pair of frames",
+                f"{reprlib.repr(pair)} is not a pair of frames",
                 'Write ["first", "second"]',
             )
     for key in ("type", "name_mot", "joint_name", "joint_type"):
         for entry in lists[key]:
             if not _is_name(entry):
-                raise _fault(file, key, f"{reprlib.repr(entry)} is no text", "Put it in quotes")
+                raise _fault(file, key, f"{reprlib.repr(entry)} is not text", "Put it in quotes")
     for kind in lists["type"]:
         if kind.lower() not in CLOSURES:
             raise _fault(file, "type", f"there is no type {kind!r}", "Known: 3d, 6d")
     for name in lists["joint_name"]:
         if lists["joint_name"].count(name) > 1:
-            raise _fault(file, "joint_name", f"{name!r} stands there twice", "Keep one")
+            raise _fault(file, "joint_name", f"{name!r} is given twice", "Keep one")
     return lists
 
 

@@ -34,7 +34,7 @@ def law_from(entry: Mapping[str, Any], folder: Path) -> Law:
     if kind is None:
         raise InputError(
             f"there is no law of type {entry['type']!r}",
-            remedy=f"This version knows {', '.join(LAW_TYPES)}",
+            remedy=f"Known: {', '.join(LAW_TYPES)}",
         )
     given = {key: entry[key] for key in LAW_KEYS[1:] if entry[key] is not None}
     keys = fields(kind)  # type: ignore[arg-type]
@@ -43,7 +43,7 @@ def law_from(entry: Mapping[str, Any], folder: Path) -> Law:
         if key not in accepted:
             raise InputError(
                 f"a law of type {kind.type!r} takes no {key}",
-                remedy=f"It takes {', '.join(accepted)}",
+                remedy=f"Known: {', '.join(accepted)}",
             )
     if kind is Table and "table" in given:
         if "t" in given or "values" in given:

@@ -96,7 +96,7 @@ class LoopElements(ElementChecker):
                     where, f"unknown element <{tag}> in it", f"Known: {', '.join(needed)}"
                 )
             if tag in found:
-                raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
+                raise self.fault(where, f"<{tag}> is given twice", "Keep one")
             self.only(child, where, needed[tag])
             if tag not in inner:
                 self.leaf(child, where)
@@ -134,7 +134,7 @@ class LoopElements(ElementChecker):
             raise self.fault(
                 where,
                 f"the link {name!r} does not exist",
-                f"Links: {', '.join(self.graph.links)}",
+                f"Known: {', '.join(self.graph.links)}",
             )
         return name
 
@@ -155,7 +155,7 @@ class LoopElements(ElementChecker):
             raise self.fault(where, "it has no type", 'Give type="..."')
         return kind
 
-    def fault_at(self, where: str) -> Callable[[str, str | None], InputError]:
+    def fault_at(self, where: str) -> Callable[[str, str], InputError]:
         """Faults of one element."""
         return lambda problem, remedy: self.fault(where, problem, remedy)
 

@@ -11,6 +11,10 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.loading.graph_translation import GraphTranslator
 from srm_mbs.loading.mjcf_bodies import BodyReader
@@ -42,7 +46,9 @@ def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -
             text = (folder / name).read_text(encoding="utf-8-sig")
         except (OSError, ValueError) as error:
             raise values.fault(
-                where, f"it cannot be read: {error}", "The path is relative to the model"
+                where,
+                f"it cannot be read: {error}",
+                "Check the path, which is relative to the model",
             ) from error
         root = parse_urdf(text, str(folder / name))
         values.check_depth(root)
@@ -124,7 +130,23 @@ def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
             moved = "refpos" in given or "refquat" in given
             inertia = "" if moved else given.get("inertia", "legacy")
             name = given.get("name") or path.stem
-            tree.meshes[name] = Mesh(path.as_posix(), scale, inertia)
+            axes = _mesh_axes(values, given, scale, where)
+            tree.meshes[name] = Mesh(path.as_posix(), scale, inertia, axes)
+
+
+def _mesh_axes(values: MjcfValues, given: dict[str, str], scale: FloatArray, where: str) -> pin.SE3:
+    """Where the axes of a mesh file lie in those of the mesh.
+
+    MuJoCo makes S R^T (x - p) of a vertex x, with the scale S, ``refpos`` p and ``refquat`` R.
+    """
+    p = values.get(given, "refpos", 3, "0 0 0", where)
+    turned = values.get(given, "refquat", 4, "1 0 0 0", where)
+    w, x, y, z = values.direction(turned, where, "refquat")
+    R = pin.Quaternion(w, x, y, z).matrix()
+    if np.ptp(scale) > 0.0 and not np.allclose(R, np.eye(3)):
+        values.remark("a mesh with refquat and an unequal scale is drawn unturned", where)
+        R = np.eye(3)
+    return pin.SE3(R.T, -scale * (R.T @ p))
 
 
 def translate(text: str, file: str, options: Options) -> Translation:

@@ -154,7 +154,7 @@ class BodyReader:
             return Body(name, None, tuple(visuals))
         inertia: pin.Inertia | None = None
         if len(inertials) > 1:
-            raise values.fault(where, "<inertial> stands there twice", "Keep one")
+            raise values.fault(where, "<inertial> is given twice", "Keep one")
         use_geoms = compiler.inertia_from_geom
         if inertials and use_geoms != "true":
             node, around = inertials[0]

@@ -169,7 +169,7 @@ class EqualityReader:
             raise self.values.fault(
                 where,
                 "the coefficients of the powers 2 to 4 in polycoef are not zero",
-                "Only linear relations of two joints are read by this version",
+                "Give a linear relation of two joints; others are not read by this version",
             )
         if names[0] == names[1]:
             raise self.values.fault(where, "joint1 and joint2 are the same", "Name two joints")

@@ -28,12 +28,13 @@ MASSLESS = ("plane", "hfield")
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh of ``<asset>``: its file as the model names it, its scale (3,), and how MuJoCo finds
-    its inertia; empty if it is moved first."""
+    """A mesh of ``<asset>``: its file as the model names it, its scale (3,), how MuJoCo finds its
+    inertia; empty if it is moved first; and where the axes of the file lie in those of the mesh."""
 
     file: str
     scale: FloatArray
     inertia: str
+    axes: pin.SE3
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +221,8 @@ def visuals_of(
                 ]
         case "mesh" if geom.given.get("mesh") in meshes:
             mesh = meshes[geom.given["mesh"]]
-            shapes = [("mesh", {"filename": mesh.file, "scale": numbers(mesh.scale)}, at)]
+            own = {"filename": mesh.file, "scale": numbers(mesh.scale)}
+            shapes = [("mesh", own, at * mesh.axes)]
         case kind:
             values.remark(f"a geom of the type {kind} is not drawn", geom.where)
     rgba = geom.given.get("rgba") or colours.get(geom.given.get("material", ""))

@@ -18,7 +18,7 @@ from srm_mbs.loading.description import Description
 from srm_mbs.loading.entries import FORCE_ENTRIES, StrictEntry
 from srm_mbs.loading.translation import MODEL_KEYS
 
-PROBLEMS = {
+PROBLEMS: dict[str, tuple[str | None, str]] = {
     "string_type": ("a text is wanted", "Put it in quotes"),
     "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
     "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
@@ -71,7 +71,7 @@ def parse_description(text: str, file: str) -> Description:
                 f"there is no closure type {entry.type!r}",
                 file=file,
                 element=f"loop[{i}].type",
-                remedy=f"This version knows {', '.join(CLOSURE_TYPES)}",
+                remedy=f"Known: {', '.join(CLOSURE_TYPES)}",
             )
         for side in "ab":
             if side in CLOSURE_TYPES[entry.type].needs and getattr(entry, side) is None:
@@ -114,24 +114,24 @@ def _known_keys(location: tuple[int | str, ...]) -> str:
     return ", ".join(table.model_fields)
 
 
-def _explain(error: ValidationError) -> tuple[str, str, str | None]:
+def _explain(error: ValidationError) -> tuple[str, str, str]:
     """Key, problem and remedy of the first thing that is wrong."""
     first = error.errors()[0]
     location = _location(first)
     key = _key_path(location)
     if first["type"] == "extra_forbidden":
         name = str(location[-1])
-        return key, f"unknown key {name!r}", f"Known here: {_known_keys(first['loc'])}"
+        return key, f"unknown key {name!r}", f"Known: {_known_keys(first['loc'])}"
     if first["type"] == "union_tag_not_found":
         return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"
     if first["type"] == "union_tag_invalid":
         tag = first["input"]["type"]
-        known = f"This version knows {', '.join(FORCE_TYPES)}"
+        known = f"Known: {', '.join(FORCE_TYPES)}"
         return f"{key}.type", f"there is no force type {_shown(tag)}", known
     if first["type"] == "missing":
         return key, "this key is missing", "Add it"
     message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
-    problem, remedy = PROBLEMS.get(first["type"], (None, None))
+    problem, remedy = PROBLEMS.get(first["type"], (None, "Correct the value"))
     if location[0] == "initial" and first["type"] == "number":
         remedy = "Give a finite number, or a list of them for a joint with several coordinates"
     return key, f"{problem or message}, not {_shown(first.get('input'))}", remedy

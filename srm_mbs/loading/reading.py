@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from srm_mbs.loading.translation import Options, merged
 from srm_mbs.loading.urdf import ROOT_JOINTS
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.provenance import Source
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,9 @@ def read_text(path: Path) -> str:
             remedy="Give the path of a readable file",
         ) from error
     except ValueError as error:  # a null character
-        raise InputError(f"it is no file name: {error}", file=repr(path)) from error
+        raise InputError(
+            f"it is not a file name: {error}", file=repr(path), remedy="Correct the path"
+        ) from error
 
 
 def _gravity(value: Any) -> tuple[float, float, float]:
@@ -130,6 +135,7 @@ def _reading(
         gravity=_gravity(description.gravity if gravity is None else gravity),
         format=found.name,
     )
+    log.debug("%s: read as %s", model_path, found.name)
     return Reading(description, source, translation.notes)
 
 
@@ -143,10 +149,10 @@ def _of_description(text: str, file: str, overrides: Overrides, urdf: str | None
             urdf = read_text(path)
         except InputError as error:
             raise InputError(
-                f"cannot read the {key.upper()} {name!r} ({error.problem}: {str(path)!r})",
+                f"the {key.upper()} {name!r} cannot be read ({error.problem}: {str(path)!r})",
                 file=file,
                 element=key,
-                remedy="The path is relative to the description",
+                remedy="Check the path, which is relative to the description",
             ) from error
     return _reading(text, file, of_key(key, path, urdf), urdf, path, overrides)
 
@@ -175,12 +181,12 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
     is_name = not Path(name).suffix and "/" not in name and "\\" not in name
     if is_name and name in bundled_models():
         name = str(models_folder() / f"{name}.toml")
-    elif is_name:
+    elif is_name and not (name and Path(name).exists()):  # "" would be the working folder
         size = generated_size(name)
         if size is None:
             raise InputError(
                 f"there is no bundled mechanism {name!r}",
-                remedy=f"Bundled: {', '.join(bundled_models())}; or give the path of a file",
+                remedy=f"Known: {', '.join(bundled_models())}; or give the path of a file",
             )
         return _generated(size, overrides)
     try:
@@ -226,16 +232,26 @@ def load(
         raise error.located(reading.source.path) from error.__cause__
 
 
-LARGEST_N = 300
-"""Loops of a generated N-four-bar; memory and time of the load-time analysis grow as N^3."""
+LARGEST_N, LARGEST_DENSE_N = 1000, 300
+"""Loops of a generated N-four-bar with the kernel, whose memory grows as N^2, and without it, as
+N^3."""
+
+
+def largest_n() -> int:
+    """Loops of the largest N-four-bar that is made here."""
+    from srm_mbs._kernel import core
+
+    return LARGEST_DENSE_N if core is None else LARGEST_N
 
 
 def _generated(n: int, overrides: Overrides) -> Reading:
-    if n > LARGEST_N:
+    largest = largest_n()
+    if n > largest:
         raise InputError(
-            f"an N-four-bar with N = {n} is too large for the dense load-time analysis",
+            f"an N-four-bar with N = {n} is too large for the memory of its load-time analysis",
             element="n",
-            remedy=f"Take N <= {LARGEST_N}",
+            remedy=f"Take N <= {largest}"
+            + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
         )
     text, urdf = _n_four_bar_texts(n)
     return _of_description(text, str(models_folder() / f"n_four_bar_{n}.toml"), overrides, urdf)
@@ -247,9 +263,11 @@ def n_four_bar(n: int) -> Mechanism:
     Raises
     ------
     InputError
-        If n < 1 or n > 300.
+        If n < 1 or n > 1000 (300 without the compiled kernel).
     """
     if not isinstance(n, Integral) or n < 1:
-        raise InputError(f"an N-four-bar needs n >= 1, not {n!r}", element="n")
+        raise InputError(
+            f"an N-four-bar needs n >= 1, not {n!r}", element="n", remedy="Give a positive integer"
+        )
     reading = _generated(int(n), Overrides())
     return assembled(reading.description, reading.source)

@@ -93,7 +93,7 @@ class SdfReader:
         form = child.get("rotation_format", "euler_rpy")
         if form not in ("euler_rpy", "quat_xyzw"):
             raise self.values.fault(
-                where, f"unknown rotation_format {form!r}", "Known: euler_rpy, quat_xyzw"
+                where, f"there is no rotation_format {form!r}", "Known: euler_rpy, quat_xyzw"
             )
         in_degrees = degrees is not None and self.values.truth(degrees, where, "degrees")
         placement = pose(self.values, child.text, where, in_degrees, form == "quat_xyzw")

@@ -89,7 +89,7 @@ class JointReader:
         self._gearboxes: list[Gearbox] = []
         self._mimics: list[tuple[str, str, Element]] = []
 
-    def fault(self, name: str, problem: str, remedy: str | None = None) -> InputError:
+    def fault(self, name: str, problem: str, remedy: str) -> InputError:
         return self.values.fault(f"joint {name!r}", problem, remedy)
 
     def read(self, node: Element, prefix: str, version: tuple[int, int]) -> None:
@@ -105,7 +105,7 @@ class JointReader:
         values.children(node, where, JOINT_READ, JOINT_IGNORED)
         kind = node.get("type", "")
         if kind not in TYPES:
-            raise self.fault(name, f"unknown joint type {kind!r}", f"Known: {', '.join(TYPES)}")
+            raise self.fault(name, f"there is no joint type {kind!r}", f"Known: {', '.join(TYPES)}")
         ends = [self.end(node, side, prefix, name) for side in ("parent", "child")]
         if ends[0] == ends[1]:
             raise self.fault(
@@ -316,7 +316,7 @@ class JointReader:
             gear.name,
             f"no revolute joint about its axis leads from its reference body {gear.reference!r} "
             f"to {body!r}",
-            "A gearbox is read as a coupling of two such joints: add them",
+            "Add such joints: a gearbox is read as a coupling of two of them",
         )
 
     def couplings(self) -> list[dict[str, Any]]:

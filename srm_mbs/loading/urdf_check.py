@@ -133,7 +133,7 @@ class UrdfChecker(JointChecker):
                     raise self.fault(
                         f"joint {name!r}",
                         f"its {side} link {link!r} does not exist",
-                        f"Links: {', '.join(links)}",
+                        f"Known: {', '.join(links)}",
                     )
                 ends[side] = link
             child = ends["child"]
@@ -152,7 +152,7 @@ class UrdfChecker(JointChecker):
                 else f"{len(roots)} links have no parent joint: {', '.join(roots)}"
             )
             raise self.fault(
-                "<robot>", problem, "A URDF needs exactly one root link; close loops by [[loop]]"
+                "<robot>", problem, "Keep exactly one root link; close loops by [[loop]]"
             )
         children: dict[str, list[str]] = {}
         for child, parent in parent_link.items():

@@ -26,7 +26,7 @@ class ElementChecker:
         self.notes: list[str] = []
         self.ignored: dict[str, int] = {}
 
-    def fault(self, element: str, problem: str, remedy: str | None = None) -> InputError:
+    def fault(self, element: str, problem: str, remedy: str) -> InputError:
         return InputError(problem, file=self.file, element=element, remedy=remedy)
 
     def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
@@ -111,7 +111,7 @@ class ElementChecker:
                 )
         for tag in set(read) - {"link", "joint"}:
             if len(node.findall(tag)) > 1:
-                raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
+                raise self.fault(where, f"<{tag}> is given twice", "Keep one")
 
     def no_loop_inside(self, node: Element, where: str) -> None:
         """Refuse loops and couplings inside an element that is ignored as a whole."""

@@ -78,7 +78,7 @@ class Graph:
             if kind not in ONE_DEGREE:
                 raise InputError(
                     f"the joint {name!r} of type {kind!r} lies between them",
-                    remedy="A coupling takes joints with one degree of freedom",
+                    remedy="Couple joints with one degree of freedom",
                 )
             found.append(name)
         if not found:

@@ -38,7 +38,7 @@ class JointChecker(ElementChecker):
         kind = joint.get("type")
         if kind not in JOINT_TYPES:
             raise self.fault(
-                where, f"unknown joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
+                where, f"there is no joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
             )
         self.origin(joint, where)
         self.axis(joint, kind, where)
@@ -124,6 +124,14 @@ class JointChecker(ElementChecker):
                 raise self.fault(
                     where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
                 )
+        lower, upper = (
+            self.numbers(limit, key, 1, where)[0] if key in limit.attrib else 0.0
+            for key in ("lower", "upper")
+        )
+        if lower > upper:
+            self.notes.append(
+                f"{where}: its limits are none: lower = {lower:g} is above upper = {upper:g}"
+            )
 
     def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
         dynamics = joint.find("dynamics")

@@ -170,7 +170,7 @@ def _mimics(elements: LoopElements, options: Options, notes: list[str]) -> bool:
         elements.only(mimic, where, ("joint", "multiplier", "offset"))
         elements.leaf(mimic, where)
         if len(joint.findall("mimic")) > 1:
-            raise elements.fault(where, "it stands there twice", "Keep one")
+            raise elements.fault(where, "it is given twice", "Keep one")
         joint.remove(mimic)
         found = True
         if joint.get("type") == "fixed" or name in locked:
@@ -197,7 +197,7 @@ def _mimic_problem(
 ) -> tuple[str, str] | None:
     """Problem and remedy of a <mimic> that cannot be a coupling."""
     if leader not in joints:
-        return f"there is no joint {leader!r}", f"Joints: {', '.join(joints)}"
+        return f"there is no joint {leader!r}", f"Known: {', '.join(joints)}"
     if leader == name:
         return "the joint mimics itself", "Name another joint"
     for joint in (name, leader):

@@ -47,7 +47,7 @@ class XmlValues:
         self._ignored: dict[str, int] = {}
         self._remarks: dict[str, list[str]] = {}
 
-    def fault(self, where: str, problem: str, remedy: str | None = None) -> InputError:
+    def fault(self, where: str, problem: str, remedy: str) -> InputError:
         """The error to raise about the element ``where``."""
         return InputError(problem, file=self.file, element=where, remedy=remedy)
 
@@ -118,7 +118,7 @@ class XmlValues:
             if depth > DEEPEST:
                 raise self.fault(
                     f"<{level[0].tag}>",
-                    f"more than {DEEPEST} elements are in each other",
+                    f"more than {DEEPEST} elements are nested",
                     "Write such a long chain as a URDF, which is flat",
                 )
             level = [child for node in level for child in node]
@@ -150,7 +150,7 @@ class XmlValues:
                 continue
             if tag in read:
                 if tag in seen and tag not in many:
-                    raise self.fault(where, f"<{tag}> stands there twice", "Keep one")
+                    raise self.fault(where, f"<{tag}> is given twice", "Keep one")
                 seen.add(tag)
             elif tag in ignored:
                 self.ignore(f"<{tag}> element")
@@ -160,7 +160,7 @@ class XmlValues:
                 raise self.fault(
                     where or f"<{tag}>",
                     f"unknown element <{tag}> in <{node.tag}>",
-                    f"Known here: {', '.join((*read, *ignored))}",
+                    f"Known: {', '.join((*read, *ignored))}",
                 )
 
     def _other_tool(self, tag: str, where: str) -> None:

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from tools.models.description import header
-from tools.models.urdf_text import Mass, Shape, Urdf, Vector, bar, tube, vector
+from tools.models.urdf_text import Mass, Shape, Urdf, Vector, bar, box, tube, vector
 
 AXIS = vector(0.0, -1.0, 0.0)
 DENSITY = 1.0  # kg/m
@@ -59,11 +59,16 @@ class Linkage:
         return vector(x, 0.0, z)
 
     def ground(self, *pins: Vector) -> None:
+        """A post with a foot behind each of the pins that do not move."""
         w = self.width
-        shapes = tuple(
-            tube(vector(x, 1.5 * w, z), vector(x, 0.5 * w, z), 0.9 * w, "grey") for x, z in pins
-        )
-        self.urdf.link("world", None, shapes)
+        shapes: list[Shape] = []
+        for x, z in pins:
+            shapes += [
+                tube(vector(x, 1.5 * w, z), vector(x, 0.5 * w, z), 0.9 * w, "grey"),
+                box(vector(1.8 * w, w, 2.5 * w), vector(x, w, z - 1.25 * w), "grey"),
+                box(vector(4.0 * w, w, 0.7 * w), vector(x, w, z - 2.85 * w), "grey"),
+            ]
+        self.urdf.link("world", None, tuple(shapes))
 
     def link(self, name: str, parent: str, pins: list[Vector], material: str, layer: int) -> None:
         """A link on ``parent``, which it meets at the first of its pins; drawn in ``layer``."""
@@ -196,8 +201,8 @@ def _leg(plane: Linkage, name: str, crank_pin: Vector, mirrored: bool, layer: in
     above = meeting(crank_pin, n["j"], hip, n["b"], left=mirrored)
     below = meeting(crank_pin, n["k"], hip, n["c"], left=not mirrored)
     back = meeting(hip, n["d"], above, n["e"], left=not mirrored)
-    ankle = meeting(back, n["f"], below, n["g"], left=not mirrored)
-    foot = meeting(ankle, n["h"], below, n["i"], left=not mirrored)
+    ankle = meeting(back, n["f"], below, n["g"], left=mirrored)
+    foot = meeting(ankle, n["h"], below, n["i"], left=mirrored)
     plane.link(f"{name}_j", "crank", [crank_pin, above], "orange", layer + 1)
     plane.link(f"{name}_k", "crank", [crank_pin, below], "vermillion", layer)
     plane.link(f"{name}_hip", "world", [hip, above, back], "green", layer)

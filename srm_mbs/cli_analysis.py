@@ -35,6 +35,10 @@ def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]
     names = []
     for text in given or []:
         name, equals, numbers = text.partition("=")
+        if name in values or name in names:
+            raise InputError(
+                f"joint {name!r} is given twice", element=option, remedy="Give each joint once"
+            )
         if not equals:
             names.append(name)
             continue
@@ -42,7 +46,7 @@ def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]
             values[name] = [float(number) for number in numbers.split(",")]
         except ValueError:
             raise InputError(
-                f"{text!r} is no joint with a value", element=option, remedy="Write crank=1.5"
+                f"{text!r} is not a joint with a value", element=option, remedy="Write crank=1.5"
             ) from None
     return values, names
 
@@ -51,7 +55,7 @@ def _held(given: list[str] | None) -> tuple[dict[str, float], list[str]]:
     """Positions of the held joints that have one, and all their names."""
     values, names = _values(given, "--hold")
     if any(len(numbers) > 1 for numbers in values.values()):
-        raise InputError("a held joint takes one value", element="--hold", remedy="Give one")
+        raise InputError("a held joint takes one value", element="--hold", remedy="Give one value")
     positions = {name: numbers[0] for name, numbers in values.items()}
     return positions, [*positions, *names]
 
@@ -67,11 +71,11 @@ def modes(
     model: Model,
     hold: Hold = None,
     starts: Annotated[
-        int, typer.Option(metavar="N", help="Configurations from which closing starts.")
+        int, typer.Option(metavar="N", help="Number of configurations from which closing starts.")
     ] = 200,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of the random ones.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the random ones among them.")] = 0,
 ) -> None:
-    """List the assembly modes of a mechanism: the ways in which its loops close.
+    """List the assembly modes, the ways in which loops close.
 
     Without --hold as many joints as there are degrees of freedom keep their initial position.
     """
@@ -98,10 +102,13 @@ def equilibrium(
     model: Model,
     hold: Hold = None,
     nearest: Annotated[
-        bool, typer.Option("--nearest", help="The nearest one, stable or not.")
+        bool, typer.Option("--nearest", help="Find the nearest one, stable or not.")
     ] = False,
 ) -> None:
-    """Find a static equilibrium and print positions, stability, holding forces and reactions."""
+    """Find a static equilibrium.
+
+    Prints positions, stability, holding forces and reactions.
+    """
     from srm_mbs.findings import equilibrium_rows, position_rows
 
     mechanism = srm_mbs.load(model)
@@ -121,17 +128,26 @@ def linearise(
         str,
         typer.Option(
             metavar="initial|rest|equilibrium|nearest",
-            help="The initial state, the initial configuration at rest, or an equilibrium "
-            "(stable, or the nearest).",
+            help="Where: the initial state, the initial configuration at rest, a stable "
+            "equilibrium, or the nearest one.",
         ),
     ] = "initial",
     actuated: Annotated[
         list[str] | None,
-        typer.Option("--input", metavar="JOINT", help="Input of B. Default: all joints."),
+        typer.Option(
+            "--input",
+            metavar="JOINT",
+            help="Joint whose force is an input of B. May be given several times.",
+            show_default="all joints",
+        ),
     ] = None,
     coordinate: Annotated[
         list[str] | None,
-        typer.Option(metavar="JOINT", help="Joint that is a coordinate. Default: chosen."),
+        typer.Option(
+            metavar="JOINT",
+            help="Joint that is a coordinate. May be given several times.",
+            show_default="chosen",
+        ),
     ] = None,
     mode: Annotated[int, typer.Option(metavar="N", help="Mode that --html shows.")] = 0,
     html: Html = None,
@@ -164,7 +180,7 @@ def _state(mechanism: Mechanism, at: str) -> tuple[Any, ...]:
     raise InputError(
         f"there is no state {at!r}",
         element="--at",
-        remedy="Give initial, rest, equilibrium or nearest",
+        remedy="Known: initial, rest, equilibrium, nearest",
     )
 
 
@@ -173,14 +189,19 @@ def drag(
     model: Model,
     values: Annotated[
         list[str],
-        typer.Argument(metavar="JOINT=VALUE[,VALUE...]", help="Positions to go to (rad, m)."),
+        typer.Argument(
+            metavar="JOINT=VALUE[,VALUE...]", help="Joint and the positions to go to (rad, m)."
+        ),
     ],
     html: Html = None,
     duration: Annotated[
         float, typer.Option(metavar="S", help="Length of the animation (s).")
     ] = 3.0,
 ) -> None:
-    """Drag joints through positions on one branch; exit status 1 where they go no further."""
+    """Drag joints through positions, on one branch.
+
+    The exit status is 1 where they go no further.
+    """
     from srm_mbs.findings import path_rows, position_rows
 
     if html is not None:

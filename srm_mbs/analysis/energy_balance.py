@@ -17,12 +17,17 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray, IndexArray
+from srm_mbs.mechanism import Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
+from srm_mbs.workspaces import workspace
 
 NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
+
+ROUNDING = 1e-13
+"""Part of the energies that add up to it which rounding leaves of a sum, with much to spare."""
 
 Powers = dict[str, FloatArray]
 """Power (n,) W of each thing that does work, by name."""
@@ -44,6 +49,9 @@ class EnergyBalance:
         their actions changed at once.
     start
         Energy (J) at the start of the run.
+    rounding
+        Residual (J) that rounding alone may leave: a small part of the energies, and of the weight
+        times the scene diagonal.
     """
 
     t: FloatArray
@@ -51,6 +59,7 @@ class EnergyBalance:
     potential: FloatArray
     works: Mapping[str, FloatArray]
     start: float
+    rounding: float
 
     @property
     def residual(self) -> FloatArray:
@@ -67,9 +76,9 @@ class EnergyBalance:
 
     @property
     def relative(self) -> float:
-        """Largest residual over the scale; 0 where nothing moved."""
+        """Largest residual over the scale; 0 where nothing moved but for rounding."""
         largest = float(np.abs(self.residual).max(initial=0.0))
-        return largest / self.scale if self.scale else 0.0
+        return largest / self.scale if self.scale > self.rounding else 0.0
 
 
 _System = OpenSystem | ClosedSystem
@@ -95,7 +104,7 @@ def _joints(run: Solution, system: _System) -> Powers:
 def _elements(run: Solution, system: _System) -> Powers:
     """Of springs and bushings what is left when their force at rest is taken off."""
     mechanism = run.mechanism
-    model, data = mechanism.model, mechanism.model.createData()
+    model, data = mechanism.model, workspace(mechanism.model)
     rest = np.zeros(model.nv)
     elements = [ForceKinematics(model, [force]) for force in mechanism.forces]
     names = [f"force {force.name}" for force in mechanism.forces]
@@ -154,13 +163,24 @@ def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
             pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
             works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
     kinetic = np.array([system.kinetic_energy(*state) for state in zip(solution.q, solution.v)])
+    start = float(system.energy(solution.steps.states[0]))
     return EnergyBalance(
         solution.t,
         kinetic,
         solution.energy - kinetic,
         works,
-        float(system.energy(solution.steps.states[0])),
+        start,
+        _rounding(solution.mechanism, [start, *kinetic, *solution.energy]),
     )
+
+
+def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
+    """What rounding may leave (J) of these energies, whose zero is where potentials cancel."""
+    model = mechanism.model
+    mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
+    weight = mass * float(np.linalg.norm(model.gravity.linear))
+    largest = float(np.abs(energies).max(initial=0.0))
+    return float(ROUNDING * (weight * mechanism.structure.units.length + largest))
 
 
 def joined_balance(
@@ -201,4 +221,5 @@ def joined_balance(
         joined([balance.potential for balance in balances]),
         {name: joined(pieces) for name, pieces in rows.items()},
         ends[0].start,
+        max(balance.rounding for balance in balances),
     )

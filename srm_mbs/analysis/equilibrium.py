@@ -9,6 +9,7 @@ Levenberg-Marquardt steps on Q.  S^T f = S^T M v', with the constrained accelera
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.reactions import reactions_at
 from srm_mbs.systems.singular import SINGULAR, TAU, nearest_singular, smallest_singular_value
 from srm_mbs.systems.tangent import ChartPoint, TangentChart, differences, tangent_basis
+
+log = logging.getLogger(__name__)
 
 ITERATIONS = 150
 LARGEST_STEP = 0.5
@@ -120,7 +123,11 @@ class _Statics:
     def at(self, chart: TangentChart, z: FloatArray) -> ChartPoint:
         point = chart.point(z)
         if point is None:
-            raise AnalysisError("the loops do not close around this configuration", q=chart.q)
+            raise AnalysisError(
+                "the loops do not close around this configuration",
+                q=chart.q,
+                remedy="Give another start",
+            )
         return point
 
     def stiffness(self, chart: TangentChart) -> FloatArray:
@@ -280,8 +287,9 @@ def equilibrium(
 ) -> Equilibrium:
     """A configuration in which the mechanism stays at rest.
 
-    Gravity, springs, bushings, constant torques and wrenches act; damping and friction do not, at
-    rest (friction is smooth here, and holds nothing for ever).
+    Gravity, springs, bushings, constant torques and wrenches act, and what follows a law over time
+    as it is at t = 0; damping and friction do not, at rest (friction is smooth here, and holds
+    nothing for ever).
 
     Parameters
     ----------
@@ -370,6 +378,7 @@ def _described(
     system = make_system(mechanism, lambda t, q, v: holding)
     wrenches, multipliers = reactions_at(system, np.zeros(1), q[None], statics.rest[None])
     joints = {name: mechanism.joint(name) for name in held}
+    log.debug("%s: equilibrium of %d free directions", mechanism.name, len(values))
     return Equilibrium(
         q,
         {name: values[0] for name, values in multipliers.items()},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,8 @@ from srm_mbs.mechanism import Mechanism
 from srm_mbs.motion import JointMotion
 from srm_mbs.systems.singular import SINGULAR
 from srm_mbs.systems.tangent import tangent_basis
+
+log = logging.getLogger(__name__)
 
 KEPT = 0.9
 """Smallest cosine between neighbouring tangents on one branch."""
@@ -76,7 +79,11 @@ class FollowedPath:
             If the duration is not positive.
         """
         if not duration > 0.0:
-            raise InputError(f"duration = {duration!r} is not positive", element="duration")
+            raise InputError(
+                f"duration = {duration!r} is not positive",
+                element="duration",
+                remedy="Give a positive number of seconds",
+            )
         times = np.linspace(0.0, duration, len(self.path)) if len(self.path) > 1 else np.zeros(1)
         return JointMotion(self.mechanism, times, self.path)
 
@@ -86,7 +93,10 @@ def _dragged(mechanism: Mechanism, values: Mapping[str, Any]) -> FloatArray:
     columns = []
     for name, given in values.items():
         joint = mechanism.joint(name)
-        array = np.atleast_1d(np.asarray(given, dtype=float))
+        try:
+            array = np.atleast_1d(np.asarray(given, dtype=float))
+        except (TypeError, ValueError):
+            array = np.full(1, np.nan)
         if joint.nv != 1 or array.ndim != 1 or not len(array) or not np.isfinite(array).all():
             raise InputError(
                 f"joint {name!r} cannot be dragged along {given!r}",
@@ -125,7 +135,11 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     mechanism = mechanism.undriven  # what is dragged takes the place of drives
     wanted = _dragged(mechanism, values)
     if not mechanism.loops:
-        raise InputError("a mechanism without loops has nothing to follow", element="loop")
+        raise InputError(
+            "a mechanism without loops has nothing to follow",
+            element="loop",
+            remedy="Set its joints directly: they do not depend on each other",
+        )
     start = assemble(mechanism, q, hold=list(values))
     problem = ClosureProblem(mechanism, start.q)
     columns = np.array([mechanism.joint(name).idx_v for name in values])
@@ -155,6 +169,8 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
         joint = mechanism.joint(name)
         if joint.nq == 1:
             reached[:, joint.idx_q] = wanted[: len(reached), k]
+    message = _message(limit, found.turned)
+    log.debug("%s: %s", mechanism.name, message)
     return FollowedPath(
         mechanism,
         reached,
@@ -163,7 +179,7 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
         singular,
         found.cosine > KEPT,
         found.path,
-        _message(limit, found.turned),
+        message,
     )
 
 

@@ -22,6 +22,7 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.options import numbers
 from srm_mbs.solution import Solution
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.multibody import make_system
@@ -74,6 +75,14 @@ class InverseDynamics:
         return self._computed[1]
 
 
+def _arrays(parts: Callable[[], Iterable[Any]]) -> list[FloatArray]:
+    """The parts of a motion; none if they are no numbers."""
+    try:
+        return [np.array(part, dtype=float) for part in parts()]
+    except (TypeError, ValueError):
+        return []
+
+
 def _motion(
     mechanism: Mechanism, motion: Any, t: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -81,7 +90,11 @@ def _motion(
     nq, nv = mechanism.model.nq, mechanism.model.nv
     if isinstance(motion, Solution):
         if (motion.mechanism.model.nq, motion.mechanism.model.nv) != (nq, nv):
-            raise InputError("the run is one of another mechanism", element="motion")
+            raise InputError(
+                "the run is one of another mechanism",
+                element="motion",
+                remedy="Give a run of this mechanism",
+            )
         run = motion if t is None else motion.at(t)
         return run.t, run.q, run.v, run.accelerations
     if callable(motion):
@@ -89,18 +102,17 @@ def _motion(
             raise InputError(
                 "a motion given as a function needs times", element="t", remedy="Give t (n,)"
             )
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        states = [motion(float(time)) for time in times]
-        parts: list[Any] = [times, *(np.array(part, dtype=float) for part in zip(*states))]
+        times = np.atleast_1d(numbers(t, "t", "Give times t (n,) in s"))
+        states = [motion(float(time)) for time in times.ravel()]
+        parts = _arrays(lambda: [times, *zip(*states, strict=True)])
+        if not states:
+            parts += [np.zeros((0, nq)), np.zeros((0, nv)), np.zeros((0, nv))]
     elif t is not None:
         raise InputError(
             "times are part of a motion that is given as arrays", element="t", remedy="Leave it out"
         )
     else:
-        try:
-            parts = [np.array(part, dtype=float) for part in motion]
-        except (TypeError, ValueError):
-            parts = []
+        parts = _arrays(lambda: motion)
     n = len(parts[0]) if parts and parts[0].ndim == 1 else 0
     shapes = [part.shape for part in parts]
     if shapes != [(n,), (n, nq), (n, nv), (n, nv)] or not all(
@@ -157,7 +169,9 @@ def inverse_dynamics(
     columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
     labels = coordinate_names(mechanism)
     count = len(columns)
-    weight = np.ones(count) if weights is None else np.array(weights, dtype=float)
+    weight = np.ones(count)
+    if weights is not None:
+        weight = numbers(weights, "weights", f"Give {count} positive numbers")
     if weight.shape != (count,) or not np.all(weight > 0.0):
         raise InputError(
             f"weights of shape {weight.shape} do not fit {count} actuated coordinates",

@@ -8,9 +8,11 @@ the accelerations are linear in the forces.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -21,12 +23,16 @@ from srm_mbs.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.motion import JointMotion
+from srm_mbs.options import positive
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.controllers import Controller
 from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
 from srm_mbs.systems.singular import TAU
 from srm_mbs.systems.tangent import TangentChart, differences, tangent_basis
+from srm_mbs.workspaces import workspace
+
+log = logging.getLogger(__name__)
 
 CLOSED, TANGENT = 1e-9, 1e-9
 """Largest closure error and rate of the state, over units."""
@@ -135,8 +141,15 @@ class Linearisation:
         Raises
         ------
         InputError
-            If there is no such mode, or the mechanism cannot move that far.
+            If there is no such mode, the mechanism cannot move that far, or ``frames`` is not
+            positive.
         """
+        if not isinstance(frames, Integral) or frames < 1:
+            raise InputError(
+                f"frames = {frames!r} is not a positive whole number",
+                element="frames",
+                remedy=f"Give a positive number, for example {FRAMES}",
+            )
         count = len(self.eigenvalues)
         if not -count <= mode < count:
             raise InputError(
@@ -196,7 +209,8 @@ def linearise(
     Parameters
     ----------
     mechanism
-        Gravity, force elements, joint damping and (smoothed) friction act.
+        Gravity, force elements, joint damping and (smoothed) friction act; what follows a law over
+        time, as it is at t = 0.
     q : (nq,), v : (nv,)
         The state, with closed loops and consistent rates.  By default the initial state; at rest
         if only q is given.
@@ -218,6 +232,7 @@ def linearise(
         the right size), or names do not fit.
     """
     mechanism.refuse_drives("a linearisation")
+    step = positive(step, "step")
     if q is None and v is None:
         q, v = mechanism.q0, mechanism.v0
     if q is None:
@@ -272,11 +287,12 @@ def linearise(
     drift = field(np.zeros(2 * k)) * scale
     # The last evaluation was at the state: its factorisation gives the response to forces.
     terms = system.evaluate(0.0, np.concatenate([q, v]))
-    U = cholesky(pin.crba(mechanism.model, mechanism.model.createData(), q))
+    U = cholesky(pin.crba(mechanism.model, workspace(mechanism.model), q))
     pushed = unwhiten(U, whiten(U, np.asfortranarray(np.eye(nv)[:, columns])))
     response = np.array([w - terms.project(w) for w in pushed.T]).reshape(-1, nv).T
     B = np.vstack([np.zeros((k, len(columns))), response[chosen]])
     labels = coordinate_names(mechanism)
+    log.debug("%s: linearised in %d coordinates", mechanism.name, k)
     return Linearisation(
         mechanism,
         q,

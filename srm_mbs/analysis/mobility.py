@@ -107,8 +107,10 @@ def mobility_map(solution: Solution) -> MobilityMap:
         bases.append(basis)
         values.append(singular)
     freedom = np.array([basis.shape[1] for basis in bases], dtype=int)
-    table = np.array(values).reshape(len(bases), -1)
     structural = mechanism.structure.loop_rank
+    table = np.array(values)
+    if not len(table):  # as wide as at any configuration
+        table = np.zeros((0, len(tangent_basis(geometry, mechanism.q0, everything)[1])))
     parts = [np.linalg.norm(basis, axis=1) for basis in bases]
     return MobilityMap(
         solution.t,
@@ -125,11 +127,17 @@ def mobility_map(solution: Solution) -> MobilityMap:
 def _changes(solution: Solution) -> tuple[MobilityChange, ...]:
     if not solution.mechanism.structure.loop_rank:
         return ()
-    nv = solution.mechanism.model.nv
-    met = [(passage.time, passage.singular, passage.loops) for passage in solution.crossings]
-    met += [(stay.start, stay.singular, stay.loops) for stay in solution.bifurcations]
-    return tuple(
-        MobilityChange(time, nv - found.rank, loops)
-        for time, found, loops in sorted(met, key=lambda entry: entry[0])
-        if found is not None
-    )
+    mechanism = solution.mechanism
+    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
+    everything = np.arange(mechanism.model.nv)
+    met = [(passage.time, passage.configuration, passage.loops) for passage in solution.crossings]
+    met += [(stay.start, stay.configuration, stay.loops) for stay in solution.bifurcations]
+    changes = []
+    for time, q, loops in sorted(met, key=lambda entry: entry[0]):
+        if q is None:
+            continue
+        freedom = tangent_basis(geometry, q, everything)[0].shape[1]
+        # Where only the drives lose rank, what the closures leave free is the same.
+        if freedom > mechanism.model.nv - mechanism.structure.loop_rank:
+            changes.append(MobilityChange(time, freedom, loops))
+    return tuple(changes)

@@ -7,8 +7,10 @@ it is that none is missing.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,8 @@ from srm_mbs.coordinates import coordinate_names, set_position
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.tangent import tangent_basis
+
+log = logging.getLogger(__name__)
 
 SAME = 1e-6
 """Largest difference (rad, scene diagonals) of two closings of one mode."""
@@ -126,13 +130,23 @@ def assembly_modes(
         If the held joints leave the mechanism free to move, so that modes are not isolated, or for
         unknown joints or malformed values.
     """
-    if int(starts) < 1:
+    if not isinstance(starts, Integral) or starts < 1:
         raise InputError(
-            f"starts = {starts!r} is not positive", element="starts", remedy="Give 200"
+            f"starts = {starts!r} is not a positive whole number",
+            element="starts",
+            remedy="Give a positive number, for example 200",
+        )
+    if not isinstance(seed, Integral) or seed < 0:
+        raise InputError(
+            f"seed = {seed!r} is not a natural number", element="seed", remedy="Give 0, 1, 2 ..."
         )
     mechanism = mechanism.undriven  # modes are those of the loops
     if not mechanism.loops:
-        raise InputError("a mechanism without loops has no assembly modes", element="loop")
+        raise InputError(
+            "a mechanism without loops has no assembly modes",
+            element="loop",
+            remedy="Give a mechanism with closures",
+        )
     start = np.array(mechanism.q0)
     for name, value in (q or {}).items():
         set_position(mechanism, start, name, value)
@@ -145,7 +159,7 @@ def assembly_modes(
     free = free_coordinates(mechanism, held)
     modes: list[FloatArray] = []
     counts: list[int] = []
-    for guess in _starts(problem, start, free, int(starts), seed):
+    for guess in _starts(problem, start, free, int(starts), int(seed)):
         closed = close_from(problem, guess, free, SEARCH_STEPS)
         if not problem.closed(closed):
             continue
@@ -160,6 +174,7 @@ def assembly_modes(
             _check_isolated(mechanism, problem, modes, free, held)
     if modes:
         _check_isolated(mechanism, problem, modes, free, held)
+    log.debug("%s: %d assembly modes from %d starts", mechanism.name, len(modes), int(starts))
     order = sorted(range(len(modes)), key=lambda k: problem.distance(modes[k]))
     return [
         AssemblyMode(

@@ -21,14 +21,17 @@ if TYPE_CHECKING:
 
 Image = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.png", help="Write a picture of the run, at its end or --at S."),
+    typer.Option(metavar="FILE.png", help="Write a picture of the run at the time --at."),
 ]
 At = Annotated[
-    float | None, typer.Option("--at", metavar="S", help="Time of the picture in the run (s).")
+    float | None,
+    typer.Option(
+        "--at", metavar="S", help="Time of the picture in the run (s).", show_default="the end"
+    ),
 ]
 Video = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Write a film of the run; the suffix is .gif or .mp4."),
+    typer.Option(metavar="FILE", help="Write a film of the run as .gif or .mp4."),
 ]
 Trace = Annotated[
     list[str] | None,
@@ -42,21 +45,50 @@ Trace = Annotated[
 Gaps = Annotated[bool, typer.Option("--gaps", help="Draw the gaps of the closures, exaggerated.")]
 Live = Annotated[
     bool,
-    typer.Option("--live", help="Show the run in the browser while it is computed; then play it."),
+    typer.Option("--live", help="Show the run in the browser while it is computed, then play it."),
 ]
 Reactions = Annotated[
     bool, typer.Option("--reactions", help="Colour the closures by the force in them.")
 ]
 
 
-def check_pictures(image: Path | None, video: Path | None) -> None:
-    """Refuse files that could not be written after the run."""
-    from srm_mbs.rendering import FILMS
+def check_pictures(image: Path | None, at: float | None, video: Path | None) -> None:
+    """Refuse files that could not be written after the run.
+
+    Raises
+    ------
+    InputError
+        If one cannot be, its encoder is missing, or there is a time and no picture.
+    """
+    from srm_mbs.rendering import FILMS, encoder_of
 
     if image is not None:
         check_output(image, "--image", (".png",))
+    elif at is not None:
+        raise InputError(
+            "it is the time of a picture, and none is asked for",
+            element="--at",
+            remedy="Give --image FILE.png too",
+        )
     if video is not None:
         check_output(video, "--video", FILMS)
+        encoder_of(video)
+
+
+def check_time(at: float | None, t_end: float) -> None:
+    """Refuse a picture of a time (s) that a run up to ``t_end`` (s) does not have.
+
+    Raises
+    ------
+    InputError
+        If it has not.
+    """
+    if at is not None and not (0.0 <= at <= t_end or t_end <= 0.0):
+        raise InputError(
+            f"{at:g} s lies outside the run, from 0 to {t_end:g} s",
+            element="--at",
+            remedy="Give a time of the run",
+        )
 
 
 def drawn(
@@ -71,16 +103,19 @@ def drawn(
     """
     from srm_mbs.overlays import Wanted
 
-    anchors = _anchors(trace or [])
-    try:
-        Wanted(anchors, gaps, reactions).check(mechanism)
-    except InputError as error:
-        error.element = f"--{error.element}"
-        raise
+    anchors = given_points(trace or [], "--trace")
+    Wanted(anchors, gaps, reactions).check(mechanism)
     return {"trace": anchors, "gaps": gaps, "reactions": reactions}
 
 
-def _anchors(texts: list[str]) -> list[srm_mbs.Anchor]:
+def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
+    """The points LINK:X,Y,Z that were given to ``option``.
+
+    Raises
+    ------
+    InputError
+        If one is none.
+    """
     found = []
     for text in texts:
         link, colon, numbers = text.rpartition(":")
@@ -90,8 +125,8 @@ def _anchors(texts: list[str]) -> list[srm_mbs.Anchor]:
             colon = ""
         if not colon:
             raise InputError(
-                f"{text!r} is no point of a link",
-                element="--trace",
+                f"{text!r} is not a point of a link",
+                element=option,
                 remedy="Write LINK:X,Y,Z, for example rod:0.5,0,0",
             )
         found.append(srm_mbs.Anchor(link, xyz=(x, y, z)))
@@ -108,8 +143,11 @@ def play(
     gaps: Gaps = False,
     reactions: Reactions = False,
 ) -> None:
-    """Play a saved run in the browser; with --image or --video, write these instead."""
-    check_pictures(image, video)
+    """Play a saved run in the browser.
+
+    With --image or --video, write these instead.
+    """
+    check_pictures(image, at, video)
     solution = srm_mbs.load_solution(run)
     options = drawn(solution.mechanism, trace, gaps, reactions)
     if image is None and video is None:

@@ -18,8 +18,8 @@ from srm_mbs.anchors import WORLD
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.overlays import Overlays
-from srm_mbs.scene import FIELD_OF_VIEW, Picture, View
+from srm_mbs.scene import FIELD_OF_VIEW, Motion, Picture, View
+from srm_mbs.spans import Spans
 from srm_mbs.visuals import Box, Colour, Cylinder, Mesh, Shape, Sphere
 
 TOP_COLOUR, BOTTOM_COLOUR = (1.0, 1.0, 1.0), (0.90, 0.92, 0.94)
@@ -111,11 +111,12 @@ def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
                 "position": ("vector3", motion.positions[:, k]),
                 "quaternion": ("quaternion", motion.quaternions[:, k]),
             }
-            _move(meshcat, animation, root[names[joint]], tracks)
+            _move(meshcat, animation, root[names[joint]], tracks, motion)
     for number, visual in enumerate(picture.visuals):
         node = root[f"{names[visual.joint]}/shape_{number}"]
         _put(meshcat, node, visual.shape, visual.placement, visual.colour)
-    _draw_overlays(meshcat, scene["/overlays"], shift, picture.overlays, animation)
+        _show(meshcat, animation, node, visual.spans, motion)
+    _draw_overlays(meshcat, scene["/overlays"], shift, picture, animation)
     if animation.clips:
         # For ever: a page that is looked at late still moves; "pause" stops it.
         scene.set_animation(animation, play=True, repetitions=math.inf)
@@ -135,9 +136,10 @@ def _put(
 
 
 def _draw_overlays(
-    meshcat: Any, root: Any, shift: FloatArray, overlays: Overlays, animation: Any
+    meshcat: Any, root: Any, shift: FloatArray, picture: Picture, animation: Any
 ) -> None:
     """Shapes with a motion of their own, and paths."""
+    overlays = picture.overlays
     if overlays.moving:
         root.set_transform(shift)
     for moving in overlays.moving:
@@ -147,14 +149,15 @@ def _draw_overlays(
             _put(meshcat, part, shape, at, colour, moving.in_front)
             if moving.colours is not None:
                 tracks = {"material.color": ("color", moving.colours)}
-                _move(meshcat, animation, part["<object>"], tracks)
+                _move(meshcat, animation, part["<object>"], tracks, picture.motion)
         tracks = {
             "position": ("vector3", moving.positions),
             "quaternion": ("quaternion", moving.quaternions),
         }
         if moving.scales is not None:
             tracks["scale"] = ("vector3", moving.scales)
-        _move(meshcat, animation, node, tracks)
+        _move(meshcat, animation, node, tracks, picture.motion)
+        _show(meshcat, animation, node, moving.spans, picture.motion)
     for trace in overlays.traces:
         points = meshcat.geometry.PointsGeometry(trace.points.T.astype(np.float32))
         material = meshcat.geometry.LineBasicMaterial(color=_number(trace.colour))
@@ -189,21 +192,45 @@ def _light(scene: Any, view: View) -> None:
 
 
 def _move(
-    meshcat: Any, animation: Any, node: Any, values: dict[str, tuple[str, FloatArray]]
+    meshcat: Any,
+    animation: Any,
+    node: Any,
+    values: dict[str, tuple[str, FloatArray]],
+    motion: Motion,
 ) -> None:
     """Set ``node`` to the first of its values, and add a clip if they change.
 
     ``values`` are property, three.js's type and one row for each key frame.
     """
-    tracks = {}
+    tracks, frames = {}, motion.frames
     for name, (kind, rows) in values.items():
         # What stays is said once: the pivot of a crank, the direction of a slider.
         count = len(rows) if np.ptp(rows, axis=0).max() > 1e-12 else 1
         tracks[name] = meshcat.animation.AnimationTrack(
-            name, kind, list(range(count)), rows[:count].tolist()
+            name, kind, frames[:count], rows[:count].tolist()
         )
         if name != "material.color":
             node.set_property(name, rows[0].tolist())
     if any(len(track.frames) > 1 for track in tracks.values()):
         fps = animation.default_framerate
         animation.clips[node.path] = meshcat.animation.AnimationClip(tracks, fps=fps)
+
+
+def _show(meshcat: Any, animation: Any, node: Any, spans: Spans | None, motion: Motion) -> None:
+    """Show ``node`` during ``spans`` only, to the very time and not to the next key frame."""
+    if spans is None:
+        return
+    start, end = float(motion.times[0]), float(motion.times[-1])
+    changes = {start: False, end: False}
+    for first, last in spans:
+        changes |= {first: True, last: last >= end}
+    times = sorted(changes)
+    node.set_property("visible", changes[times[0]])
+    clip = animation.clips.setdefault(
+        node.path, meshcat.animation.AnimationClip({}, fps=animation.default_framerate)
+    )
+    # The last key is that of all clips, so that all of them last as long.
+    frames = [(t - start) * motion.rate for t in times[:-1]] + [len(motion.times) - 1]
+    clip.tracks["visible"] = meshcat.animation.AnimationTrack(
+        "visible", "bool", frames, [changes[t] for t in times]
+    )

@@ -17,6 +17,7 @@ Reactions are left out: there are six per loop, and they are better taken from
 from __future__ import annotations
 
 import csv
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from srm_mbs.mechanism import Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.summary import JOINT_TYPES
 from srm_mbs.systems.units import row_dimensions
+
+log = logging.getLogger(__name__)
 
 _LENGTHS, _QUATERNION = ("x (m)", "y (m)", "z (m)"), ("qx", "qy", "qz", "qw")
 _LINEAR, _ANGULAR = ("vx (m/s)", "vy (m/s)", "vz (m/s)"), ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)")
@@ -72,6 +75,7 @@ def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
         writer.writerow(columns)
         # Python's own floats: the csv module writes them with repr.
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
+    log.info("written: %s", path)
 
 
 def _columns(solution: Solution) -> dict[str, FloatArray]:

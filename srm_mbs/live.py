@@ -16,10 +16,13 @@ from srm_mbs.drawing import draw_picture, import_meshcat, node_names
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.motion import JointMotion
 from srm_mbs.overlays import Overlays, Wanted
-from srm_mbs.playback import close, serve, show, wait
-from srm_mbs.readout import read_out
-from srm_mbs.scene import ASPECT, make_picture
-from srm_mbs.web_page import make_page
+from srm_mbs.playback import about_picture, close, serve, show, wait
+from srm_mbs.readout import DRIFT, ENERGY, drift_unit
+from srm_mbs.scene import make_picture
+from srm_mbs.systems.driven import constraint_errors
+from srm_mbs.systems.multibody import make_system
+from srm_mbs.web_page import as_json, make_page
+from srm_mbs.workspaces import workspace
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
@@ -40,13 +43,15 @@ WIDER = 1.6
 class LiveView:
     """Shows the state of a run in the browser: ``simulate(mechanism, 10.0, progress=view)``.
 
-    It takes at most :data:`SHARE` of the run's time, by leaving states out.  Bodies only, springs
+    It takes at most :data:`SHARE` of the run's time, by leaving states out.  The panel has the
+    time, the closure error and the change of the energy since the first step.  Bodies only, springs
     and the like come with :meth:`play`.  It is a context manager, which stops serving at its end.
 
     Parameters
     ----------
     mechanism
-        What is simulated.
+        What is simulated.  The closure error and the energy are those of its closures and forces,
+        also where an event lets one go.
     open_browser
         Open a browser window; otherwise only serve the page.  Its address is logged.
 
@@ -71,15 +76,19 @@ class LiveView:
         picture = make_picture(start, 1.0, Wanted())
         view = replace(picture.view, distance=WIDER * picture.view.distance)
         picture = replace(picture, view=view, overlays=Overlays())
-        about = read_out(start, start.t) | {"notes": [], "aspect": ASPECT, "live": True}
+        about = about_picture(start, picture, panel=True)
+        self._system, self._energy = make_system(mechanism), math.nan
+        unit = drift_unit(start)
+        about["values"] = [{"label": DRIFT, "unit": unit, "live": 1}] if unit else []
+        about["values"].append({"label": ENERGY, "unit": "J", "live": 2})
+        names = node_names(mechanism)
+        self._joints = sorted({visual.joint for visual in picture.visuals} - {0})
+        about["live"] = [names[joint] for joint in self._joints]
         page = make_page(self._meshcat, mechanism.name, about, None)
         self.visualizer = serve(self._meshcat, page, picture)
-        self._model, self._data = mechanism.model, mechanism.model.createData()
-        names = node_names(mechanism)
-        root = self.visualizer["/mechanism"]
-        drawn = sorted({visual.joint for visual in picture.visuals} - {0})
-        self._nodes = [(joint, root[names[joint]]) for joint in drawn]
-        self._clock = self.visualizer["/live"]
+        self._mechanism = mechanism
+        self._model, self._data = mechanism.model, workspace(mechanism.model)
+        self._node = self.visualizer["/live"]
         import zmq
 
         # A server that has died must not stop the run.
@@ -89,9 +98,9 @@ class LiveView:
         self.spent, self.shown, self.stride = 0.0, 0, 1
         # What a state costs is known before the run.
         began = time.perf_counter()
-        self.send(0.0, np.array(mechanism.q0))
+        self.send(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
         self._cost = time.perf_counter() - began
-        self.shown = 0
+        self.shown, self._energy = 0, math.nan
         show(self.visualizer, mechanism.name, open_browser=open_browser)
 
     def __call__(self, t: float, h: float, state: FloatArray) -> None:
@@ -99,6 +108,7 @@ class LiveView:
         now = time.perf_counter()
         if not self._began:
             self._began = self._last = now
+            self._energy = self._system.energy(state)
             return
         if now - self._last < OFTEN:
             self.stride = min(2 * self.stride, MOST)
@@ -108,7 +118,7 @@ class LiveView:
         if self.spent + self._cost > SHARE * (now - self._began):
             return
         try:
-            self.send(t, state[: self._model.nq])
+            self.send(t, state)
         except self._lost:
             log.warning("the page no longer follows the run: its server does not answer")
             self.spent = math.inf
@@ -117,14 +127,19 @@ class LiveView:
         self._cost = self._last - now
         self.spent += self._cost
 
-    def send(self, t: float, q: FloatArray) -> None:
-        """Show the configuration q (nq,) at t (s)."""
+    def send(self, t: float, state: FloatArray) -> None:
+        """Show the state (nq + nv,) at t (s)."""
+        q, v = np.split(state, [self._model.nq])
         pin.forwardKinematics(self._model, self._data, q)
-        for joint, node in self._nodes:
-            node.set_transform(self._data.oMi[joint].homogeneous)
-        place = np.eye(4)
-        place[0, 3] = t
-        self._clock.set_transform(place)
+        energy = self._system.energy(state)
+        if math.isnan(self._energy):
+            self._energy = energy
+        g, _ = constraint_errors(self._mechanism, np.array([t]), q[None], v[None])
+        head = np.zeros((4, 4))
+        head[:3, 0] = t, np.linalg.norm(g), energy - self._energy
+        # One command for all, which the page takes apart: each waits for the server's answer.
+        places = [self._data.oMi[joint].homogeneous for joint in self._joints]
+        self._node.set_transform(np.hstack([head, *places]))
         self.shown += 1
 
     def play(self, solution: Playable, **drawn: Any) -> None:
@@ -137,10 +152,13 @@ class LiveView:
         drawn
             ``trace``, ``gaps`` and ``reactions`` of :func:`srm_mbs.playback.play`.
         """
-        draw_picture(self._meshcat, self.visualizer, make_picture(solution, 60.0, Wanted(**drawn)))
+        picture = make_picture(solution, 60.0, Wanted(**drawn))
+        about = about_picture(solution, picture, panel=True)
+        self.visualizer["/about"].set_property("about", as_json(about))
+        draw_picture(self._meshcat, self.visualizer, picture)
 
     def wait(self) -> None:
-        """Serve until Ctrl+C."""
+        """Serve until Ctrl-C."""
         wait(self.visualizer)
 
     def close(self) -> None:

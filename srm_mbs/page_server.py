@@ -17,6 +17,9 @@ from srm_mbs.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+SERVERLESS = "Use solution.export_html(path), which needs no server"
+"""Remedy where the server does not work."""
+
 
 def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
     """Serve ``page`` from a process of its own.
@@ -55,7 +58,7 @@ def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
         raise InputError(
             f"meshcat cannot start its server (exit code {process.returncode})"
             + (f": {words[-1]}" if words else ""),
-            remedy="solution.export_html(path) needs none",
+            remedy=SERVERLESS,
         )
     return process, found["zmq_url"], found["web_url"]
 

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +20,10 @@ from srm_mbs.anchors import Anchor
 from srm_mbs.drawing import draw_picture, import_meshcat
 from srm_mbs.errors import InputError
 from srm_mbs.overlays import Wanted
-from srm_mbs.page_server import start_server
+from srm_mbs.page_server import SERVERLESS, start_server
 from srm_mbs.readout import read_out
 from srm_mbs.scene import ASPECT, Picture, make_picture
-from srm_mbs.web_page import make_page
+from srm_mbs.web_page import make_page, write_page
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
@@ -77,21 +77,13 @@ def play(
     ----------
     solution
         The run; one that failed is played up to its end.
-    fps
-        Key frames per second; between them the browser interpolates.  Fewer are taken where
-        their number would get too large (:data:`srm_mbs.scene.MAX_BODY_FRAMES`).
+    fps, trace, gaps, reactions
+        As for :func:`export_html`.
     open_browser
         Open a browser window; otherwise only serve the page.  Its address is logged.
     block
-        Wait until Ctrl+C, and then stop serving.  By default in a script, whose end would also be
+        Wait until Ctrl-C, and then stop serving.  By default in a script, whose end would also be
         that of the page, and not in an interactive session.
-    trace
-        Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
-    gaps
-        Draw the gaps of the closures, so much exaggerated that they are seen; the panel gives the
-        factor.
-    reactions
-        Colour the closures by the size of their reaction force, with a legend in the panel.
 
     Returns
     -------
@@ -106,7 +98,7 @@ def play(
     """
     meshcat = import_meshcat()
     picture = make_picture(solution, check_fps(fps), Wanted(trace, gaps, reactions))
-    about = _about(solution, picture, panel=True)
+    about = about_picture(solution, picture, panel=True)
     visualizer = serve(meshcat, make_page(meshcat, solution.mechanism.name, about, None), picture)
     show(visualizer, solution.mechanism.name, open_browser=open_browser)
     if block is None:
@@ -117,12 +109,12 @@ def play(
 
 
 def wait(visualizer: Any) -> None:
-    """Serve until Ctrl+C, then :func:`close`."""
+    """Serve until Ctrl-C, then :func:`close`."""
     try:
         while visualizer.window.server_proc.poll() is None:
             time.sleep(0.1)
     except KeyboardInterrupt:
-        log.info("stopped")
+        log.info("playback stopped")
     finally:
         close(visualizer)
 
@@ -186,7 +178,7 @@ def serve(meshcat: Any, page: str, picture: Picture) -> Any:
         window.zmq_socket.setsockopt(_zmq().RCVTIMEO, -1)
     except _zmq().ZMQError as error:
         close(visualizer)
-        raise InputError(f"meshcat's server does not answer: {error}") from error
+        raise InputError(f"meshcat's server does not answer: {error}", remedy=SERVERLESS) from error
     except BaseException:
         close(visualizer)
         raise
@@ -238,7 +230,8 @@ def export_html(
     path
         Name of the file, usually ``.html``; an existing one is replaced.
     fps
-        Key frames per second; between them the browser interpolates.  Fewer are taken where
+        Key frames per second; between them the browser goes straight.  More are taken where bodies
+        would be seen beside their places, such as in short runs of fast mechanisms, and fewer where
         their number would get too large (:data:`srm_mbs.scene.MAX_BODY_FRAMES`), to keep the file
         below 5 MB unless there are mesh files or very many bodies.
     trace
@@ -257,18 +250,23 @@ def export_html(
         If ``fps`` is not a positive number, what is asked for cannot be drawn, meshcat is missing,
         or the file cannot be written.
     """
+    drawn = Wanted(trace, gaps, reactions)
+    write_page(page_of(solution, fps, drawn, panel=panel), Path(path))
+
+
+def page_of(
+    solution: Playable, fps: float, wanted: Wanted, *, panel: bool, extra: Iterable[float] = ()
+) -> str:
+    """The page of :func:`export_html`, with key frames at ``extra`` times (s); errors as there."""
     meshcat = import_meshcat()
-    picture = make_picture(solution, check_fps(fps), Wanted(trace, gaps, reactions))
+    picture = make_picture(solution, check_fps(fps), wanted, extra)
     recorder = _Recorder()
     draw_picture(meshcat, meshcat.Visualizer(window=recorder), picture)
-    about = _about(solution, picture, panel=panel)
-    page = make_page(meshcat, solution.mechanism.name, about, recorder.commands)
-    try:
-        Path(path).write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"the page cannot be written: {error.strerror}", file=str(path)) from error
+    about = about_picture(solution, picture, panel=panel)
+    return make_page(meshcat, solution.mechanism.name, about, recorder.commands)
 
 
-def _about(solution: Playable, picture: Picture, *, panel: bool) -> dict[str, Any]:
+def about_picture(solution: Playable, picture: Picture, *, panel: bool) -> dict[str, Any]:
+    """What the page says about a run and its picture, for :func:`srm_mbs.web_page.make_page`."""
     about = read_out(solution, picture.motion.times, panel=panel)
     return about | {"notes": picture.overlays.notes, "aspect": ASPECT}

@@ -9,13 +9,18 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.solution import Solution
+from srm_mbs.spans import parts_of
 from srm_mbs.systems.units import row_dimensions
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
+    from srm_mbs.stepping.crossings import Crossing
 
 MAX_SAMPLES = 3000
 """Times at which the values are sampled: some 100 kB in a page."""
+NAMED_LOOPS, NAMED_PASSAGES = 12, 100
+"""Loops, and passages, up to which the passages name their loops."""
+DRIFT, ENERGY = "drift |g|", "energy change"
 DIGITS = 4
 """Digits of a value in the page; it shows three."""
 
@@ -44,13 +49,9 @@ def read_out(solution: Playable, times: FloatArray, *, panel: bool = True) -> di
     if not (panel and isinstance(solution, Solution)):
         return about
     crossings = solution.crossings
+    few = len(solution.mechanism.loops) <= NAMED_LOOPS and len(crossings) <= NAMED_PASSAGES
     about["passages"] = [
-        {
-            "time": crossing.time,
-            "text": f"singular configuration passed at t = {crossing.time:.4g} s"
-            + (f": {', '.join(crossing.loops)}" if crossing.loops else ""),
-        }
-        for crossing in crossings
+        {"time": crossing.time, "text": _passage(crossing, named=few)} for crossing in crossings
     ]
     if len(times) > MAX_SAMPLES:
         times = np.linspace(times[0], times[-1], MAX_SAMPLES)
@@ -58,18 +59,36 @@ def read_out(solution: Playable, times: FloatArray, *, panel: bool = True) -> di
     about["times"] = [float(f"{t:.9g}") for t in times]
     run = solution.at(times)
     values = []
+    unit = drift_unit(solution)
     with np.errstate(over="ignore", invalid="ignore"):
-        if solution.mechanism.constrained:
-            unit = ", ".join(row_dimensions(solution.mechanism))
-            values.append(("drift |g|", unit, run.drift[:, 0]))
-        values.append(("energy change", "J", run.energy - solution.at(times[:1]).energy))
-    if solution.mechanism.constrained and solution.steps.count:
-        values.append(("sigma", "", sigma_at(solution, times)))
+        if unit:
+            values.append((DRIFT, unit, run.drift[:, 0]))
+        values.append((ENERGY, "J", run.energy - solution.at(times[:1]).energy))
+        if unit and solution.steps.count:
+            values.append(("sigma", "", sigma_at(solution, times)))
     about["values"] = [
         {"label": label, "unit": unit, "samples": [_rounded(x) for x in samples.tolist()]}
         for label, unit, samples in values
     ]
     return about
+
+
+def drift_unit(solution: Playable) -> str:
+    """Units of the closure errors of a run or motion, "" if it never has closures or drives."""
+    units: dict[str, None] = {}
+    for mechanism, _ in parts_of(solution):
+        if mechanism.constrained:
+            units |= dict.fromkeys(row_dimensions(mechanism))
+    return ", ".join(units)
+
+
+def _passage(crossing: Crossing, *, named: bool) -> str:
+    """What the mark of a passage says: its time and, where all are few, the loops and drives.
+
+    Which loops lose rank takes a second to find out among dozens, and nobody could read them.
+    """
+    text = f"singular configuration passed at t = {crossing.time:.4g} s"
+    return f"{text}: {crossing.participants.names}" if named else text
 
 
 def sigma_at(solution: Solution, times: FloatArray) -> FloatArray:

@@ -7,23 +7,28 @@ drives, and photographed at the wanted times: what is seen is what the browser p
 from __future__ import annotations
 
 import io
+import logging
 import math
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srm_mbs.errors import InputError
-from srm_mbs.playback import check_fps, export_html
+from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.overlays import Wanted
+from srm_mbs.playback import check_fps, page_of
+from srm_mbs.web_page import write_page
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
+
+log = logging.getLogger(__name__)
 
 SIZE = (900, 600)
 """Width and height of a picture in pixels; other shapes than 3 to 2 leave margins."""
@@ -42,7 +47,8 @@ _SETTLED = """async t => {
   const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
   await frame(); await frame();
 }"""
-_BARE = "#bar, .dg { display: none !important; }"
+BARE = "#bar, .dg { display: none !important; }"
+"""Style of a page that is photographed: nothing that one operates."""
 
 
 @contextmanager
@@ -59,7 +65,7 @@ def browser() -> Iterator[Any]:
     except ImportError as error:
         raise InputError(
             "pictures and films need playwright, which is not installed",
-            remedy="pip install 'srm-mbs[render]', or look at solution.export_html(path)",
+            remedy='Install it: pip install "srm-mbs[render]"; or use solution.export_html(path)',
         ) from error
     with sync_playwright() as playwright:
         found = [shutil.which(name) for name in BROWSERS]
@@ -68,7 +74,7 @@ def browser() -> Iterator[Any]:
         if path is None:
             raise InputError(
                 "pictures and films need Chromium, which is not installed",
-                remedy="Install your system's chromium, or run: playwright install chromium",
+                remedy="Install chromium from your system, or run: playwright install chromium",
             )
         chromium = playwright.chromium.launch(executable_path=path, args=list(BROWSER_OPTIONS))
         try:
@@ -78,10 +84,39 @@ def browser() -> Iterator[Any]:
 
 
 @contextmanager
-def _photographer(
-    solution: Playable, size: tuple[int, int], fps: float, drawn: dict[str, Any]
-) -> Iterator[Any]:
-    """A function from a time of the run (s) to a PNG."""
+def photographer(
+    solution: Playable,
+    size: tuple[int, int],
+    fps: float,
+    drawn: dict[str, Any],
+    times: Sequence[float],
+    chromium: Any = None,
+    style: str = BARE,
+) -> Iterator[Callable[[float], bytes]]:
+    """A function from a time of the run (s) to a PNG.
+
+    Parameters
+    ----------
+    solution
+        The run.
+    size
+        Width and height in pixels.
+    fps
+        Key frames per second; between them bodies go straight.
+    drawn
+        ``trace``, ``gaps`` and ``reactions`` of :func:`srm_mbs.playback.export_html`.
+    times
+        Those (s) of the pictures, which get key frames of their own.
+    chromium
+        A :func:`browser` that goes on being used; by default one of its own.
+    style
+        Added to that of the page.
+
+    Raises
+    ------
+    InputError
+        If ``size`` is none, something wanted cannot be drawn, or Chromium or playwright is missing.
+    """
     width, height = size
     if not (isinstance(width, int) and isinstance(height, int) and min(size) > 0):
         raise InputError(
@@ -89,13 +124,14 @@ def _photographer(
             element="size",
             remedy="Give for example size=(900, 600)",
         )
-    with tempfile.TemporaryDirectory() as folder, browser() as chromium:
+    own = browser() if chromium is None else nullcontext(chromium)
+    with tempfile.TemporaryDirectory() as folder, own as opened:
         file = Path(folder) / "page.html"
-        export_html(solution, file, fps=fps, panel=False, **drawn)
-        page = chromium.new_page(viewport={"width": width, "height": height})
+        write_page(page_of(solution, fps, Wanted(**drawn), panel=False, extra=times), file)
+        page = opened.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
-        page.add_style_tag(content=_BARE)
+        page.add_style_tag(content=style)
         start = solution.span[0]
 
         def photograph(t: float) -> bytes:
@@ -104,13 +140,17 @@ def _photographer(
             return picture
 
         yield photograph
+        page.close()
 
 
 def _written(path: Path, content: bytes) -> None:
     try:
         path.write_bytes(content)
     except OSError as error:
-        raise InputError(f"it cannot be written: {error.strerror}", file=str(path)) from error
+        raise InputError(
+            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
+        ) from error
+    log.info("written: %s", path)
 
 
 def export_image(
@@ -155,7 +195,7 @@ def export_image(
             element="t",
             remedy="Give a time of the run",
         )
-    with _photographer(solution, size, 60.0, drawn) as photograph:
+    with photographer(solution, size, 60.0, drawn, [t]) as photograph:
         _written(path, photograph(t))
 
 
@@ -197,38 +237,51 @@ def export_video(
     fps = check_fps(fps)
     if kind not in FILMS:
         raise InputError(
-            f"films are .gif or .mp4 files, not {path.suffix!r}", file=str(path), element="path"
+            f"films are .gif or .mp4 files, not {path.suffix!r}",
+            file=str(path),
+            element="path",
+            remedy="Name it .gif or .mp4",
         )
     if not (math.isfinite(speed) and speed > 0.0):
-        raise InputError(f"speed = {speed!r} is not a positive number", element="speed")
-    encoder = _encoder()
-    if kind == ".mp4" and encoder is None:
         raise InputError(
-            "an .mp4 needs the encoder ffmpeg, which is not installed",
-            file=str(path),
-            remedy="Install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
+            f"speed = {speed!r} is not a positive number",
+            element="speed",
+            remedy="Give a positive number: 1 is real time",
         )
+    encoder = encoder_of(path)
     start, end = solution.span
     count = max(1, math.floor((end - start) / speed * fps * (1.0 + 1e-12)) + 1)
-    times = start + np.arange(count) * (speed / fps)
-    with _photographer(solution, size, fps / min(speed, 1.0), drawn) as photograph:
-        pictures = [photograph(min(float(t), end)) for t in times]
-    if kind == ".gif":
+    times = np.minimum(start + np.arange(count) * (speed / fps), end).tolist()
+    with photographer(solution, size, fps / min(speed, 1.0), drawn, times) as photograph:
+        pictures = [photograph(t) for t in times]
+    if encoder is None:
         _written(path, _gif(pictures, fps))
     else:
-        _encode(str(encoder), pictures, fps, path)
+        _encode(encoder, pictures, fps, path)
 
 
-def _encoder() -> str | None:
-    """ffmpeg of the system, or the one that the package imageio-ffmpeg brings."""
+def encoder_of(film: Path) -> str | None:
+    """ffmpeg of the system, or the one that the package imageio-ffmpeg brings; None for a ``.gif``.
+
+    Raises
+    ------
+    InputError
+        If the film needs one and there is none.
+    """
+    if film.suffix.lower() == ".gif":
+        return None
     found = shutil.which("ffmpeg")
     if found is None:
         try:
             import imageio_ffmpeg
 
             found = imageio_ffmpeg.get_ffmpeg_exe()
-        except (ImportError, RuntimeError):
-            return None
+        except (ImportError, RuntimeError) as error:
+            raise InputError(
+                "an .mp4 needs the encoder ffmpeg, which is not installed",
+                file=str(film),
+                remedy="Install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
+            ) from error
     return str(found)
 
 
@@ -258,5 +311,8 @@ def _encode(encoder: str, pictures: Sequence[bytes], fps: float, path: Path) -> 
     if done.returncode:
         words = done.stderr.decode(errors="replace").strip().splitlines()
         raise InputError(
-            f"ffmpeg cannot write it: {words[-1] if words else done.returncode}", file=str(path)
+            f"ffmpeg cannot write it: {words[-1] if words else done.returncode}",
+            file=str(path),
+            remedy="Write a .gif, which needs no encoder",
         )
+    log.info("written: %s", path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,11 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.moving import turns_between
 from srm_mbs.overlays import Overlays, Wanted, joints_of, make_overlays, springs_of
+from srm_mbs.spans import loops_of, parts_of
 from srm_mbs.visuals import Visual, visuals_of
+from srm_mbs.workspaces import workspace
 
 if TYPE_CHECKING:
     from srm_mbs.motion import Playable
@@ -25,9 +29,15 @@ MAX_BODY_FRAMES = 30_000
 MIN_FPS = 10.0
 """Key frames per second below which the limit above is not kept: motion would look wrong."""
 
+BESIDE = 0.003
+"""Largest distance of a body from its place between key frames, over the size of the motion."""
+KEPT = 0.98
+"""Part of the key frames that keep to it."""
+
 FIELD_OF_VIEW = 25.0  # degrees, vertical: narrow, so that planar mechanisms look planar
 ASPECT = 1.5  # width by height of the window that the picture is made for
 FILLED = 0.84  # of the window
+SMALLEST = 1e-9  # distance of the camera (m) below which there is nothing to see
 SAMPLES = 300  # frames that are looked at to find the camera's place
 
 
@@ -43,7 +53,8 @@ class Motion:
     joints
         Indices of the joints that carry the bodies, k of them.
     times : (n,) s
-        Uniform, from the start to the end of the run; one only if the run has no length.
+        From the start to the end of the run, uniform but for those that were asked for; one only if
+        the run has no length.
     positions : (n, k, 3) m
         Origins of the joint frames in the world.
     quaternions : (n, k, 4)
@@ -62,11 +73,21 @@ class Motion:
             return 1.0
         return float((len(self.times) - 1) / (self.times[-1] - self.times[0]))
 
+    @property
+    def frames(self) -> list[float]:
+        """``times`` counted in :attr:`rate`: 0, 1, 2 ... if they are uniform."""
+        numbers = ((self.times - self.times[0]) * self.rate).round(6).tolist()
+        return [int(number) if number.is_integer() else number for number in numbers]
+
 
 def sample_motion(
-    solution: Playable, joints: tuple[int, ...], fps: float, others: int = 0
+    solution: Playable,
+    joints: tuple[int, ...],
+    fps: float,
+    others: int = 0,
+    extra: Iterable[float] = (),
 ) -> Motion:
-    """Forward kinematics of the dense output at uniform times.
+    """Forward kinematics of the dense output at uniform times, and at ``extra`` ones.
 
     Parameters
     ----------
@@ -75,38 +96,83 @@ def sample_motion(
     joints
         Indices of joints of its model.
     fps
-        Wanted key frames per second.  There are fewer if otherwise all bodies together had more
+        Wanted key frames per second.  There are more if otherwise bodies, which go straight
+        between them, left their paths (:data:`BESIDE`), and fewer if all bodies together had more
         than :data:`MAX_BODY_FRAMES`, but at least :data:`MIN_FPS` or ``fps``, the smaller one.
     others
         Number of other things that have as many key frames.
+    extra
+        Times (s) in the run at which bodies are in their place exactly.
     """
     start, end = solution.span
     duration = end - start
     wanted = duration * fps * (1.0 - 1e-12)  # rounding must not add one to a whole number
     count = max(1, len(joints) + others)
-    allowed = max(MAX_BODY_FRAMES // count, math.ceil(MIN_FPS * duration))
+    allowed = max(MAX_BODY_FRAMES // count, math.ceil(min(MIN_FPS, fps) * duration))
     intervals = math.ceil(min(wanted, allowed))
-    if wanted > allowed:
+    motion, needed = _sampled(solution, joints, np.linspace(start, end, intervals + 1))
+    parts = 1  # of each interval: the key frames that were wanted stay
+    while intervals and parts < min(math.ceil(needed / intervals), allowed // intervals):
+        parts = min(math.ceil(needed / intervals), allowed // intervals)
+        times = np.linspace(start, end, parts * intervals + 1)
+        motion, needed = _sampled(solution, joints, times)
+    if max(wanted, needed) > allowed:
         log.info(
-            "%d bodies over %g s: %.3g key frames per second instead of %g",
+            "%d bodies over %g s: %.3g key frames per second instead of %.3g",
             count,
             duration,
-            intervals / duration,
-            fps,
+            motion.rate,
+            max(wanted, needed) / duration,
         )
-    times = np.linspace(start, end, intervals + 1)
+    times = motion.times
+    apart = [t for t in extra if np.abs(times - t).min() * motion.rate > 1e-6]
+    if not apart:
+        return motion
+    return _sampled(solution, joints, np.union1d(times, apart))[0]
+
+
+def _sampled(solution: Playable, joints: tuple[int, ...], times: FloatArray) -> tuple[Motion, int]:
+    """The motion at ``times`` (n,) s, and the number of intervals that it needs."""
     model = solution.mechanism.model
-    data = model.createData()
+    data = workspace(model)
     placements = np.empty((len(times), len(joints), 7))
-    for i, q in enumerate(solution(times)[0]):
-        pin.forwardKinematics(model, data, q)
+    rates = np.empty((len(times), len(joints), 6))
+    for i, (q, v) in enumerate(zip(*solution(times))):
+        pin.forwardKinematics(model, data, q, v)
         for k, joint in enumerate(joints):
             placements[i, k] = pin.SE3ToXYZQUAT(data.oMi[joint])
+            rates[i, k] = pin.getVelocity(model, data, joint, pin.LOCAL_WORLD_ALIGNED).vector
     quaternions = placements[:, :, 3:]
     # q and -q are the same rotation: take the one near its predecessor.
     flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=2) < 0.0, -1.0, 1.0)
     quaternions[1:] *= np.cumprod(flips, axis=0)[:, :, None]
-    return Motion(joints, times, placements[:, :, :3], quaternions)
+    motion = Motion(joints, times, placements[:, :, :3], quaternions)
+    excess = _beside(motion, rates) / BESIDE
+    intervals = len(times) - 1
+    # The distance falls with the square of the interval, once these are short.
+    return motion, math.ceil(intervals * min(math.sqrt(excess), 4.0)) if excess > 1.0 else intervals
+
+
+def _beside(motion: Motion, rates: FloatArray) -> float:
+    """How far bodies are beside their places between the key frames, over the size of the motion.
+
+    The larger of distance and turn (rad).  All but a few intervals keep to it, so that a jolt does
+    not ask for many.  ``rates`` (n, k, 6) of the joint frames (m/s, rad/s, world axes) show turns
+    that key frames miss: one and a half between two of them looks like a half.
+    """
+    if not rates[1:].size:
+        return 0.0
+    h = np.diff(motion.times)[:, None, None]
+    places, quaternions = motion.positions, motion.quaternions
+    chords = np.zeros((len(h), rates.shape[1], 6))
+    size = float(np.ptp(places.reshape(-1, 3), axis=0).max())
+    chords[:, :, :3] = np.diff(places, axis=0) / h
+    chords[:, :, 3:] = turns_between(quaternions[:-1], quaternions[1:]) / h
+    # A cubic that leaves a chord of length h with slope d at both ends is h d / 4 beside it.
+    off = 0.25 * h[:, :, 0, None] * np.maximum(abs(rates[:-1] - chords), abs(rates[1:] - chords))
+    distances = np.linalg.norm(off[:, :, :3], axis=2) / (size or 1.0)
+    turns = np.linalg.norm(off[:, :, 3:], axis=2)
+    return float(np.quantile(np.maximum(distances, turns).max(axis=1), KEPT))
 
 
 # Camera -------------------------------------------------------------------------------------
@@ -147,13 +213,14 @@ def choose_view(mechanism: Mechanism, points: FloatArray) -> View:
     offsets = seen - centre
     slope = FILLED * math.tan(math.radians(0.5 * FIELD_OF_VIEW))
     needed = np.abs(offsets[:, :2]) / [slope * ASPECT, slope] - offsets[:, 2:]
-    return View(centre @ axes, axes, max(float(needed.max()), 1e-3))
+    distance = float(needed.max())
+    return View(centre @ axes, axes, distance if distance > SMALLEST else 1.0)
 
 
 def _view_direction(mechanism: Mechanism) -> FloatArray:
     """Unit vector from the camera to the mechanism."""
     model = mechanism.model
-    jacobian = pin.computeJointJacobians(model, model.createData(), np.array(mechanism.q0))
+    jacobian = pin.computeJointJacobians(model, workspace(model), np.array(mechanism.q0))
     size = np.abs(jacobian).max(initial=0.0)
     for normal, forward in ((1, (0.0, 1.0, 0.0)), (2, (0.0, 0.0, -1.0)), (0, (-1.0, 0.0, 0.0))):
         # Planar: no joint moves along the normal, or turns about anything else.
@@ -190,10 +257,13 @@ class Picture:
     view: View
 
 
-def make_picture(solution: Playable, fps: float, wanted: Wanted) -> Picture:
+def make_picture(
+    solution: Playable, fps: float, wanted: Wanted, extra: Iterable[float] = ()
+) -> Picture:
     """Key frames of everything that is drawn of ``solution``.
 
-    ``fps`` is the wanted number of key frames per second (:func:`sample_motion`).
+    ``fps`` is the wanted number of key frames per second, and ``extra`` are times that get one
+    (:func:`sample_motion`).
 
     Raises
     ------
@@ -201,12 +271,13 @@ def make_picture(solution: Playable, fps: float, wanted: Wanted) -> Picture:
         If what is ``wanted`` cannot be drawn.
     """
     mechanism = solution.mechanism
-    wanted.check(mechanism)
-    visuals = visuals_of(mechanism)
-    joints = {visual.joint for visual in visuals} - {0} | joints_of(mechanism, wanted)
-    loops = len(mechanism.loops) * (2 * wanted.gaps + 2 * wanted.reactions)
-    others = 2 * len(springs_of(mechanism)) + len(wanted.trace) + loops
-    motion = sample_motion(solution, tuple(sorted(joints)), fps, others)
+    wanted.check(*(part for part, _ in parts_of(solution)))
+    loops = loops_of(solution)
+    visuals = visuals_of(mechanism, loops)
+    joints = {visual.joint for visual in visuals} - {0} | joints_of(solution, wanted)
+    others = 2 * len(springs_of(solution)) + len(wanted.trace)
+    others += len(loops) * (2 * wanted.gaps + 2 * wanted.reactions)
+    motion = sample_motion(solution, tuple(sorted(joints)), fps, others, extra)
     points = seen_points(visuals, motion)
     extent = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
     overlays = make_overlays(solution, wanted, motion, extent)

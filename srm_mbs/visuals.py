@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,10 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.loading.safe_xml import parse_urdf
+from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.spans import Spans
+from srm_mbs.workspaces import workspace
 
 log = logging.getLogger(__name__)
 
@@ -104,12 +107,15 @@ class Visual:
         Of the shape in the joint's frame.
     colour
         Red, green, blue and opacity, 0 to 1.
+    spans
+        When it is there (s); None for always.
     """
 
     joint: int
     placement: pin.SE3
     shape: Shape
     colour: Colour
+    spans: Spans | None = None
 
     def corners(self) -> FloatArray:
         """Corners (8, 3) m of its bounding box, in the joint's frame."""
@@ -119,14 +125,23 @@ class Visual:
         return np.asarray(corners @ self.placement.rotation.T + self.placement.translation)
 
 
-def visuals_of(mechanism: Mechanism) -> list[Visual]:
+def visuals_of(
+    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, Spans | None]] | None = None
+) -> list[Visual]:
     """Shapes of ``mechanism``: those of its URDF or, if there are none, bars.
+
+    ``loops`` are the closures whose anchors the bars reach and mark, with when they are there;
+    those of ``mechanism`` by default.
 
     Mesh files are looked for beside the URDF, in the folders above it (``package://``), and in
     the data of ``example-robot-data``; one that cannot be read is left out with a warning.
     """
     found = list(_urdf_visuals(mechanism))
-    return found or _skeleton(mechanism)
+    if found:
+        return found
+    return _skeleton(
+        mechanism, [(loop, None) for loop in mechanism.loops] if loops is None else loops
+    )
 
 
 # The URDF -----------------------------------------------------------------------------------
@@ -167,7 +182,10 @@ def _numbers(element: Element, key: str, default: str) -> list[float]:
         values = []
     count = len(default.split())
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"<{element.tag} {key}={text!r}> needs {count} finite number(s)")
+        raise InputError(
+            f"<{element.tag} {key}={text!r}> is not {count} finite number(s)",
+            remedy=f"Write {count} number(s)",
+        )
     return values
 
 
@@ -201,7 +219,7 @@ def _shape(visual: Element, meshes: _MeshFiles) -> Shape:
     """The shape of a ``<visual>``; raises InputError if it cannot be drawn."""
     element = visual.find("geometry/*")
     if element is None:
-        raise InputError("it has no geometry")
+        raise InputError("it has no geometry", remedy="Add <geometry>")
     match element.tag:
         case "box":
             x, y, z = _numbers(element, "size", "0 0 0")
@@ -216,7 +234,9 @@ def _shape(visual: Element, meshes: _MeshFiles) -> Shape:
             scale = np.array(_numbers(element, "scale", "1 1 1"))
             return meshes.read(element.get("filename", ""), scale)
         case tag:
-            raise InputError(f"its geometry is {tag!r}, not box, cylinder, sphere or mesh")
+            raise InputError(
+                f"there is no geometry {tag!r}", remedy="Known: box, cylinder, sphere, mesh"
+            )
 
 
 class _MeshFiles:
@@ -239,7 +259,7 @@ class _MeshFiles:
         for candidate in candidates:
             if candidate.is_file():
                 return candidate
-        raise InputError(f"there is no mesh file {name!r}")
+        raise InputError(f"there is no mesh file {name!r}", remedy="Check the path")
 
     def read(self, name: str, scale: FloatArray) -> Mesh:
         """Triangles of the mesh ``name`` in metres.
@@ -259,9 +279,14 @@ class _MeshFiles:
             faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.uint32)
             vertices = np.array(mesh.vertices(), dtype=float)
         except Exception as error:  # Boost.Python raises whatever the C++ reader throws
-            raise InputError(f"the mesh file {str(path)!r} cannot be read: {error}") from error
+            raise InputError(
+                f"the mesh file {str(path)!r} cannot be read: {error}",
+                remedy="Give an STL, OBJ or DAE file",
+            ) from error
         if not len(faces):
-            raise InputError(f"the mesh file {str(path)!r} holds no triangles")
+            raise InputError(
+                f"the mesh file {str(path)!r} holds no triangles", remedy="Give one with triangles"
+            )
         return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3))
 
 
@@ -276,14 +301,16 @@ def _robot_data() -> list[Path]:
 # Bars ---------------------------------------------------------------------------------------
 
 
-def _skeleton(mechanism: Mechanism) -> list[Visual]:
+def _skeleton(
+    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, Spans | None]]
+) -> list[Visual]:
     """Bars from each joint to the joints and loop anchors behind it, and markers at them."""
     model = mechanism.model
     ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
     for joint in range(1, model.njoints):
         ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
-    anchors = [side.resolve(model) for loop in mechanism.loops for side in loop.anchors]
-    for joint, placement in anchors:
+    anchors = [(*side.resolve(model), spans) for loop, spans in loops for side in loop.anchors]
+    for joint, placement, _ in anchors:
         ends[joint].append(placement.translation)
     # The last body of a chain ends in its centre of mass, for want of anything else.
     masses = [
@@ -310,9 +337,9 @@ def _skeleton(mechanism: Mechanism) -> list[Visual]:
         centre = pin.SE3(np.eye(3), model.inertias[joint].lever)
         colour = _default_colour(joint)
         out.append(Visual(joint, centre, Sphere(1.5 * width), colour))
-    for joint, placement in anchors:
+    for joint, placement, spans in anchors:
         if joint:
-            out.append(Visual(joint, placement, Sphere(0.9 * width), ANCHOR_COLOUR))
+            out.append(Visual(joint, placement, Sphere(0.9 * width), ANCHOR_COLOUR, spans))
     for end in ends[0]:
         block = Box((2.0 * width,) * 3)
         out.append(Visual(0, pin.SE3(np.eye(3), end), block, GROUND_COLOUR))
@@ -321,7 +348,7 @@ def _skeleton(mechanism: Mechanism) -> list[Visual]:
 
 def _extent(mechanism: Mechanism, ends: list[list[FloatArray]]) -> float:
     """Diagonal (m) of the box around all joints and bar ends at the initial configuration."""
-    data = mechanism.model.createData()
+    data = workspace(mechanism.model)
     pin.forwardKinematics(mechanism.model, data, np.array(mechanism.q0))
     points = [data.oMi[joint].act(end) for joint, own in enumerate(ends) for end in own]
     points += [data.oMi[joint].translation for joint in range(1, mechanism.model.njoints)]
@@ -340,8 +367,9 @@ def _marker(mechanism: Mechanism, joint: int, width: float) -> Visual:
     model = mechanism.model
     kind = model.joints[joint]
     # The joint moves itself only by its own columns, which are constant for a hinge or a slide.
-    jacobian = pin.computeJointJacobian(model, model.createData(), np.array(mechanism.q0), joint)
-    linear, angular = np.split(jacobian[:, kind.idx_v], 2)
+    jacobian = pin.computeJointJacobian(model, workspace(model), np.array(mechanism.q0), joint)
+    # With one column it comes as a vector.
+    linear, angular = np.split(jacobian.reshape(6, model.nv)[:, kind.idx_v], 2)
     if kind.nv == 1 and np.any(angular):
         hinge = Cylinder(0.8 * width, 2.4 * width)
         return Visual(joint, _along(np.zeros(3), angular), hinge, PIN_COLOUR)

@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 import srm_mbs as srm
 from srm_mbs.cli import app
 from srm_mbs.live import SHARE
+from srm_mbs.systems.driven import constraint_errors
+from srm_mbs.systems.multibody import make_system
 from tests.browsing import opened
 
 BODY = """name => {
@@ -39,16 +41,51 @@ def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
     ):
         assert page.locator("#bar").is_visible() is False
         for t in (0.4, 1.1):
-            view.send(t, solution(t)[0])
+            view.send(t, np.concatenate(solution(t)))
             page.wait_for_function(f"element('panel').innerText.includes('{t:.3f}')")
             pin.forwardKinematics(mechanism.model, data, solution(t)[0])
             for joint, name in enumerate(mechanism.joint_names, 1):
                 found = np.array(page.evaluate(BODY, name)).reshape(4, 4).T
                 assert np.abs(found - data.oMi[joint].homogeneous).max() < 1e-9
-        view.play(solution)
+        view.play(solution, reactions=True)
         page.wait_for_function("animator.playing && animator.time > 0.1")
         assert page.evaluate("animator.duration") == pytest.approx(1.5, rel=1e-6)
         page.wait_for_function("!element('bar').hidden")
+        # What there is to say about the whole run has come with it.
+        words = page.locator("#panel").inner_text()
+        assert "sigma" in words
+        assert "force in the closures" in words
+
+
+@pytest.mark.browser
+def test_the_live_panel_has_the_drift_and_the_energy_since_the_first_step(browser: Any) -> None:
+    mechanism = srm.load("four_bar")
+    solution = srm.simulate(mechanism, 1.5, rtol=1e-4)
+    read = solution.at([0.1, 1.1])
+    # Off the closures, as far as none of the run is: the digits are those of the error.
+    apart = np.concatenate([read.q[1] + [0.0, 0.0, 1e-3], read.v[1]])
+    with (
+        srm.LiveView(mechanism, open_browser=False) as view,
+        opened(browser, view.visualizer.url()) as page,
+    ):
+        view(0.1, 0.1, np.concatenate([read.q[0], read.v[0]]))
+        for state in (np.concatenate([read.q[1], read.v[1]]), apart):
+            view.send(1.1, state)
+            q, v = state[None, :3], state[None, 3:]
+            g = constraint_errors(mechanism, np.array([1.1]), q, v)[0]
+            change = make_system(mechanism).energy(state) - read.energy[0]
+            page.wait_for_function(
+                """([drift, change]) => {
+                  const rows = document.querySelectorAll("#panel tr");
+                  if (rows.length !== 3 || rows[0].cells[1].textContent !== "1.100") return false;
+                  const read = row => +row.cells[1].textContent.replace("\u2212", "-")
+                    .replace("e\u2212", "e-");
+                  const close = (a, b) => Math.abs(a - b) <= 6e-3 * Math.abs(b);
+                  return close(read(rows[1]), drift) && close(read(rows[2]), change);
+                }""",
+                arg=[float(np.linalg.norm(g)), float(change)],
+            )
+        assert page.locator("#panel tr").all_inner_texts()[1].endswith("m")
 
 
 @pytest.mark.parametrize("backend", ["auto", "python"])

@@ -3,6 +3,18 @@
 const SPEEDS = [0.01, 0.1, 0.25, 0.5, 1, 2, 4];
 
 var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
+// A run that is computed comes as one transform, for a node of its own: a block of 4 x 4 with the
+// time and the values for the panel in its first column, and one for each body.
+let state = [0];
+const set_transform = viewer.set_transform;
+viewer.set_transform = (path, matrix) => {
+  if (path.length !== 1 || path[0] !== "live") return set_transform.call(viewer, path, matrix);
+  state = matrix.slice(0, 3);
+  about.live?.forEach((name, i) => {
+    set_transform.call(viewer, ["mechanism", name], matrix.slice(16 * (i + 1), 16 * (i + 2)));
+  });
+};
+
 if (scene === null) viewer.connect();
 else for (const text of scene) {
   const bytes = atob(text), buffer = new Uint8Array(bytes.length);
@@ -10,36 +22,52 @@ else for (const text of scene) {
   viewer.handle_command_bytearray(buffer);
 }
 
-// The picture is made for one shape of window: step back in a narrower one.
-function step_back() {
-  const narrow = about.aspect * window.innerHeight / window.innerWidth;
-  if (narrow > 1) viewer.camera.position.multiplyScalar(narrow);
-}
-
 const element = (id) => document.getElementById(id);
 const animator = viewer.animator, slider = element("time"), clock = document.querySelector("output");
 
+// The picture is made for one shape of window: step back in a narrower one.
+const pane = element("meshcat-pane");
+pane.setAttribute("aria-label", document.title);
+const set_size = viewer.set_3d_pane_size;  // of itself it takes the height of the window
+viewer.set_3d_pane_size = () => set_size.call(viewer, pane.clientWidth, pane.clientHeight);
+new ResizeObserver(() => viewer.set_3d_pane_size()).observe(pane);
+let away = 1;
+function step_back() {
+  const wanted = Math.max(1, about.aspect * pane.clientHeight / pane.clientWidth);
+  if (Math.abs(wanted - away) < 1e-3) return;
+  viewer.camera.position.multiplyScalar(wanted / away);
+  away = wanted;
+  viewer.set_dirty();
+}
+
 // Panel: time, and the values of the run there, interpolated between their samples.
-const cells = [];
+let cells = [];
 function add_row(label, unit) {
   const row = document.querySelector("#panel table").insertRow();
   for (const text of [label, "", unit]) row.insertCell().textContent = text;
   cells.push(row.cells[1]);
 }
-if (about.panel) add_row("t", "s");
-for (const value of about.values) add_row(value.label, value.unit);
-for (const note of about.notes) {
-  const text = element("notes").appendChild(document.createElement("div"));
-  text.textContent = note.text;
-  if (!note.ramp) continue;
-  const ramp = element("notes").appendChild(document.createElement("div"));
-  ramp.className = "ramp";
-  ramp.style.background = `linear-gradient(to right, ${note.ramp.join(", ")})`;
-  const ends = element("notes").appendChild(document.createElement("div"));
-  ends.className = "ends";
-  for (const end of note.ends) ends.appendChild(document.createElement("span")).textContent = end;
+function fill_panel() {
+  cells = [];
+  document.querySelector("#panel table").replaceChildren();
+  element("notes").replaceChildren();
+  element("name").textContent = document.title;
+  if (about.panel) add_row("t", "s");
+  for (const value of about.values) add_row(value.label, value.unit);
+  for (const note of about.notes) {
+    const text = element("notes").appendChild(document.createElement("div"));
+    text.textContent = note.text;
+    if (!note.ramp) continue;
+    const ramp = element("notes").appendChild(document.createElement("div"));
+    ramp.className = "ramp";
+    ramp.style.background = `linear-gradient(to right, ${note.ramp.join(", ")})`;
+    const ends = element("notes").appendChild(document.createElement("div"));
+    ends.className = "ends";
+    for (const end of note.ends) ends.appendChild(document.createElement("span")).textContent = end;
+  }
+  element("panel").hidden = !about.panel && !about.notes.length;
 }
-element("panel").hidden = !about.panel && !about.notes.length;
+fill_panel();
 
 function value_at(samples, time) {
   const times = about.times;
@@ -77,7 +105,6 @@ function seek(time) {
   animator.display_progress(time);
 }
 slider.oninput = () => seek(+slider.value);
-element("toggle").onclick = () => animator.playing ? animator.pause() : animator.play();
 element("speed").onchange = () => { animator.mixer.timeScale = +element("speed").value; };
 element("loop").onchange = () => {
   for (const action of animator.actions) {
@@ -86,6 +113,29 @@ element("loop").onchange = () => {
   }
 };
 
+function toggle() {
+  if (animator.playing) animator.pause(); else animator.play();
+}
+element("toggle").onclick = toggle;
+
+// Keys, wherever the focus is; those that its own element takes are left to it.
+const SEEKS = {
+  ArrowLeft: () => animator.time - animator.duration / 100,
+  ArrowRight: () => animator.time + animator.duration / 100,
+  Home: () => 0,
+  End: () => animator.duration,
+};
+document.addEventListener("keydown", (event) => {
+  const own = event.target.closest("button, select, input, .dg");
+  if (animator.duration === 0 || event.ctrlKey || event.altKey || event.metaKey) return;
+  if (own && own !== slider && (own.tagName !== "BUTTON" || event.key === " ")) return;
+  if (event.key === " ") toggle();
+  else if (event.key in SEEKS) {
+    seek(Math.min(Math.max(SEEKS[event.key](), 0), animator.duration));
+  } else return;
+  event.preventDefault();
+});
+
 let laid_out = null;
 // The animation comes with the scene, or later from the server.
 function lay_out() {
@@ -93,29 +143,45 @@ function lay_out() {
   element("bar").hidden = animator.duration === 0;
   slider.max = animator.duration;
   element("marks").replaceChildren(...about.passages.map(({ time, text }) => {
-    const mark = document.createElement("span");
+    const mark = document.createElement("button");
     mark.style.left = `${100 * (time - about.start) / animator.duration}%`;
     mark.title = text;
+    mark.setAttribute("aria-label", text);
     mark.onclick = () => seek(time - about.start);
     return mark;
   }));
   element("speed").onchange();
-  if (scene !== null || animator.duration > 0) step_back();
+  element("loop").onchange();
+  if (scene === null) away = 1;  // the camera's place has come with the animation
+}
+
+// A page that follows a run is told by the server what there is to say about it in the end.
+let told;
+function listen() {
+  const news = viewer.scene_tree.find(["about"]).object.about;
+  if (news === undefined || news === told) return;
+  told = news;
+  about = { ...JSON.parse(news), live: [] };
+  fill_panel();
+  laid_out = null;
 }
 
 (function show() {
+  if (about.live) listen();
   if (laid_out !== animator.actions) lay_out();
   slider.value = animator.time;
   element("toggle").textContent = animator.playing ? "Pause" : "Play";
   const digits = animator.duration > 0 && animator.duration < 1 ? 4 : 2;
   clock.value = `${animator.time.toFixed(digits)} / ${animator.duration.toFixed(digits)} s`;
-  // While a run is computed there is no animation, and the server moves this node with the time.
+  slider.setAttribute("aria-valuetext", clock.value);
+  // While a run is computed there is no animation.
   const computed = about.live && animator.duration === 0;
-  const time = computed ? viewer.scene_tree.find(["live"]).object.position.x
-    : about.start + animator.time;
+  const time = computed ? state[0] : about.start + animator.time;
+  if (scene !== null || animator.duration > 0 || time > 0) step_back();
   if (about.panel) cells[0].textContent = time.toFixed(digits + 1);
   about.values.forEach((value, i) => {
-    cells[i + 1].textContent = shown(value_at(value.samples, time));
+    const here = computed ? state[value.live] ?? null : value_at(value.samples, time);
+    cells[i + 1].textContent = shown(here);
   });
   requestAnimationFrame(show);
 })();

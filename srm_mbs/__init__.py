@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from srm_mbs.actions import Event, Switch, impact
+    from srm_mbs.analysis.certificate import Certificate, certify
     from srm_mbs.analysis.energy_balance import EnergyBalance
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
     from srm_mbs.analysis.following import FollowedPath, follow
@@ -75,6 +76,7 @@ _HOME = {
     "Bushing": "forces",
     "ButcherTableau": "methods.butcher",
     "CLOSURE_TYPES": "closures",
+    "Certificate": "analysis.certificate",
     "ConstantSpeed": "laws",
     "DaeSolution": "dae_solution",
     "Drive": "drives",
@@ -118,6 +120,7 @@ _HOME = {
     "assembly_modes": "analysis.modes",
     "backend": "kernel",
     "bundled_models": "loading",
+    "certify": "analysis.certificate",
     "convert": "loading.converting",
     "equilibrium": "analysis.equilibrium",
     "follow": "analysis.following",
@@ -149,6 +152,7 @@ __all__ = [
     "AssemblyMode",
     "Bushing",
     "ButcherTableau",
+    "Certificate",
     "ConstantSpeed",
     "DaeSolution",
     "Drive",
@@ -187,6 +191,7 @@ __all__ = [
     "assembly_modes",
     "backend",
     "bundled_models",
+    "certify",
     "closures_from_pinocchio",
     "convert",
     "equilibrium",

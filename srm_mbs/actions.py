@@ -13,6 +13,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.options import numbers
 from srm_mbs.systems.multibody import make_system
+from srm_mbs.workspaces import workspace
 
 
 class Event:
@@ -74,6 +75,10 @@ class Switch:
         By default as they are.  The positions must satisfy its closures, but for the tolerance of
         the run.  The velocities are projected on them, M-orthogonally: constraint impulses act, as
         in an inelastic impact, and nothing else.
+
+    Drives that the mechanism had go on.  A new one engages: its law counts in the time of the run,
+    from the position in which it finds its coordinate, s(t) = s(t_s) + law(t) - law(t_s); an
+    absolute one must find it where it prescribes it.
     """
 
     mechanism: Mechanism
@@ -114,20 +119,27 @@ def impact(
 
     if not 0.0 <= restitution <= 1.0:
         raise InputError(
-            f"restitution = {restitution!r} is not between 0 and 1", element="restitution"
+            f"restitution = {restitution!r} is not between 0 and 1",
+            element="restitution",
+            remedy="Give 0 (nothing springs back) to 1 (all of it)",
         )
     here = mechanism.with_state(q, v)
-    n = numbers(normal, "normal", f"Give {here.model.nv} numbers")
+    remedy = f"Give {here.model.nv} numbers"
+    n = numbers(normal, "normal", remedy)
     if n.shape != here.v0.shape:
-        raise InputError(f"normal has shape {n.shape}, not {here.v0.shape}", element="normal")
-    M = pin.crba(here.model, here.model.createData(), here.q0, pin.Convention.WORLD)
+        raise InputError(
+            f"normal has shape {n.shape}, not {here.v0.shape}", element="normal", remedy=remedy
+        )
+    M = pin.crba(here.model, workspace(here.model), here.q0, pin.Convention.WORLD)
     along = np.linalg.solve(np.triu(M) + np.triu(M, 1).T, n)
     terms = make_system(here).evaluate(0.0, np.concatenate([here.q0, here.v0]))
     free = along - terms.project(along)
     gain = float(n @ free)
     if not gain > 1e-12 * float(n @ along):
         raise InputError(
-            "the closures do not let the mechanism move along this normal", element="normal"
+            "the closures do not let the mechanism move along this normal",
+            element="normal",
+            remedy="Give the gradient of the gap, which some motion of the mechanism changes",
         )
     out: FloatArray = here.v0 - (1.0 + restitution) * float(n @ here.v0) / gain * free
     return out

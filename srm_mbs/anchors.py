@@ -113,6 +113,24 @@ class Anchor:
         return int(frame.parentJoint), frame.placement * offset
 
 
+def name_places(element: str, *anchors: Any) -> list[str]:
+    """Links or frames of the anchors that are given; None stands for no anchor.
+
+    Raises
+    ------
+    InputError
+        About the ``element`` if one is no anchor.
+    """
+    for anchor in anchors:
+        if not isinstance(anchor, Anchor | None):
+            raise InputError(
+                f"{anchor!r} is not an anchor",
+                element=element,
+                remedy='Give for example srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))',
+            )
+    return [anchor.where for anchor in anchors if anchor is not None]
+
+
 def resolve_apart(
     model: pin.Model, a: Anchor, b: Anchor, element: str
 ) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
@@ -138,3 +156,38 @@ def resolve_apart(
             "(locked and fixed joints join bodies)",
         )
     return resolved[0], resolved[1]
+
+
+def resolve_moving(
+    model: pin.Model, anchors: Sequence[Anchor], element: str
+) -> list[tuple[int, pin.SE3]]:
+    """Points that have a path, each as in :meth:`Anchor.resolve`.
+
+    Raises
+    ------
+    InputError
+        About ``element`` if one is no anchor, is not there, or lies on the ground.
+    """
+    if isinstance(anchors, Anchor):
+        raise InputError(f"{element} is one anchor", element=element, remedy="Give a list of them")
+    found = []
+    for anchor in anchors:
+        if not isinstance(anchor, Anchor):
+            raise InputError(
+                f"{anchor!r} is not a point of a link",
+                element=element,
+                remedy='Give for example srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))',
+            )
+        try:
+            joint, placement = anchor.resolve(model)
+        except InputError as error:
+            error.element = element
+            raise
+        if joint == 0:
+            raise InputError(
+                f"{anchor.where!r} lies on the ground and has no path",
+                element=element,
+                remedy="Name a point of a link that moves",
+            )
+        found.append((joint, placement))
+    return found

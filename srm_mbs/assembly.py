@@ -5,6 +5,7 @@ Positions come from :mod:`srm_mbs.closing`, rates from :mod:`srm_mbs.consistent_
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,10 @@ from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.joint_limits import beyond_limits, close_within_limits
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.driven import DriveRows
+from srm_mbs.systems.ranks import null_basis
 from srm_mbs.systems.singular import SINGULAR
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,14 +203,20 @@ def assemble(
         closed[own] = start[own]
     consistent = consistent_rates(mechanism, problem, closed, rates, held_rates)
     drives = DriveRows(mechanism, problem, closed)
-    _, singular, right = np.linalg.svd(np.concatenate([problem.normalised(closed), drives.rows]))
+    free = null_basis(np.concatenate([problem.normalised(closed), drives.rows]), SINGULAR)
     residuals, rate_residuals = mechanism.with_state(closed, consistent).initial_errors
-    rank = int(np.sum(singular > SINGULAR))
+    log.debug(
+        "%s: assembled with %s held, closed to %.1e, %d directions free",
+        mechanism.name,
+        ", ".join(held) or "no joint",
+        np.abs(residuals).max(initial=0.0),
+        free.shape[1],
+    )
     return Assembly(
         closed,
         consistent,
         residuals,
         rate_residuals,
-        problem.unit[:, None] * right[rank:].T,
-        model.nv - rank > mechanism.degrees_of_freedom,
+        problem.unit[:, None] * free,
+        free.shape[1] > mechanism.degrees_of_freedom,
     )

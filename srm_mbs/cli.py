@@ -1,7 +1,7 @@
 """The command line ``srm-mbs``: thin, every command calls the package and prints.
 
 Everything slow is imported inside the commands, so that ``srm-mbs --help`` answers at once.
-Exit status: 0; 1 when a run did not reach its end; 2 for bad input.
+Exit status: 0; 1 when a run or a search did not reach its end; 2 for bad input.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 import srm_mbs
-from srm_mbs import cli_analysis, cli_playback
+from srm_mbs import cli_analysis, cli_playback, cli_plots, cli_report
 from srm_mbs.cli_output import (
     BAD_INPUT,
     RUN_FAILED,
     Lines,
     Model,
-    Run,
     check_output,
     reported,
     table,
@@ -43,6 +42,7 @@ from srm_mbs.cli_playback import (
     Trace,
     Video,
     check_pictures,
+    check_time,
     drawn,
     live_view,
     play_run,
@@ -55,7 +55,7 @@ T_END, RTOL = 10.0, 1e-6
 app = typer.Typer(
     name="srm-mbs",
     help="Simulate closed-loop mechanisms without drift and through singular configurations.",
-    epilog="Exit status: 0; 1 if a run did not reach its end; 2 for bad input.",
+    epilog="Exit status: 0; 1 if a run or a search did not reach its end; 2 for bad input.",
     no_args_is_help=True,
     add_completion=False,
     # Plain help and usage errors: rich would draw boxes into pipes, and eat "[simulation]".
@@ -103,27 +103,34 @@ def simulate(
         float | None,
         typer.Option(
             metavar="S",
-            help=f"End of the run (s). Default: the description's, else {T_END:g}.",
+            help="End of the run (s).",
+            show_default=f"the description's, else {T_END:g}",
         ),
     ] = None,
     method: Annotated[str, typer.Option(metavar="NAME", help="Integration method.")] = "psrm",
     tableau: Annotated[
-        str, typer.Option(metavar="NAME", help="Runge-Kutta scheme of the method.")
-    ] = "dop853",
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Runge-Kutta scheme of the method.",
+            show_default="the method's: dop853 with psrm, tvd32 with srm",
+        ),
+    ] = None,
     rtol: Annotated[
         float | None,
         typer.Option(
             metavar="R",
             help="Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
-            f"1e-4 with srm). Default: the description's, else {RTOL:g}.",
+            "1e-4 with srm).",
+            show_default="the description's, else 1e-6",
         ),
     ] = None,
     atol: Annotated[
         float | None,
         typer.Option(
             metavar="A",
-            help="Absolute tolerance of every coordinate. Default: the description's, else rtol "
-            "times the unit of each coordinate.",
+            help="Absolute tolerance of every coordinate.",
+            show_default="the description's, else rtol times the unit of each coordinate",
         ),
     ] = None,
     step: Annotated[
@@ -132,14 +139,14 @@ def simulate(
     ] = None,
     backend: Annotated[
         str,
-        typer.Option(metavar="auto|python|kernel", help="What computes the run."),
+        typer.Option(metavar="auto|python|kernel", help="Backend that computes the run."),
     ] = "auto",
     out: Annotated[
         Path | None, typer.Option(metavar="RUN.npz", help="Save the run, for plot and play.")
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Plot the run; the suffix is .png, .pdf or .svg."),
+        typer.Option(metavar="FILE", help="Plot the run as .png, .pdf or .svg."),
     ] = None,
     csv: Annotated[
         Path | None,
@@ -171,22 +178,24 @@ def simulate(
     if out is not None:
         check_output(out, "--out", (".npz",))
     if plot is not None:
-        from srm_mbs.plots import FORMATS
+        from srm_mbs.plotting import FORMATS
 
         check_output(plot, "--plot", FORMATS)
     if csv is not None:
         check_output(csv, "--csv", (".csv",))
     if html is not None:
         check_output(html, "--html", (".html", ".htm"))
-    check_pictures(image, video)
+    check_pictures(image, at, video)
 
     mechanism = srm_mbs.load(model)
     shown = drawn(mechanism, trace, gaps, reactions)
     defaults = mechanism.defaults
+    t_end = _first(t_end, defaults.t_end, T_END)
+    check_time(at, t_end)
     view = live_view(mechanism) if live else None
     solution = srm_mbs.simulate(
         mechanism,
-        _first(t_end, defaults.t_end, T_END),
+        t_end,
         method=method,
         tableau=tableau,
         rtol=_first(rtol, defaults.rtol, RTOL),
@@ -233,7 +242,7 @@ def convert(
     ],
     cut: Annotated[
         list[str] | None,
-        typer.Option(metavar="JOINT", help="Cut a loop at this joint; may be given several times."),
+        typer.Option(metavar="JOINT", help="Cut a loop at this joint. May be given several times."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
 ) -> None:
@@ -250,9 +259,9 @@ def convert(
 @app.command()
 @reported()
 def info(model: Model) -> None:
-    """Print degrees of freedom, joints, loops and force elements of a mechanism.
+    """Describe a mechanism: joints, loops, forces, the start.
 
-    With the rank of its closure rows, the rows that are redundant, and the start.
+    With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
     """
     from srm_mbs.summary import drive_rows, force_rows, joint_rows, loop_rows, mechanism_rows
 
@@ -285,10 +294,11 @@ def info(model: Model) -> None:
 def models() -> None:
     """List the mechanisms that come with the package."""
     from srm_mbs.loading.bundled import models_folder
+    from srm_mbs.loading.reading import largest_n
 
     folder = models_folder()
     table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
-    typer.echo("n_four_bar_<N> is made for any N up to 300.")
+    typer.echo(f"n_four_bar_<N> is made for any N up to {largest_n()}.")
 
 
 def _first_sentence(path: Path) -> str:
@@ -303,26 +313,10 @@ def _first_sentence(path: Path) -> str:
 app.command()(cli_playback.play)
 
 
-@app.command()
-@reported()
-def plot(
-    run: Run,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Where to save it; the suffix is .png, .pdf or .svg. Default: RUN with .png.",
-        ),
-    ] = None,
-) -> None:
-    """Plot drift, energy, sigma and step sizes of a saved run."""
-    from srm_mbs.plots import FORMATS
+app.command()(cli_plots.plot)
 
-    solution = srm_mbs.load_solution(run)
-    path = run.with_suffix(".png") if out is None else out
-    check_output(path, "--out", FORMATS)
-    solution.plot(path)
-    typer.echo(f"written: {path}")
+
+app.command()(cli_report.report)
 
 
 @app.command(
@@ -332,9 +326,10 @@ def plot(
 )
 @reported()
 def benchmark(context: typer.Context) -> None:
-    """Measure run time against error beside other simulators (in a checkout only).
+    """Compare run time and error with other simulators.
 
-    The options are those of 'python -m benchmarks.work_precision'.
+    In a checkout of the source only.  The options are those of
+    'python -m benchmarks.work_precision'.
     """
     harness = Path("benchmarks", "work_precision", "__main__.py")
     if not harness.is_file():

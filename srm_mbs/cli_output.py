@@ -8,14 +8,17 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ParamSpec, get_type_hints
 
 import typer
+from typer.models import OptionInfo
 
 from srm_mbs.errors import InputError, SrmError, SrmWarning
 
 RUN_FAILED, BAD_INPUT = 1, 2
+Given = ParamSpec("Given")
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
 ]
@@ -23,8 +26,8 @@ Model = Annotated[
     str,
     typer.Argument(
         metavar="MODEL",
-        help="A bundled mechanism (see 'srm-mbs models'), or a file: a .toml description, or "
-        "another format, found out by its content (docs/formats.md).",
+        help="A bundled mechanism (see 'srm-mbs models'), a .toml description, or a file of "
+        "another format, which its content tells (docs/formats.md).",
     ),
 ]
 
@@ -41,26 +44,51 @@ class Lines(logging.Handler):
         say(record.levelname.lower(), record.getMessage())
 
 
-@contextmanager
-def reported() -> Iterator[None]:
-    """Warnings and expected errors of a command as single lines, the latter with status 2."""
+def reported() -> Callable[[Callable[Given, None]], Callable[Given, None]]:
+    """Decorates commands: warnings and expected errors are single lines, the latter with status 2.
 
+    Errors name an option as it is written: ``--t-end``, not ``t_end``.
+    """
+
+    def decorate(command: Callable[Given, None]) -> Callable[Given, None]:
+        @wraps(command)
+        def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
+            try:
+                with _warnings_as_lines():
+                    command(*args, **kwargs)
+            except BrokenPipeError:
+                raise  # the reader of a pipe has gone: typer ends quietly
+            except SrmError as error:
+                if isinstance(error, InputError) and error.element is not None:
+                    error.element = _as_written(error.element, command)
+                say("error", error)
+                raise typer.Exit(BAD_INPUT) from error
+            except OSError as error:
+                say("error", os_problem(error))
+                raise typer.Exit(BAD_INPUT) from error
+
+        return run
+
+    return decorate
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         say("warning", message)
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", SrmWarning)
-            warnings.showwarning = show
-            yield
-    except BrokenPipeError:
-        raise  # the reader of a pipe has gone: typer ends quietly
-    except SrmError as error:
-        say("error", error)
-        raise typer.Exit(BAD_INPUT) from error
-    except OSError as error:
-        say("error", os_problem(error))
-        raise typer.Exit(BAD_INPUT) from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", SrmWarning)
+        warnings.showwarning = show
+        yield
+
+
+def _as_written(element: str, command: Callable[..., None]) -> str:
+    hint = get_type_hints(command, include_extras=True).get(element)
+    for given in getattr(hint, "__metadata__", ()):
+        if isinstance(given, OptionInfo):
+            return (given.param_decls or ("--" + element.replace("_", "-"),))[0]
+    return element
 
 
 def os_problem(error: OSError) -> str:
@@ -91,7 +119,7 @@ def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
 
 def check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
     """Refuse, before a long run, a file that could not be written after it."""
-    problem = remedy = None
+    problem = remedy = ""
     folder = path.parent
     if path.suffix.lower() not in suffixes:
         problem = f"the suffix {path.suffix!r} is not known here"

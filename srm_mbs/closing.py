@@ -18,8 +18,9 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.loops import support, world_jacobian
+from srm_mbs.systems.ranks import shortest, weakest
 from srm_mbs.systems.singular import sharpened
-from srm_mbs.systems.units import row_angles
+from srm_mbs.systems.units import counted_turns, row_angles
 
 CLOSED = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
@@ -109,29 +110,32 @@ class ClosureProblem(ClosureGeometry):
         return float(np.linalg.norm(self.difference(self.start, q)))
 
     @cached_property
-    def _hinges(self) -> list[Any]:
-        """The joints with an angle of which whole turns do not matter: coupled ones do."""
+    def _hinges(self) -> tuple[IndexArray, IndexArray]:
+        """Indices into q and into v of the angles of which whole turns do not matter: those of
+        coupled joints do."""
         coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
-        return [
-            joint
-            for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:])
-            if joint.nq == joint.nv == 1
-            and joint.shortname().startswith("JointModelR")
-            and name not in coupled
-        ]
+        turning = self.mechanism.derived("counted turns", lambda: counted_turns(self.model))
+        in_q: list[int] = []
+        in_v: list[int] = []
+        for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
+            own = np.flatnonzero(turning[joint.idx_v : joint.idx_v + joint.nv])
+            if name not in coupled:
+                in_q += (joint.idx_q + own).tolist()
+                in_v += (joint.idx_v + own).tolist()
+        return np.array(in_q, dtype=int), np.array(in_v, dtype=int)
 
     @property
     def hinges(self) -> IndexArray:
-        """Velocity indices of the hinges of which whole turns do not matter."""
-        return np.array([joint.idx_v for joint in self._hinges], dtype=int)
+        """Velocity indices of the angles of which whole turns do not matter: hinges and universal
+        joints."""
+        return self._hinges[1]
 
     def unwound(self, q: FloatArray) -> FloatArray:
         """q without full turns of its hinges away from the start, except of coupled ones."""
+        own = self._hinges[0]
+        turns = np.round((q[own] - self.start[own]) / (2.0 * np.pi))
         q = q.copy()
-        for joint in self._hinges:
-            turns = np.round((q[joint.idx_q] - self.start[joint.idx_q]) / (2.0 * np.pi))
-            if turns:
-                q[joint.idx_q] -= 2.0 * np.pi * turns
+        q[own] -= 2.0 * np.pi * turns
         return q
 
     def closed(self, q: FloatArray) -> bool:
@@ -183,7 +187,7 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
     for _ in range(60):
         if error == 0.0:
             break
-        step = np.linalg.lstsq(G[:, free], g, rcond=RANK)[0]
+        step = shortest(G[:, free], g, RANK)
         q = problem.move(q, -step, free)
         g, G = problem.closure(q)
         new_error = float(np.abs(g).max())
@@ -195,10 +199,10 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
 
 def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Sharpen a double root of g; q itself where this does not help."""
-    singular = np.linalg.svd(problem.normalised(q)[:, free], compute_uv=False)
-    if not np.any((singular > 1e-13) & (singular < NEARLY_SINGULAR)):
+    rows = problem.normalised(q)[:, free]
+    if not weakest(rows, 1e-13) < NEARLY_SINGULAR:
         return q
-    rank = int(np.sum(singular > NEARLY_SINGULAR))
+    rank = int(np.sum(np.linalg.svd(rows, compute_uv=False) > NEARLY_SINGULAR))
     # A regular closing close to a singular one must stay: g may not become larger.
     closed = max(2e-15, float(np.abs(problem.closure(q)[0]).max()))
     found = sharpened(problem, q, rank, NEARLY_SINGULAR, closed, free)

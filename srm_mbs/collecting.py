@@ -10,10 +10,11 @@ import numpy as np
 from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.compiled.dense_output import CompiledDenseOutput
 from srm_mbs.compiled.driving import CompiledRecord
+from srm_mbs.compiled.twin import shared
 from srm_mbs.forces import LimitSpring
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import ErrorNorm, Method
-from srm_mbs.records import ATTEMPT, Settings, Statistics
+from srm_mbs.records import Settings, Statistics, attempt_array
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.stepping.events import EventWatch
@@ -53,7 +54,7 @@ def collected(
     if not isinstance(record, CompiledRecord):
         dense = DenseOutput(system, scheme, data)
     else:
-        dense = CompiledDenseOutput(twin, system, scheme, data)
+        dense = CompiledDenseOutput(None if shared(system) else twin, system, scheme, data)
         placed, replaced, suspects = record.placed, record.replaced, record.suspects
     rejected = [a for a in record.attempts if a.verdict is Verdict.REJECTED]
     stats = Statistics(
@@ -73,9 +74,7 @@ def collected(
         data,
         dense=dense,
         t_eval=t_eval,
-        attempts=np.array(
-            [(a.t, a.h, a.error_ratio, a.verdict.value) for a in record.attempts], dtype=ATTEMPT
-        ),
+        attempts=attempt_array(record.attempts),
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message
@@ -129,9 +128,10 @@ def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
     if not names:
         return ""
     q = dense.nodes()[1][:, indices]
-    least, largest = q.min(axis=0), q.max(axis=0)
+    # The reductions themselves: their methods cost more than they do here.
+    least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
     beyond = np.maximum(low - least, largest - high)
-    if not beyond.max() > 0.0:
+    if not max(beyond.tolist()) > 0.0:
         return ""
     # A run that a terminal event ends at a limit has not left it.
     slack = ROUND_OFF * np.maximum(1.0, np.maximum(-least, largest))

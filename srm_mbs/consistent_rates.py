@@ -19,6 +19,7 @@ from srm_mbs.errors import AssemblyError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
 from srm_mbs.systems.driven import DriveRows
+from srm_mbs.systems.ranks import null_basis, ranked, weakest
 from srm_mbs.systems.singular import (
     SINGULAR,
     SingularConfiguration,
@@ -66,21 +67,18 @@ def consistent_rates(
     G = np.concatenate([G, drives.rows])
     asked = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
     normalised = np.concatenate([problem.normalised(q), drives.rows])
-    singular = np.linalg.svd(normalised, compute_uv=False)
     conditions, close = _conditions(mechanism, problem, q, drives)
     fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
 
     def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
         """The rates nearest to u that satisfy the conditions; None if there are none."""
-        _, s, right = np.linalg.svd(to.rows[:, free])
-        rank = int(np.sum(s > SINGULAR))
-        inverse = np.linalg.pinv(to.rows[:, free], rcond=SINGULAR / max(s[:1].sum(), SINGULAR))
+        moved = ranked(to.rows[:, free], SINGULAR)
         u = u.copy()
         for _ in range(2):  # the second pass removes the rounding of the first
-            u[free] -= inverse @ (to.rows @ u - to.right)
+            u[free] -= moved.solve(to.rows @ u - to.right)
         if np.abs(u).max() <= AT_REST * fastest:
             u[:] = 0.0  # what is left is rounding, which has no direction
-        return _onto_tangent(u, free, right[rank:].T, to.curvature)
+        return _onto_tangent(u, free, moved.null, to.curvature)
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
         """Rates in units, the largest G v left, and whether a motion has these rates."""
@@ -98,7 +96,7 @@ def consistent_rates(
         return u, float(np.abs(G @ u - asked).max()), True
 
     # Next to a singular configuration q lies off its branch by round-off over the distance.
-    smallest = float(singular[singular > EXACTLY].min(initial=1.0))
+    smallest = min(weakest(normalised, EXACTLY), 1.0)
     tolerance = max(RATE_TOLERANCE, min(ROUNDING / smallest, LOOSEST))
     tolerance *= max(1.0, fastest)
 
@@ -127,7 +125,7 @@ def consistent_rates(
     remedy = f"Change or free one of {quoted(guilty)}" if guilty else "Give other rates"
     if driven and not held:
         remedy = "Change or remove a drive, or start where the motion can follow it"
-    if np.any((singular > 1e-13) & (singular < 10.0 * SINGULAR)):
+    if weakest(normalised, 1e-13) < 10.0 * SINGULAR:
         remedy += (
             "; the held positions lie so close to a singular configuration that the rates are not "
             "determined: give them with all digits, or further away"
@@ -171,8 +169,7 @@ def _conditions(
     """The conditions at q, and the singular configuration so close to q that rates choose the
     branch and not q."""
     normalised = problem.normalised(q)
-    left, singular, _ = np.linalg.svd(np.concatenate([normalised, drives.rows]))
-    left = left[:, int(np.sum(singular > SINGULAR)) :]
+    left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
 
     def curvature(u: FloatArray) -> FloatArray:
         bias = np.concatenate([problem.bias(q, u), drives.bias(u)])
@@ -180,8 +177,7 @@ def _conditions(
         return out
 
     here = _with_drives(normalised, drives, curvature)
-    singular = np.linalg.svd(normalised, compute_uv=False)
-    if not np.any((singular > EXACTLY) & (singular < NEARLY)):
+    if not weakest(normalised, EXACTLY) < NEARLY:
         return here, None
     # G determines the rates to round-off over the square of the distance: use the branch.
     rank = mechanism.structure.loop_rank

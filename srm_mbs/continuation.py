@@ -266,5 +266,5 @@ def _met(
             continue
         away = problem.difference(path[i].q, q)[columns]
         met = (path[i].h + away) * problem.unit[columns]
-        found.append(Met(q, analyse_singular(problem, q, rank).loops, met))
+        found.append(Met(q, analyse_singular(problem, q, rank).participants.loops, met))
     return tuple(found)

@@ -61,7 +61,7 @@ def read_table(path: Path, columns: Sequence[str]) -> FloatArray:
                 f"there is no column {name!r}" if name not in header else f"two columns {name!r}",
                 file=file,
                 element="first line",
-                remedy=f"Columns: {', '.join(header) or 'none'}",
+                remedy=f"Known: {', '.join(header) or 'none'}",
             )
     wanted = [header.index(name) for name in columns]
     out = np.empty((len(rows) - 1, len(wanted)))

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.anchors import Anchor, resolve_apart
+from srm_mbs.anchors import Anchor, name_places, resolve_apart
 from srm_mbs.errors import InputError
 from srm_mbs.laws import Curve, Law, Polynomial, Sine, Table
 from srm_mbs.loop_closure import LoopClosure
+from srm_mbs.workspaces import workspace
 
 HAS_VALUES = (Table, Polynomial, Sine)
 """Laws that say where they start, so that they can be meant as positions themselves."""
@@ -66,8 +67,8 @@ class Drive:
     name: str = ""
 
     def __post_init__(self) -> None:
+        places = name_places(f"drive {self.name!r}", self.a, self.b)
         if not self.name:
-            places = [anchor.where for anchor in (self.a, self.b) if anchor is not None]
             object.__setattr__(self, "name", self.joint or "_".join(["drive", *places]))
         if not isinstance(self.law, Law):
             raise self._fault(f"{self.law!r} is not a law", "Give srm.ConstantSpeed(...) or alike")
@@ -82,7 +83,7 @@ class Drive:
         ):
             raise self._fault(
                 "what is driven is not determined",
-                "With a and b give axis = [x, y, z] or distance = true; neither with a joint",
+                "Give axis = [x, y, z] or distance = true with a and b, and neither with a joint",
             )
         if self.absolute and not isinstance(self.law, HAS_VALUES):
             raise self._fault(
@@ -160,7 +161,7 @@ def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
 def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> Mapping[str, float]:
     """The driven coordinate of each drive (rad, m) at q (nq,); angles of continuous joints in
     (-pi, pi]."""
-    data = model.createData()
+    data = workspace(model)
     pin.forwardKinematics(model, data, np.asarray(q, dtype=float))
     out = {}
     for drive in drives:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from srm_mbs.solution import Solution
 
 
+CHECK_WRITING = "Check the folder and its permissions"
+"""Remedy for a file that cannot be written."""
+
+
 class SrmError(Exception):
     """Base class of everything that this package raises on purpose."""
 
@@ -26,20 +30,21 @@ class InputError(SrmError, ValueError):
     Parameters
     ----------
     problem
-        What is wrong, without a final full stop.
+        What is wrong: a clause that begins in lower case, without a final full stop.
     file, element
         The file and the element in it (a TOML key path, a URDF element, an argument) at fault.
     remedy
-        What the reader can do.
+        What the reader can do: an imperative, or ``Known: `` and the names that there are, without
+        a final full stop.
     """
 
     def __init__(
         self,
         problem: str,
         *,
+        remedy: str,
         file: str | None = None,
         element: str | None = None,
-        remedy: str | None = None,
     ) -> None:
         self.problem = problem
         self.file = file
@@ -50,7 +55,7 @@ class InputError(SrmError, ValueError):
     def __str__(self) -> str:
         where = ": ".join(part for part in (self.file, self.element) if part)
         text = f"{where}: {self.problem}" if where else self.problem
-        return f"{text}. {self.remedy}" if self.remedy else text
+        return f"{text}. {self.remedy}"
 
     def located(self, file: str) -> InputError:
         """The same error with ``file`` filled in where it was unknown (the object itself)."""
@@ -99,8 +104,8 @@ class AssemblyError(InputError):
 class AnalysisError(SrmError, RuntimeError):
     """An equilibrium or a path was not found; ``q`` (nq,) is how far the search came."""
 
-    def __init__(self, problem: str, *, q: Any, remedy: str | None = None) -> None:
-        super().__init__(f"{problem}. {remedy}" if remedy else problem)
+    def __init__(self, problem: str, *, q: Any, remedy: str) -> None:
+        super().__init__(f"{problem}. {remedy}")
         self.q = q
 
 

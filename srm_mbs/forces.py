@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.anchors import Anchor, resolve_apart
+from srm_mbs.anchors import Anchor, name_places, resolve_apart
 from srm_mbs.errors import InputError
 from srm_mbs.force_checks import fault, in_unit, moving_joint, take, take_law, take_name, take_rates
 from srm_mbs.force_element import ForceElement
@@ -62,7 +62,7 @@ class SpringDamper(ForceElement):
     name: str = ""
 
     def __post_init__(self) -> None:
-        take_name(self, self.a.where, self.b.where)
+        take_name(self, *name_places(f"force {self.name or self.type!r}", self.a, self.b))
         take_rates(self)
         if self.rest_length is None:
             if self.stiffness:
@@ -208,7 +208,7 @@ class Wrench(ForceElement):
     law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
-        take_name(self, self.at.where)
+        take_name(self, *name_places(f"force {self.name or self.type!r}", self.at))
         several = take_law(self, 6) and not isinstance(self.law, Law)
         if several and not np.any([self.force, self.moment]):
             object.__setattr__(self, "force", (1.0, 1.0, 1.0))
@@ -267,7 +267,7 @@ class Bushing(ForceElement):
     name: str = ""
 
     def __post_init__(self) -> None:
-        take_name(self, self.a.where, self.b.where)
+        take_name(self, *name_places(f"force {self.name or self.type!r}", self.a, self.b))
         take_rates(self, 6)
 
     def check(self, model: pin.Model) -> None:
@@ -337,7 +337,7 @@ class LimitSpring(ForceElement):
             raise fault(
                 self,
                 f"the position of joint {self.joint!r} is not one number",
-                "Limits are for revolute and prismatic joints",
+                "Give limits to revolute and prismatic joints only",
             )
         low, high, _ = self.resolved(model)
         if not low < high or not np.isfinite([low, high]).any():

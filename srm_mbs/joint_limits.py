@@ -10,6 +10,7 @@ from srm_mbs.closing import ClosureProblem, close_from
 from srm_mbs.forces import OPEN, LimitSpring
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.units import coordinate_units
+from srm_mbs.workspaces import workspace
 
 SLACK = 1e-9
 """What rounding may take a joint beyond its limit, rad or m."""
@@ -85,7 +86,7 @@ def limit_springs(mechanism: Mechanism) -> tuple[LimitSpring, ...]:
     """
     there = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
     rate = coordinate_units(mechanism, mechanism.q0, mechanism.v0).rate
-    inertia = np.diag(pin.crba(mechanism.model, mechanism.model.createData(), mechanism.q0))
+    inertia = np.diag(pin.crba(mechanism.model, workspace(mechanism.model), mechanism.q0))
     out = []
     for name, _, j, low, high in _limited(mechanism):
         moved = max(float(inertia[j]), SMALLEST_INERTIA * float(inertia.max()))

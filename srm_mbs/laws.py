@@ -57,6 +57,11 @@ class Curve:
             bend -= amplitude * omega * omega * math.sin(angle)
         return value, rate, bend
 
+    def piece(self, t: float) -> Curve:
+        """The piece that begins at t (s) or holds there, for ever and since ever."""
+        i = max(bisect_right(self.breaks, t) - 1, 0)
+        return Curve((self.breaks[i],), (self.pieces[i],), self.sines)
+
     def shifted(self, by: float) -> Curve:
         """The same curve ``by`` higher."""
         pieces = tuple((piece[0] + by, *piece[1:]) for piece in self.pieces)
@@ -106,7 +111,7 @@ def _take(law: Law, key: str, above: float = -math.inf) -> float:
         given, bool
     )
     if not usable or not math.isfinite(given):
-        raise _fault(law, f"{key} = {given!r} is no finite number", f"Give a number for {key}")
+        raise _fault(law, f"{key} = {given!r} is not a finite number", f"Give a number for {key}")
     if not given > above:
         raise _fault(law, f"{key} = {given!r} is too small", f"Give {key} above {above:g}")
     object.__setattr__(law, key, float(given))

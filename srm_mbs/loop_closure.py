@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.anchors import Anchor, finite_numbers, resolve_apart, vector
+from srm_mbs.anchors import Anchor, finite_numbers, name_places, resolve_apart, vector
 from srm_mbs.arrays import FloatArray
 from srm_mbs.closures import CLOSURE_TYPES, ClosureType, ClosureValues, JointRow, RowSet
 from srm_mbs.errors import InputError
+from srm_mbs.workspaces import workspace
 
 _KEYS = {
     "a": ("an anchor a", 'Give "a = { link = ... }"'),
@@ -80,13 +81,14 @@ class LoopClosure:
     offset: float | None = None
 
     def __post_init__(self) -> None:
+        places = name_places(f"loop {self.name!r}", self.a, self.b)
         if not self.name:
-            where = [anchor.where for anchor in self.anchors] or [*(self.joints or ())]
+            where = places or [*(self.joints or ())]
             object.__setattr__(self, "name", "_".join((self.type_name, *where)))
         if not isinstance(self.type, ClosureType) and self.type not in CLOSURE_TYPES:
             raise self._fault(
                 f"there is no closure type {self.type!r}",
-                f"This version knows {', '.join(CLOSURE_TYPES)}",
+                f"Known: {', '.join(CLOSURE_TYPES)}",
             )
         kind = self.kind
         for key, (words, remedy) in _KEYS.items():
@@ -136,12 +138,12 @@ class LoopClosure:
         joints = tuple(given) if not isinstance(given, str) else (given,)
         if not joints or not all(isinstance(name, str) for name in joints):
             raise self._fault(
-                f"joints = {given!r} is no list of names", 'Give "joints = [first, second]"'
+                f"joints = {given!r} is not a list of names", 'Give "joints = [first, second]"'
             )
         for name in joints:
             if joints.count(name) > 1:
                 raise self._fault(
-                    f"the joint {name!r} stands there twice", "Keep one, with the sum of both"
+                    f"the joint {name!r} is named twice", "Keep one, with the sum of both"
                 )
         if (self.ratio is None) == (self.coefficients is None):
             raise self._fault(
@@ -266,7 +268,7 @@ class LoopClosure:
         """
         if self.type != "distance" or self.length is not None:
             return self
-        data = model.createData()
+        data = workspace(model)
         pin.forwardKinematics(model, data, q)
         a, b = (data.oMi[joint].act(inside.translation) for joint, inside in self.resolve(model))
         length = float(np.linalg.norm(a - b))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +11,7 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.shown import Shown
 
 
 class Playable(Protocol):
@@ -30,7 +30,7 @@ class Playable(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class JointMotion:
+class JointMotion(Shown):
     """Configurations over time.
 
     Attributes
@@ -49,8 +49,8 @@ class JointMotion:
         nq = self.mechanism.model.nq
         if self.q.shape != (len(self.t), nq) or not len(self.t) or np.any(np.diff(self.t) <= 0.0):
             raise InputError(
-                f"times of shape {self.t.shape} and configurations of shape {self.q.shape} are no "
-                "motion",
+                f"times of shape {self.t.shape} and configurations of shape {self.q.shape} do not "
+                "make a motion",
                 element="motion",
                 remedy=f"Give increasing times (n,) and configurations (n, {nq})",
             )
@@ -79,27 +79,3 @@ class JointMotion:
             q[i] = pin.integrate(model, self.q[k], (time - self.t[k]) / h * move)
             v[i] = move / h
         return (q[0], v[0]) if np.ndim(t) == 0 else (q, v)
-
-    def play(self, **options: Any) -> None:
-        """Play it in the browser; see :func:`srm_mbs.playback.play`."""
-        from srm_mbs.playback import play
-
-        play(self, **options)
-
-    def export_html(self, path: str | Path, **options: Any) -> None:
-        """Write a page with the animation; see :func:`srm_mbs.playback.export_html`."""
-        from srm_mbs.playback import export_html
-
-        export_html(self, Path(path), **options)
-
-    def export_image(self, path: str | Path, **options: Any) -> None:
-        """Write a picture at one time; see :func:`srm_mbs.rendering.export_image`."""
-        from srm_mbs.rendering import export_image
-
-        export_image(self, path, **options)
-
-    def export_video(self, path: str | Path, **options: Any) -> None:
-        """Write a film; see :func:`srm_mbs.rendering.export_video`."""
-        from srm_mbs.rendering import export_video
-
-        export_video(self, path, **options)

@@ -25,6 +25,9 @@ LOOSEST_OF_SPLIT = {8: 1e-2, 1: 1e-3}
 """The split PSRM, which watches its branch itself: order of the error estimate, from which order on
 -> loosest rtol.  Estimates of low order let a run drift away altogether at 1e-2."""
 TIGHTEST_RTOL = 100 * np.finfo(float).eps
+TIGHTEST_OF_CLOSURES = 1000 * np.finfo(float).eps
+"""Where closures or drives act: next to singular configurations corrections know positions to
+rounding / sigma, and tighter runs may stand still there (10 of 31 passages tried at 1e-13)."""
 AVOIDABLE = 1e-9
 """Fraction of the run within which of its ends a given singular time cannot be avoided."""
 SAMPLED = 1e-9
@@ -53,14 +56,25 @@ def positive(value: Any, what: str, unit: str = "") -> float:
     return number
 
 
+def finite(value: Any, what: str) -> float:
+    """``value`` as a finite number of seconds."""
+    if type(value) is float and math.isfinite(value):
+        return value
+    (number,) = numbers([value], what, "Give a number of seconds").tolist()
+    return float(number)
+
+
 def numbers(values: Any, what: str, remedy: str) -> FloatArray:
     """``values`` as an array of finite numbers."""
     try:
-        array = np.array(values, dtype=float)
+        # NumPy would drop imaginary parts with no more than a warning.
+        array = np.array(values, dtype=float) if np.isrealobj(values) else np.full(1, np.nan)
     except (TypeError, ValueError):
         array = np.full(1, np.nan)
     if not np.isfinite(array).all():
-        raise InputError(f"{what} = {values!r} is not finite numbers", element=what, remedy=remedy)
+        raise InputError(
+            f"{what} = {values!r} does not consist of finite numbers", element=what, remedy=remedy
+        )
     return array
 
 
@@ -72,8 +86,17 @@ def loosest_rtol(method: Method) -> float:
     return next(rtol for least, rtol in LOOSEST_OF_SPLIT.items() if order >= least)
 
 
-def checked_rtol(value: Any, loosest: float = LOOSEST_RTOL) -> float:
-    """rtol within what the methods can use, at most ``loosest``; warns where it is changed."""
+def tightest_rtol(constrained: bool) -> float:
+    """The tightest rtol that rounding leaves, of mechanisms ``constrained`` by closures or drives
+    and of others."""
+    return float(TIGHTEST_OF_CLOSURES if constrained else TIGHTEST_RTOL)
+
+
+def checked_rtol(
+    value: Any, loosest: float = LOOSEST_RTOL, tightest: float = float(TIGHTEST_RTOL)
+) -> float:
+    """rtol within what the methods can use, from ``tightest`` to ``loosest``; warns where it is
+    changed."""
     rtol = positive(value, "rtol")
     if rtol > loosest:
         warnings.warn(
@@ -83,13 +106,14 @@ def checked_rtol(value: Any, loosest: float = LOOSEST_RTOL) -> float:
             stacklevel=3,
         )
         return loosest
-    if rtol < TIGHTEST_RTOL:
+    if rtol < tightest:
+        where = "" if rtol < TIGHTEST_RTOL else " next to singular configurations of closures"
         warnings.warn(
-            f"rtol = {rtol:g} is below round-off: using {TIGHTEST_RTOL:.1e}",
+            f"rtol = {rtol:g} is below round-off{where}: using {tightest:.1e}",
             SrmWarning,
             stacklevel=3,
         )
-        return float(TIGHTEST_RTOL)
+        return tightest
     return rtol
 
 
@@ -106,7 +130,7 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
             raise InputError(
                 f"there is no method {method!r}",
                 element="method",
-                remedy=f"This version has {', '.join(repr(name) for name in METHODS)}",
+                remedy=f"Known: {', '.join(repr(name) for name in METHODS)}",
             )
         return _named(method.lower(), tableau)
     if tableau is not None:
@@ -152,7 +176,7 @@ def checked_placement(placement: Any) -> str:
         raise InputError(
             f"there is no placement {placement!r}",
             element="placement",
-            remedy=f"Give one of {', '.join(repr(name) for name in PLACEMENTS)}",
+            remedy=f"Known: {', '.join(repr(name) for name in PLACEMENTS)}",
         )
     return str(placement)
 
@@ -208,10 +232,10 @@ def check_avoidable(singular_times: FloatArray, breakpoints: FloatArray, t_end: 
 
 def checked_span(t0: Any, t_end: Any) -> tuple[float, float]:
     """Start and end (s) of a run."""
-    (start,) = numbers([t0], "t0", "Give a number of seconds").tolist()
+    start = finite(t0, "t0")
     if start == 0.0:
         return 0.0, positive(t_end, "t_end", " of seconds")
-    (end,) = numbers([t_end], "t_end", "Give a number of seconds").tolist()
+    end = finite(t_end, "t_end")
     if not end > start:
         raise InputError(
             f"the run ends at {end:g} s, before it starts at {start:g} s",
@@ -233,14 +257,15 @@ def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) 
             element="sample_time",
             remedy="Give controller=, a function of (t, q, v)",
         )
-    first: int = math.floor(t0 / period + SAMPLED) + 1
-    end: int = math.ceil(t_end / period - SAMPLED)
-    if end - first > MOST_SAMPLES:
+    count = (t_end - t0) / period
+    if not count < MOST_SAMPLES:
         raise InputError(
-            f"sample_time = {period:g} s makes {end - first} samples",
+            f"sample_time = {period:g} s makes {count:.3g} samples",
             element="sample_time",
             remedy=f"Give at least {(t_end - t0) / MOST_SAMPLES:.1e} s for a run of this length",
         )
+    first: int = math.floor(t0 / period + SAMPLED) + 1
+    end: int = math.ceil(t_end / period - SAMPLED)
     return np.arange(first, end, dtype=np.float64) * np.float64(period)
 
 

@@ -52,12 +52,20 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
     return checked
 
 
+def _units_of_states(mechanism: Mechanism) -> FloatArray:
+    """The unit of each tangent component (2 nv,)."""
+    units = mechanism.structure.units
+    return np.concatenate([units.coordinate, units.coordinate * units.rate])
+
+
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
-    nv = mechanism.model.nv
-    units = mechanism.structure.units
     if atol is None:
-        return rtol * np.concatenate([units.coordinate, units.coordinate * units.rate])
+        tolerance: FloatArray = rtol * mechanism.at_start(
+            "units of states", lambda: _units_of_states(mechanism)
+        )
+        return tolerance
+    nv = mechanism.model.nv
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
     array = numbers(atol, "atol", remedy)
     if array.shape not in ((), (nv,), (2 * nv,)) or not (array > 0.0).all():
@@ -144,13 +152,23 @@ def placed_control(
     span: tuple[float, float],
     placement: str,
     singular_times: FloatArray,
+    arrivals: bool = False,
 ) -> tuple[StepSizeControl, Sequence[Placing]]:
-    """The step-size control of a run, and the wrappers in it that count what they did."""
+    """The step-size control of a run, and the wrappers in it that count what they did.
+
+    ``arrivals``: the driver prepares for ends beside singular configurations.
+    """
     scheme = method.scheme
     t0, t_end = span
     control = step_size_control(scheme, t0, t_end, step, first_step)
     control, wrappers = placed(
-        control, scheme, placement if system.has_constraints else None, singular_times, t_end, step
+        control,
+        scheme,
+        placement if system.has_constraints else None,
+        singular_times,
+        t_end,
+        step,
+        arrivals,
     )
     if system.has_constraints and placement == "automatic":
         guard = BranchGuard(control, system)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srm_mbs.errors import InputError
+from srm_mbs.request_storage import request_entry, request_from
 from srm_mbs.segmented import SegmentedSolution
-from srm_mbs.storage import load_plain, save_solution
+from srm_mbs.storage import OTHER_VERSION, SAVED_BY, load_plain, save_solution
 
 if TYPE_CHECKING:
     from srm_mbs.solution import Solution
@@ -36,6 +37,7 @@ def save_segments(solution: SegmentedSolution, path: Path) -> None:
         "count": len(solution.segments),
         "status": solution.status,
         "message": solution.message,
+        "request": request_entry(solution),
         "t_eval": None if solution.t_eval is None else solution.t_eval.tolist(),
     }
     with zipfile.ZipFile(path, "w") as archive:
@@ -66,10 +68,11 @@ def load_segments(path: Path) -> Solution | None:
             contents = json.loads(archive.read(CONTENTS))
             if contents["format"] != FORMAT:
                 raise InputError(
-                    f"its segments have format {contents['format']}, this version reads {FORMAT}"
+                    f"its segments have format {contents['format']}, this version reads {FORMAT}",
+                    remedy=OTHER_VERSION,
                 )
             t_eval = contents["t_eval"]
-            return SegmentedSolution(
+            whole = SegmentedSolution(
                 [
                     load_plain(io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}")
                     for k in range(contents["count"])
@@ -78,7 +81,11 @@ def load_segments(path: Path) -> Solution | None:
                 status=contents["status"],
                 message=contents["message"],
             )
+            whole.request = request_from(contents.get("request"))
+            return whole
         except InputError as error:
             raise error.located(str(path)) from error
         except Exception as error:
-            raise InputError(f"it is no saved run: {error}", file=str(path)) from error
+            raise InputError(
+                f"it is not a saved run: {error}", file=str(path), remedy=SAVED_BY
+            ) from error

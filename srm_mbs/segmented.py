@@ -16,6 +16,7 @@ from srm_mbs.solution import Solution
 from srm_mbs.stepping.bifurcations import Bifurcation
 from srm_mbs.stepping.crossings import Crossing
 from srm_mbs.stepping.dense import StepData
+from srm_mbs.stepping.reading_times import check_within, times_to_read
 from srm_mbs.systems.held import HeldForce
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class SegmentedSolution(Solution):
         status: str,
         message: str,
     ) -> None:
-        self.segments = tuple(segments)
+        self._segments = tuple(segments)
         first = self.segments[0]
         self.mechanism = first.mechanism
         self.scheme, self.settings = first.scheme, first.settings
@@ -70,6 +71,11 @@ class SegmentedSolution(Solution):
                 for name in ("t_events", "q_events", "v_events")
             )
 
+    @property
+    def segments(self) -> tuple[Solution, ...]:
+        """The smooth parts of the run, between the actions of events."""
+        return self._segments
+
     def _index(self, t: FloatArray) -> Any:
         """The segment of each time; the later one at a jump."""
         return np.clip(np.searchsorted(self._starts, t, side="right") - 1, 0, None)
@@ -89,27 +95,23 @@ class SegmentedSolution(Solution):
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output, right-continuous; see :class:`~srm_mbs.Solution`."""
-        times = np.asarray(t, dtype=float)
-        if times.ndim > 1:
-            raise ValueError(f"t has shape {times.shape}; give a scalar or a vector of times")
+        times = times_to_read(t, scalar=True)
         found = self.at(np.atleast_1d(times))
         return (found.q[0], found.v[0]) if times.ndim == 0 else (found.q, found.v)
 
     def at(self, t: Any) -> Solution:
         """The same run read at other times; see :meth:`~srm_mbs.Solution.at`."""
-        times = np.array(t, dtype=float)
-        if times.ndim != 1:
-            raise ValueError(f"t has shape {times.shape}; give a vector of times")
+        times = times_to_read(t)
         start, end = self.span
-        slack = 1e-12 * max(abs(start), abs(end))
-        if len(times) and not (times.min() >= start - slack and times.max() <= end + slack):
-            raise ValueError(f"the run covers t = {start:.9g} to {end:.9g} s")
-        return SegmentedSolution(
+        check_within(times, start, end)
+        run = SegmentedSolution(
             self.segments,
             t_eval=np.clip(times, start, end),
             status=self.status,
             message=self.message,
         )
+        run.request = self.request
+        return run
 
     @property
     def span(self) -> tuple[float, float]:
@@ -204,6 +206,27 @@ class SegmentedSolution(Solution):
     def reaction_multipliers(self) -> Mapping[str, FloatArray]:
         """See :attr:`~srm_mbs.Solution.reaction_multipliers`; 0 while a closure is not there."""
         return self._named("reaction_multipliers")
+
+    @cached_property
+    def drive_forces(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.drive_forces`; 0 while a drive is not there."""
+        return self._named("drive_forces")
+
+    @cached_property
+    def drive_rates(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.drive_rates`; 0 while a drive is not there."""
+        return self._named("drive_rates")
+
+    @cached_property
+    def coupling_forces(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.coupling_forces`; 0 while a coupling is not there."""
+        return self._named("coupling_forces")
+
+    @property
+    def indeterminate_reactions(self) -> tuple[str, ...]:
+        """See :attr:`~srm_mbs.Solution.indeterminate_reactions`; those of any segment."""
+        rows = (row for segment in self.segments for row in segment.indeterminate_reactions)
+        return tuple(dict.fromkeys(rows))
 
     def save(self, path: str | Path) -> None:
         """Write all segments into one file; see :meth:`~srm_mbs.Solution.save`."""

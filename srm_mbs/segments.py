@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,16 +11,21 @@ import numpy as np
 
 from srm_mbs.actions import Switch
 from srm_mbs.arrays import FloatArray
+from srm_mbs.drives import positions
 from srm_mbs.errors import EvaluationError, EventError, InputError, SimulationError
+from srm_mbs.laws import Curve
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.options import checked_times, positive
 from srm_mbs.preparation import check_consistent
+from srm_mbs.records import Request
 from srm_mbs.segmented import SegmentedSolution
 from srm_mbs.simulation import simulate
 from srm_mbs.solution import Solution
-from srm_mbs.stepping.events import Event, prepare_events
+from srm_mbs.stepping.events import TOGETHER, Event, prepare_events
 from srm_mbs.systems.consistent import onto_closures
-from srm_mbs.systems.multibody import make_system
+from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
+
+log = logging.getLogger(__name__)
 
 MANY = 10
 CHATTERS = 1e-8
@@ -28,6 +34,9 @@ HELD = 1e-9
 """Rounding of an event that closures hold at zero, over its values before."""
 SNAPS = 1e-4
 """Largest motion (units) onto the closures of another mechanism: more is an inconsistent state."""
+INTERRUPTED = "Interrupted at t = {:.6g} s; everything up to there is kept."
+ON = 1e-13
+"""Closure error that is rounding, in scaled rows, and over 1 + |v| that of rates."""
 LEFT = 1e-12
 """Part of the run too short for another segment."""
 
@@ -36,7 +45,13 @@ class _Armed:
     """An event of the user, (t, q, v) -> float, within one segment."""
 
     def __init__(
-        self, event: Any, prepared: Event, before: int, departs: bool, floor: float
+        self,
+        event: Any,
+        prepared: Event,
+        before: int,
+        departs: bool,
+        floor: float,
+        guard: float | None,
     ) -> None:
         self._event = event
         self.__name__ = prepared.name.strip("'")
@@ -46,6 +61,7 @@ class _Armed:
         self.acts = getattr(event, "action", None) is not None
         self.departs = departs and floor == 0.0
         self.floor = floor
+        self.guard = guard
 
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         return self._event(t, q, v)
@@ -94,14 +110,27 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
     floors = [0.0] * len(events)
     parts: list[Solution] = []
     acted: list[int] = []
-    span = t_end - options["t0"]
+    guard: float | None = None
+    t = float(options["t0"])
+    span = t_end - t
     status, message = "", ""
     while not status:
         armed = [
-            _Armed(event, prepared[i], counts[i], i in acted, floors[i])
+            _Armed(event, prepared[i], counts[i], i in acted, floors[i], guard)
             for i, event in enumerate(events)
         ]
-        solution = simulate(mechanism, t_end, **here | {"events": armed})
+        try:
+            solution = simulate(mechanism, t_end, **here | {"events": armed})
+        except InputError as error:
+            if not parts:
+                raise
+            status, message = "failed", f"Stopped at t = {t:.9g} s: after the action {error}."
+            break
+        except KeyboardInterrupt:
+            if not parts:
+                raise
+            status, message = "interrupted", INTERRUPTED.format(t)
+            break
         parts.append(solution)
         status, message = solution.status, solution.message
         found = solution.t_events or []
@@ -111,7 +140,10 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
         if status != "event" or any(len(found[i]) >= armed[i].left for i in due):
             break
         acted = [i for i in due if armed[i].acts]
+        guard = TOGETHER * float(solution.steps.times[-1] - solution.steps.times[-2])
         try:
+            names = [armed[i].__name__ for i in acted]
+            log.debug("%s: action of %s at t = %.9g s", mechanism.name, ", ".join(names), t)
             mechanism, q, v = _after(solution, t, [(events[i], armed[i].__name__) for i in acted])
             switched = mechanism.loops != solution.mechanism.loops
             for i in acted:
@@ -122,11 +154,15 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
             status = "failed"
             message = f"Stopped at t = {t:.9g} s: {error}. Everything up to there is kept."
             break
+        except KeyboardInterrupt:
+            status, message = "interrupted", INTERRUPTED.format(t)
+            break
         here |= {"t0": t, "q0": q, "v0": v}
         status = "" if t_end - t > LEFT * span else "finished"
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
     whole = SegmentedSolution(parts, t_eval=t_eval, status=status, message=message)
+    whole.request = Request.of(t_end, options)
     if asked and not whole.success:
         raise SimulationError(message, whole)
     return whole
@@ -147,6 +183,16 @@ def _check_chatter(times: list[float], span: float, name: str) -> None:
         )
 
 
+def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
+    """Whether ``x`` is on the closures to rounding.  Moving it onto them would gain nothing, and
+    next to a singular configuration take it off its branch by that rounding over sigma."""
+    if not isinstance(system, ClosedSystem):
+        return True
+    g, c = system.residuals(x, t)
+    speed = 1.0 + float(np.abs(x[system.nq :]).max())
+    return bool((np.abs(g) < ON).all() and (np.abs(c) < ON * speed).all())
+
+
 def _after(
     solution: Solution, t: float, actions: list[tuple[Any, str]]
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
@@ -156,7 +202,9 @@ def _after(
     x = np.concatenate([solution.q[-1], solution.v[-1]])
     try:
         # The dense output is on the closures within the tolerance only.
-        x = onto_closures(make_system(mechanism), t, x)
+        system = make_system(mechanism)
+        if not _closed(system, t, x):
+            x = onto_closures(system, t, x)
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
     q, v = x[:nq], x[nq:]
@@ -182,18 +230,32 @@ def _after(
     return mechanism, q, v
 
 
+def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:
+    """The motions of the drives of ``new`` from ``t`` (s) on: those that ``old`` has go on, others
+    engage where they find their coordinate, unless they prescribe positions."""
+    found = positions(new.model, new.drives, new.q0)
+    curves = {}
+    for drive in new.drives:
+        if drive in old.drives:
+            curves[drive.name] = old.drive_curves[drive.name]
+            continue
+        curve = drive.curve(0.0)
+        moved = 0.0 if drive.absolute else found[drive.name] - curve(t)[0]
+        curves[drive.name] = curve.shifted(moved)
+    return curves
+
+
 def _switched(
     mechanism: Mechanism, switch: Switch, t: float, q: FloatArray, v: FloatArray
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
     new = switch.mechanism
     if not isinstance(new, Mechanism) or list(new.model.names) != list(mechanism.model.names):
-        raise InputError("a switch must be to a mechanism with the same joints")
-    curves = dict(new.drive_curves)
-    for drive in new.drives:
-        if drive in mechanism.drives:  # it goes on
-            curves[drive.name] = mechanism.drive_curves[drive.name]
+        raise InputError(
+            "a switch leads to something else than a mechanism with the same joints",
+            remedy="Give a mechanism made from this one, for example with dataclasses.replace",
+        )
     new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
-    new.__dict__["drive_curves"] = curves
+    new.__dict__["drive_curves"] = _curves_from(t, mechanism, new)
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from srm_mbs.collecting import bifurcations_told, collected
 from srm_mbs.compiled import driving
 from srm_mbs.compiled.run import CompiledRun
-from srm_mbs.compiled.twin import Evaluator, twin_of
+from srm_mbs.compiled.twin import Evaluator, given_back, taken
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
 from srm_mbs.kernel import uses_kernel
 from srm_mbs.mechanism import Mechanism
@@ -29,6 +29,7 @@ from srm_mbs.options import (
     checked_times,
     loosest_rtol,
     positive,
+    tightest_rtol,
 )
 from srm_mbs.preparation import (
     absolute_tolerance,
@@ -41,7 +42,8 @@ from srm_mbs.preparation import (
     sampler,
 )
 from srm_mbs.progress import progress_of
-from srm_mbs.records import Settings
+from srm_mbs.records import Request, Settings
+from srm_mbs.run_log import log_end, log_start
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.breakpoints import Passing, pieces_between
 from srm_mbs.stepping.events import acting
@@ -102,7 +104,8 @@ def simulate(
         ``"tvd32"`` for srm.
     rtol
         Relative tolerance: at most 1e-2 for the split PSRM with dop853, 1e-3 with another tableau,
-        1e-4 for sweeps; looser values are replaced with a warning.
+        1e-4 for sweeps; at least 2.2e-13 with closures or drives, 2.2e-14 without (1000 and 100
+        times the machine epsilon): below, rounding decides.  Others are replaced with a warning.
     atol
         Absolute tolerance: a number, (nv,) or (2 nv,).  By default rtol times the unit of each
         coordinate: 1 rad, the scene diagonal for lengths, and those times the mechanism's
@@ -159,6 +162,8 @@ def simulate(
     SimulationError
         Only with ``raise_on_failure``.
     """
+    if isinstance(events, Iterator):  # looked at more than once
+        events = list(events)
     options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
     check_mechanism(mechanism)
     t0, t_end = checked_span(t0, t_end)
@@ -178,7 +183,7 @@ def simulate(
     placement = checked_placement(placement)
     avoided = checked_singular_times(singular_times, t0, t_end)
     method = mechanism_method(method, tableau)
-    rtol = checked_rtol(rtol, loosest_rtol(method))
+    rtol = checked_rtol(rtol, loosest_rtol(method), tightest_rtol(mechanism.constrained))
     times = checked_times(t_eval, t0, t_end)
     samples = checked_samples(sample_time, controller, t0, t_end)
     kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(t0, t_end)])
@@ -195,13 +200,15 @@ def simulate(
     if mechanism.constrained:
         mechanism.at_start(f"consistent at {t0!r}", lambda: check_consistent(mechanism, t0))
 
+    by = "kernel" if on_kernel else "python"
+    log_start(mechanism.name, t0, t_end, method, norm, step, by)
     watch = event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()
     twin: Any = None
     record: RunRecord
     try:
         if on_kernel:
-            twin = twin_of(system)
+            twin = taken(system)
         evaluator = system if twin is None else Evaluator(system, twin)
         passing = Passing(pieces, system, method, norm, evaluator)
         if held is not None and controller is not None:
@@ -213,7 +220,9 @@ def simulate(
             if first_step is not None:
                 return first_step
             order = method.scheme.controller_order or 1
-            return initial_step(evaluator, state, memory, norm, t_end - t0, order, t0)
+            if isinstance(evaluator, Evaluator):
+                return evaluator.first_step(state, memory, norm, t_end - t0, order, t0)
+            return initial_step(system, state, memory, norm, t_end - t0, order, t0)
 
         longest = np.inf if max_step is None else max_step
         with progress_of(progress, system, t_end) as tick:
@@ -231,11 +240,19 @@ def simulate(
                     first_step=chosen_first_step() if step is None else 0.0,
                     max_step=longest,
                     placed=placement,
+                    arrivals=passing.arrivals,
                 )
                 record = driving.integrate(system, run, tick=tick, events=watch, passing=passing)
             else:
                 control, wrappers = placed_control(
-                    system, method, step, chosen_first_step, (t0, t_end), placement, avoided
+                    system,
+                    method,
+                    step,
+                    chosen_first_step,
+                    (t0, t_end),
+                    placement,
+                    avoided,
+                    arrivals=passing.arrivals,
                 )
                 record = integrate(
                     system,
@@ -252,6 +269,8 @@ def simulate(
                     breakpoints=passing,
                 )
         passing.done()
+        if twin is not None:
+            given_back(system, twin)
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = {t0:.6g} s: {error}."
@@ -264,12 +283,14 @@ def simulate(
         controller is not None or system.calls_forces,
         placement,
         tuple(avoided.tolist()),
-        "kernel" if on_kernel else "python",
+        by,
     )
     solution = collected(
         mechanism, system, method, record, wrappers, watch, times, settings, norm, twin
     )
+    solution.request = Request.of(t_end, options)
     solution.message += bifurcations_told(solution)
+    log_end(mechanism.name, solution)
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)
     return solution

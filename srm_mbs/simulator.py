@@ -19,8 +19,10 @@ from srm_mbs.options import (
     check_embedded,
     checked_placement,
     checked_rtol,
+    finite,
     loosest_rtol,
     positive,
+    tightest_rtol,
 )
 from srm_mbs.preparation import (
     absolute_tolerance,
@@ -36,6 +38,10 @@ from srm_mbs.systems.consistent import onto_closures
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.multibody import make_system
 
+SHORT = 8.0
+"""Steps up to this many units of rounding of the time move nothing but the time."""
+LONGER = 1e10
+"""Where a step is longer than its predecessor by this factor, inner steps are chosen anew."""
 NEAR = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 _NONE = np.zeros(0)
@@ -82,7 +88,7 @@ class Simulator:
             if value is not None:
                 positive(value, what, " of seconds")
         checked = mechanism_method(method, tableau)
-        rtol = checked_rtol(rtol, loosest_rtol(checked))
+        rtol = checked_rtol(rtol, loosest_rtol(checked), tightest_rtol(mechanism.constrained))
         check_embedded(checked.scheme, step)
         check_consistent(mechanism)
         self._mechanism = mechanism
@@ -123,6 +129,7 @@ class Simulator:
             )
         self._nq = mechanism.model.nq
         self._wall_time = 0.0
+        self._last = math.inf
         # Where it starts, until the first step knows what acts.
         self._begins: tuple[float, FloatArray] | None = None
 
@@ -160,7 +167,8 @@ class Simulator:
         Parameters
         ----------
         dt
-            Positive; need not be the same every time.
+            Positive; need not be the same every time.  One that is within rounding of ``t`` moves
+            the time only.
         tau : (nv,)
             Generalised forces held during the step, N and N m, beside those of the mechanism;
             none by default.
@@ -180,16 +188,23 @@ class Simulator:
             inner step.
         """
         started = time.perf_counter()
-        if not 0.0 < dt < math.inf:
-            raise InputError(f"dt = {dt!r} is not a positive number of seconds", element="dt")
+        dt = positive(dt, "dt", " of seconds")
         force = self._no_force
         if tau is not None:
             force = self._force(tau)
+        t = self.t
+        end = t + dt
+        if dt <= SHORT * math.ulp(t):
+            self._begins = self._later(t, end, dt), self._state()
+            return self.q, self.v
+        if dt > LONGER * self._last:
+            self._begins = t, self._state()
+        self._last = dt
         if self._begins is not None:
+            if not np.isfinite(force).all():
+                raise _bad_force(tau)
             self._begin(*self._begins, force, dt)
         run = self._run
-        t = run.t
-        end = t + dt
         try:
             # Those at the ends count, too: what acts just before and behind them differs.
             beside = NEAR * (abs(t) + dt)
@@ -206,6 +221,16 @@ class Simulator:
             raise SimulationError(trouble, None)
         state = run.state
         return state[: self._nq], state[self._nq :]
+
+    def _later(self, t: float, end: float, dt: float) -> float:
+        """``end`` (s), if that is later than ``t``."""
+        if end > t:
+            return end
+        raise InputError(
+            f"dt = {dt!r} s is below the rounding of t = {t!r} s",
+            element="dt",
+            remedy="Give a longer one, or reset to an earlier time",
+        )
 
     def _force(self, tau: Any) -> FloatArray:
         try:
@@ -261,16 +286,18 @@ class Simulator:
         Raises
         ------
         InputError
-            If the state violates the closures, or has another shape.
+            If the state violates the closures, or has another shape, or ``t`` is no finite number.
         """
         mechanism = self._mechanism
+        t = finite(t, "t")
         if q is None and v is None and not project:
             state = np.concatenate([mechanism.q0, mechanism.v0])
         else:
             q = mechanism.q0 if q is None else q
             v = mechanism.v0 if v is None else v
-            state = self._consistent(q, v, float(t), project)
-        self._begins = float(t), state
+            state = self._consistent(q, v, t, project)
+        self._begins = t, state
+        self._last = math.inf
         return self.q, self.v
 
     def set_state(self, q: Any = None, v: Any = None, *, project: bool = False) -> None:
@@ -316,11 +343,25 @@ class Simulator:
         other = Simulator.__new__(Simulator)
         other.__dict__.update(self.__dict__)
         other._make()
+        other._last = self._last
         if self._begins is None:
             other._run.restore(self._run.snapshot())
         else:
             other._begins = self._begins[0], self._begins[1].copy()
         return other
+
+    def __copy__(self) -> Simulator:
+        return self.clone()
+
+    def __deepcopy__(self, memo: Any) -> Simulator:
+        return self.clone()
+
+    def __reduce__(self) -> Any:
+        raise InputError(
+            "a simulator cannot be sent to another process, or kept in a file",
+            element="simulator",
+            remedy="Give its mechanism and t, q and v instead, and reset a new one to them",
+        )
 
     def __repr__(self) -> str:
         return f"Simulator({self._mechanism.name!r}, t={self.t:.6g} s)"

@@ -14,10 +14,13 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.records import Settings, Statistics
+from srm_mbs.records import Request, Settings, Statistics
+from srm_mbs.shown import Shown
 from srm_mbs.stepping.bifurcations import Bifurcation, find_bifurcations
 from srm_mbs.stepping.crossings import Crossing, find_crossings
 from srm_mbs.stepping.dense import DenseOutput, StepData
+from srm_mbs.stepping.reading_times import times_to_read
+from srm_mbs.stepping.stepped import Stepped
 from srm_mbs.stepping.winding import wound_angles
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.held import HeldForce
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.energy_balance import EnergyBalance
 
 
-class Solution:
+class Solution(Stepped, Shown):
     """Result of :func:`srm_mbs.simulate`.
 
     Attributes
@@ -53,7 +56,12 @@ class Solution:
     t_events, q_events, v_events
         For each event in turn its times (k,) s, and the states (k, nq), (k, nv) there; None if
         no events were given.
+    request
+        :class:`~srm_mbs.records.Request`: what else it takes to make the run again; None if the
+        file that it is from does not say.
     """
+
+    request: Request | None = None
 
     def __init__(
         self,
@@ -123,12 +131,10 @@ class Solution:
 
         Raises
         ------
-        ValueError
+        InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = np.asarray(t, dtype=float)
-        if times.ndim > 1:
-            raise ValueError(f"t has shape {times.shape}; give a scalar or a vector of times")
+        times = times_to_read(t, scalar=True)
         states = self._dense(np.atleast_1d(times))
         nq = self.mechanism.model.nq
         q, v = states[:, :nq], states[:, nq:]
@@ -144,14 +150,12 @@ class Solution:
 
         Raises
         ------
-        ValueError
+        InputError
             If a time lies outside the run, or ``t`` has not one dimension.
         """
-        times = np.array(t, dtype=float)
-        if times.ndim != 1:
-            raise ValueError(f"t has shape {times.shape}; give a vector of times")
+        times = times_to_read(t)
         self._dense.check(times)
-        return Solution(
+        run = Solution(
             self.mechanism,
             self._system,
             self.scheme,
@@ -165,25 +169,13 @@ class Solution:
             stats=self.stats,
             settings=self.settings,
         )
+        run.request = self.request
+        return run
 
     @property
-    def span(self) -> tuple[float, float]:
-        """Start and end (s) of the run, whatever ``t`` holds."""
-        return float(self.steps.times[0]), self.steps.end
-
-    @property
-    def rejected(self) -> FloatArray:
-        """Start and length (k, 2) s of the steps rejected for their error."""
-        return self._attempts("rejected")
-
-    @property
-    def replaced(self) -> FloatArray:
-        """Start and length (k, 2) s of the steps redone because of a singular configuration."""
-        return self._attempts("replaced")
-
-    def _attempts(self, verdict: str) -> FloatArray:
-        chosen = self.attempts[self.attempts["verdict"] == verdict]
-        return np.column_stack([chosen["t"], chosen["h"]])
+    def segments(self) -> tuple[Solution, ...]:
+        """The smooth parts of the run: itself, unless events acted on it."""
+        return (self,)
 
     def joint(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Position and rate (n,), (n,) of a one-degree joint at ``t``; angles are unwrapped.
@@ -352,42 +344,49 @@ class Solution:
 
         save_solution(self, Path(path))
 
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Drift, energy, sigma and step sizes with rejected steps and singular passages marked.
+    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
+        """A picture of the run; docs/plots.md shows each kind.
 
         Parameters
         ----------
         path
-            Where to save the figure (the suffix decides the format); not saved if omitted.
+            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
+            omitted.
+        kind
+            ``run``: drift, energy, sigma and step sizes with rejected steps and singular passages
+            marked.  ``state``: positions and rates of joints.  ``balance``: energies, works, and
+            the residual of the energy balance.  ``reactions``: forces and moments in the closures.
+            ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
+            position of joints.  ``path``: paths of points in space.
+        **options
+            ``joints`` of ``state`` and ``phase``: names, by default as many as fit.  ``loops`` of
+            ``reactions``: names; ``rows``: whether to draw the multiplier of each row.  ``points``
+            of ``path``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Without pyplot: it is on no screen, and need not be closed.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind, option, joint, loop, point or suffix; if the run has not what is
+            to be drawn; for balance and reactions of a loaded run that had a controller.
+        ControllerError, EvaluationError
+            If forces cannot be evaluated again.
+        OSError
+            If the file cannot be written.
         """
-        from srm_mbs.plots import plot_run
+        from srm_mbs.plotting import plot_solution
 
-        return plot_run(self, None if path is None else Path(path))
+        return plot_solution(self, None if path is None else Path(path), kind, **options)
 
-    def play(self, **options: Any) -> None:
-        """Play the run in the browser; see :func:`srm_mbs.playback.play`."""
-        from srm_mbs.playback import play
+    def report(self, path: str | Path, **options: Any) -> None:
+        """Write one page about the run; see :func:`srm_mbs.report.write_report`."""
+        from srm_mbs.report import write_report
 
-        play(self, **options)
-
-    def export_html(self, path: str | Path, **options: Any) -> None:
-        """Write a self-contained page with the animation; see
-        :func:`srm_mbs.playback.export_html`."""
-        from srm_mbs.playback import export_html
-
-        export_html(self, Path(path), **options)
-
-    def export_image(self, path: str | Path, **options: Any) -> None:
-        """Write a picture at one time; see :func:`srm_mbs.rendering.export_image`."""
-        from srm_mbs.rendering import export_image
-
-        export_image(self, path, **options)
-
-    def export_video(self, path: str | Path, **options: Any) -> None:
-        """Write a film; see :func:`srm_mbs.rendering.export_video`."""
-        from srm_mbs.rendering import export_video
-
-        export_video(self, path, **options)
+        write_report(self, Path(path), **options)
 
     def __repr__(self) -> str:
         return (

@@ -160,9 +160,9 @@ class KernelRun(_Live):
             If ``force`` has another shape, or is not finite.
         """
         reason = self._go_on(end, first, last, force, anew, grid, CHUNK)
+        self._held.only(force)  # snapshots need it, too
         if reason == FINISHED:
             return ""
-        self._held.only(force)
         self.system.between(first, last)
         if reason == BREAKPOINT:
             try:

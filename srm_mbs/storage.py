@@ -7,6 +7,7 @@ Nothing is pickled.
 from __future__ import annotations
 
 import json
+import logging
 from contextlib import nullcontext
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -22,7 +23,7 @@ from srm_mbs.drives import Drive
 from srm_mbs.errors import InputError
 from srm_mbs.force_element import ForceElement
 from srm_mbs.forces import FORCE_TYPES
-from srm_mbs.laws import LAW_TYPES, Law
+from srm_mbs.laws import LAW_TYPES, Curve, Law
 from srm_mbs.loading import rebuild
 from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism import Mechanism
@@ -30,6 +31,7 @@ from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.provenance import SimulationDefaults, Source
 from srm_mbs.records import ATTEMPT, Settings, Statistics
+from srm_mbs.request_storage import request_entry, request_from
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.held import HeldForce
@@ -37,7 +39,11 @@ from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure, row_names
 from srm_mbs.systems.units import Units
 
+log = logging.getLogger(__name__)
+
 FORMAT = 4
+SAVED_BY = "Give a file written by solution.save or srm-mbs simulate --out"
+OTHER_VERSION = "Load it with the version of srm_mbs that wrote it, or simulate again"
 _STEP_ARRAYS = (
     "times",
     "states",
@@ -93,6 +99,7 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
                 {"type": f.type} | _values(f) for f in mechanism.forces if f.type in FORCE_TYPES
             ],
             "drives": [_values(drive) for drive in mechanism.drives],
+            "drive_starts": _drive_starts(solution),
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
             "notes": mechanism.notes,
@@ -108,6 +115,7 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
         },
         "settings": asdict(solution.settings),
         "stats": asdict(solution.stats),
+        "request": request_entry(solution),
         "status": solution.status,
         "message": solution.message,
         "zones": [[index, threshold] for index, (threshold, _) in zones.items()],
@@ -138,6 +146,8 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
     opened = path.open("wb") if isinstance(path, Path) else nullcontext(path)
     with opened as file:  # given a name, numpy would append ".npz" to it
         np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
+    if isinstance(path, Path):
+        log.info("written: %s", path)
 
 
 def _loop(entry: dict[str, Any]) -> LoopClosure:
@@ -174,6 +184,21 @@ def _force(entry: dict[str, Any]) -> ForceElement:
     return FORCE_TYPES[entry["type"]](**values)
 
 
+def _drive_starts(solution: Solution) -> dict[str, float] | None:
+    """The driven coordinates at t = 0 of a run that starts later: its q0 does not have them."""
+    if solution.span[0] == 0.0:
+        return None
+    return {name: curve(0.0)[0] for name, curve in solution.mechanism.drive_curves.items()}
+
+
+def _drive_curves(drives: tuple[Drive, ...], starts: dict[str, float]) -> dict[str, Curve]:
+    curves = {}
+    for drive in drives:
+        curve = drive.curve(starts[drive.name])
+        curves[drive.name] = curve.shifted(starts[drive.name] - curve(0.0)[0])
+    return curves
+
+
 def _drive(entry: dict[str, Any]) -> Drive:
     return Drive(**{key: _from_entry(value) for key, value in entry.items()})
 
@@ -186,7 +211,7 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
     else:
         source, model = None, pin.Model()
         model.loadFromString(entry["model"])
-    return Mechanism(
+    mechanism = Mechanism(
         model,
         tuple(_loop(loop) for loop in entry["loops"]),
         q0=arrays["q0"],
@@ -199,6 +224,9 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         defaults=SimulationDefaults(**entry["defaults"]),
         notes=tuple(entry["notes"]),
     )
+    if entry.get("drive_starts"):
+        mechanism.__dict__["drive_curves"] = _drive_curves(mechanism.drives, entry["drive_starts"])
+    return mechanism
 
 
 def _events(
@@ -287,7 +315,9 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         meta = json.loads(str(arrays.pop("meta")))
         if meta["format"] != FORMAT:
             raise InputError(
-                f"it has format {meta['format']}, this version reads {FORMAT}", file=name
+                f"it has format {meta['format']}, this version reads {FORMAT}",
+                file=name,
+                remedy=OTHER_VERSION,
             )
         mechanism = _mechanism(meta["mechanism"], arrays)
         structure = meta["structure"]
@@ -320,7 +350,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         settings = Settings(**meta["settings"] | tuples)
         system = make_system(mechanism, _held(arrays, mechanism.model.nv))
         scheme = get_tableau(settings.tableau)
-        return Solution(
+        solution = Solution(
             mechanism,
             system,
             scheme,
@@ -334,13 +364,15 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
             stats=Statistics(**meta["stats"]),
             settings=settings,
         )
+        solution.request = request_from(meta.get("request"))
+        return solution
     except FileNotFoundError as error:
-        raise InputError("there is no such file", file=name) from error
+        raise InputError("there is no such file", file=name, remedy="Check the path") from error
     except InputError as error:
         raise error.located(name) from error
     except Exception as error:  # a damaged file makes NumPy and zipfile raise almost anything
         raise InputError(
-            f"it is no saved run: {error}",
+            f"it is not a saved run: {error}",
             file=name,
-            remedy="Give a file written by solution.save or srm-mbs simulate --out",
+            remedy=SAVED_BY,
         ) from error

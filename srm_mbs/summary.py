@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from srm_mbs.anchors import Anchor
 from srm_mbs.arrays import FloatArray
@@ -123,6 +124,19 @@ def _kind(joint: Any) -> str:
 
 def _unit(kind: str) -> str:
     return "m" if kind.startswith("prismatic") else "rad"
+
+
+def body_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(links, joint that carries it, mass, centre of mass in its frame) of each moving body."""
+    model = mechanism.model
+    links: dict[int, list[str]] = {}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            links.setdefault(int(frame.parentJoint), []).append(frame.name)
+    for k, name in enumerate(mechanism.joint_names, start=1):
+        inertia = model.inertias[k]
+        centre = _vector(map(_shown, inertia.lever)) + " m" if inertia.mass else ""
+        yield ", ".join(links.get(k, ())), name, f"{inertia.mass:.6g} kg", centre
 
 
 def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:

@@ -40,7 +40,7 @@ def check_covers(laws: Sequence[NamedLaw], t_end: float) -> None:
             raise InputError(
                 f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
                 element=element,
-                remedy="Continue the table, or end the run earlier",
+                remedy="Extend the table, or end the run earlier",
             )
 
 

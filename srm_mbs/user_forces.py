@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import pinocchio as pin
 
-from srm_mbs.anchors import Anchor
+from srm_mbs.anchors import Anchor, name_places
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.force_element import ForceElement
@@ -35,7 +35,7 @@ class UserForce(ForceElement):
     Raises
     ------
     InputError
-        If ``function`` cannot be called.
+        If ``function`` cannot be called, or ``at`` is no anchor.
     """
 
     type: ClassVar[str] = "user"
@@ -53,6 +53,7 @@ class UserForce(ForceElement):
         if not self.name:
             made = getattr(self.function, "__name__", "function").strip("<>")
             object.__setattr__(self, "name", f"user_{made}")
+        name_places(f"force {self.name!r}", self.at)
 
     def check(self, model: pin.Model) -> None:
         if self.at is None:

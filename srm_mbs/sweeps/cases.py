@@ -60,7 +60,7 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
         case = Case(index, name, parameters)
         if not isinstance(parameters, Mapping) or not all(isinstance(k, str) for k in parameters):
             raise InputError(
-                f"{parameters!r} is no set of parameters",
+                f"{parameters!r} is not a set of parameters",
                 element=case.where,
                 remedy="Give a dictionary: name of a parameter -> value",
             )
@@ -86,7 +86,7 @@ def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
         lengths = {}
     if len(lengths) < len(cases) or len(set(lengths.values())) != 1:
         raise InputError(
-            f"the columns have the lengths {lengths}" if lengths else "these are no columns",
+            f"the columns have the lengths {lengths}" if lengths else "these are not columns",
             element="cases",
             remedy="Give every parameter an array with one entry, or row, per case",
         )

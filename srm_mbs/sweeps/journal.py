@@ -75,7 +75,7 @@ class Journal:
         lines = data[:whole].splitlines()
         if not lines:
             if data and not json.dumps(head).encode().startswith(data):
-                raise self._fault("it is no file of a sweep")
+                raise self._fault("it is not a file of a sweep")
             return 0
         entries = []
         for number, line in enumerate(lines, 1):
@@ -95,13 +95,13 @@ class Journal:
     def _check(self, found: Any, head: Mapping[str, Any]) -> None:
         """Refuse the file of another sweep."""
         if not isinstance(found, dict) or found.get("format") != FORMAT:
-            raise self._fault("it is no file of a sweep, or of another format")
+            raise self._fault("it is not a file of a sweep, or is of another format")
         own, other = head["sweep"], found.get("sweep", {})
         different = [name for name in own if other.get(name) != own[name]]
         if found.get("version") != head["version"]:
             different.append(f"version of srm_mbs ({found.get('version')})")
         if different:
-            raise self._fault(f"it is of a sweep with another {', '.join(different)}")
+            raise self._fault(f"it belongs to a sweep with another {', '.join(different)}")
 
     def _fault(self, problem: str) -> InputError:
         return InputError(

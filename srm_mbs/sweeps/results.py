@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +19,8 @@ from srm_mbs.sweeps.tasks import Outcome
 
 if TYPE_CHECKING:
     import pandas
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ class Sweep:
         """
         table = _optional("pyarrow").table(self.table)
         _optional("pyarrow.parquet").write_table(table, str(path))
+        log.info("written: %s", path)
 
     def to_csv(self, path: str | Path) -> None:
         """Write the table as comma-separated values, with as many digits as give the floats back.

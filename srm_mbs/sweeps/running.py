@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from itertools import islice
@@ -118,7 +118,9 @@ def sweep(
             )
     if not isinstance(chunk, int) or chunk < 1:
         raise InputError(
-            f"chunk = {chunk!r} is no number of cases", element="chunk", remedy="Give 1 or more"
+            f"chunk = {chunk!r} is not a positive number of cases",
+            element="chunk",
+            remedy="Give 1 or more",
         )
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(
@@ -128,6 +130,8 @@ def sweep(
             "get_executor()",
         )
     _check_options(simulate_options)
+    if isinstance(simulate_options.get("events"), Iterator):  # for every run
+        simulate_options["events"] = list(simulate_options["events"])
     given = listed(mechanism, cases, free=options is not None)
     _, t_end = checked_span(simulate_options.get("t0", 0.0), t_end)
     task = Task(mechanism, t_end, measure, options, simulate_options)
@@ -141,17 +145,20 @@ def sweep(
             journal = stack.enter_context(Journal(Path(resume), task, given))
             outcomes |= journal.known
         resumed = len(outcomes)
-        log.debug("a sweep of %d cases, %d of them known", len(given), resumed)
+        log.info("sweep of %d cases, %d of them known", len(given), resumed)
         told = stack.enter_context(counting(progress, "cases", len(given)))
         missing = [case for case in given if case.index not in outcomes]
         finished = stack.enter_context(closing(_finished(task, missing, executor, chunk)))
         for case, outcome in finished:
             outcomes[case.index] = outcome
+            log.debug("%s: %s", case.where, outcome.message)
             if journal is not None:
                 journal.add(case, outcome)
             if told is not None:
                 told(len(outcomes), len(given))
-    return Sweep(given, [outcomes[case.index] for case in given], resumed)
+    found = Sweep(given, [outcomes[case.index] for case in given], resumed)
+    log.info("sweep ended: %s", found)
+    return found
 
 
 def _check_options(options: Mapping[str, Any]) -> None:

@@ -6,11 +6,16 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+import pinocchio as pin
+
+import srm_mbs as srm
+
 
 @contextlib.contextmanager
-def opened(browser: Any, address: str) -> Iterator[Any]:
+def opened(browser: Any, address: str, size: tuple[int, int] = (900, 600)) -> Iterator[Any]:
     """The loaded page; whatever it complains about, or asks the network for, is an error."""
-    context = browser.new_context(viewport={"width": 900, "height": 600})
+    context = browser.new_context(viewport={"width": size[0], "height": size[1]})
     page = context.new_page()
     complaints: list[str] = []
 
@@ -28,7 +33,33 @@ def opened(browser: Any, address: str) -> Iterator[Any]:
     if address.startswith("file:"):
         context.set_offline(True)
     page.goto(address)
-    page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
+    # The last frame: the page itself, or one in it.
+    page.frames[-1].wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
     yield page
     context.close()
     assert complaints == []
+
+
+BODIES = """t => {
+  if (t !== null) { viewer.animator.pause(); viewer.animator.seek(t); }
+  viewer.scene.updateMatrixWorld(true);
+  const root = viewer.scene_tree.find(["mechanism"]);
+  const world = root.object.matrixWorld.clone().invert();
+  const found = {};
+  for (const [name, node] of Object.entries(root.children))
+    found[name] = world.clone().multiply(node.object.matrixWorld).toArray();
+  return found;
+}"""
+
+
+def bodies_in(page: Any, t: float | None = None) -> dict[str, Any]:
+    """Placement (4, 4) of each body in a page or frame, at the animation's time ``t``."""
+    found = page.evaluate(BODIES, t)
+    return {name: np.array(matrix).reshape(4, 4).T for name, matrix in found.items()}
+
+
+def placements(mechanism: srm.Mechanism, q: Any) -> list[pin.SE3]:
+    """Of the ground and all joints, by Pinocchio's forward kinematics."""
+    data = mechanism.model.createData()
+    pin.forwardKinematics(mechanism.model, data, np.array(q))
+    return [pin.SE3(placement) for placement in data.oMi]

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
-from srm_mbs.compiled.run import CompiledRun
+from srm_mbs.compiled.run import ARRIVAL, CompiledRun
 from srm_mbs.compiled.twin import twin_of
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm
@@ -41,6 +41,7 @@ def control_state(control: Any) -> dict[str, Any]:
         "redone": 0,
         "limit": np.inf,
         "tries": 0,
+        "arrival": 0,
     }
     while True:
         if isinstance(control, BranchGuard):
@@ -51,6 +52,7 @@ def control_state(control: Any) -> dict[str, Any]:
                 "zero": np.nan if control._zero is None else control._zero,
                 "redo": 0.0 if control._redo is None else control._redo,
                 "redone": control._redone,
+                "arrival": int(control._arrival),
             }
         elif isinstance(control, SlopeOfSigma):
             state |= {"slope": control._slope}
@@ -94,6 +96,8 @@ class Comparison:
         How many attempts there were, how many used the zone, how many were redone.
     entered
         How many breakpoints were passed.
+    arrivals
+        How many ends beside singular configurations were prepared for.
     """
 
     h: float = 0.0
@@ -110,6 +114,7 @@ class Comparison:
     zones: int = 0
     replaced: int = 0
     entered: int = 0
+    arrivals: int = 0
 
 
 def compare(
@@ -124,6 +129,7 @@ def compare(
     max_step: float = np.inf,
     controller: Any = None,
     breakpoints: tuple[float, ...] = (),
+    arrivals: bool = True,
 ) -> Comparison:
     """Run the reference and repeat each of its attempts on the kernel."""
     method = srm.PSRM(tableau, eps=eps)
@@ -141,7 +147,7 @@ def compare(
     order = scheme.controller_order or 1
     first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
     control, _ = placed_control(
-        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0)
+        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0), arrivals
     )
     run = CompiledRun(
         twin,
@@ -154,6 +160,7 @@ def compare(
         first_step=first,
         max_step=max_step,
         placed=placement,
+        arrivals=arrivals,
     )
     out = Comparison()
     one = np.concatenate([norm.one, norm.one])[: 2 * system.nv]
@@ -171,8 +178,13 @@ def compare(
             out.rates = max(out.rates, float(np.max(np.abs(change) / (np.abs(memory.rate) + one))))
         limit = min(max_step, system.step_limit(x))
         # Before the reference proposes: its proposal writes the slope into the memory.
-        _, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
+        stop, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
         proposal = control.propose(t, limit, memory)
+        assert proposal.arriving == (stop == ARRIVAL)
+        if proposal.arriving:
+            memory = passing.arrive(t, x, memory)
+            out.arrivals += 1
+            continue
         try:
             result = method.step(system, t, proposal.h, x, memory, norm)
         except EvaluationError:

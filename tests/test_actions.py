@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -218,6 +219,65 @@ def test_a_drive_lets_go(backend: str) -> None:
     assert on.q[-1, 0] == pytest.approx(float(free.q0[0]) + speed * 0.9, abs=1e-11)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("law", [srm.ConstantSpeed(speed=6.0), srm.Sine(amplitude=0.4, omega=9.0)])
+def test_a_drive_engages_where_it_finds_its_joint(law: Any, backend: str, tmp_path: Path) -> None:
+    free = srm.load("slider_crank_regular")
+    driven = replace(free, drives=[srm.Drive(law, joint="crank")])
+    event = srm.Event(clock(0.3), action=lambda t, q, v: srm.Switch(driven))
+    run = srm.simulate(free, 0.8, events=event, backend=backend, rtol=1e-9)
+    assert run.success, run.message
+    curve = law.curve()
+    t = np.linspace(0.3, 0.8, 21)
+    found = run(t)[0][:, 0]
+    wanted = np.array([curve(s)[0] for s in t])
+    assert np.abs(found - wanted - (run(0.3)[0][0] - wanted[0])).max() < 1e-12
+    # The rates jump as the closures have it; from there the motion is that of a driven start.
+    before, after = run.segments  # type: ignore[attr-defined]
+    assert np.abs(after.q[0] - before.q[-1]).max() < 1e-9
+    assert after.v[0, 0] == pytest.approx(curve(0.3)[1], abs=1e-12)
+    assert run.drift.max() < 1e-9
+    run.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    assert np.array_equal(loaded.drive_forces["crank"], run.drive_forces["crank"])
+
+
+@pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-9])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_an_event_may_act_next_to_a_singular_configuration(backend: str, beside: float) -> None:
+    mechanism = srm.load("slider_crank")
+    plain = srm.simulate(mechanism, 3.0, rtol=1e-11)
+    at = plain.crossings[0].time + beside
+    event = srm.Event(clock(at), action=lambda t, q, v: (q, v))
+    run = srm.simulate(mechanism, 3.0, rtol=1e-9, events=event, backend=backend)
+    assert run.success, run.message
+    assert np.abs(run.q[-1] - plain.q[-1]).max() < 1e-9
+    assert run.drift.max() < 1e-10
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_state_from_which_no_run_can_start_ends_the_run_with_everything_kept(
+    backend: str,
+) -> None:
+    mechanism = srm.load("slider_crank")
+    (passage, *_) = srm.simulate(mechanism, 2.0, rtol=1e-10).crossings
+    stop = srm.Event(clock(passage.time), action=lambda t, q, v: (q, 0.0 * v))
+    run = srm.simulate(mechanism, 2.0, rtol=1e-10, events=stop, backend=backend)
+    assert run.status == "failed"
+    assert "after the action" in run.message
+    assert "singular" in run.message
+    assert run.t[-1] == pytest.approx(passage.time)
+
+
+def test_ctrl_c_in_an_action_keeps_the_segments(ball: srm.Mechanism) -> None:
+    def stopped(t: float, q: Any, v: Any) -> None:
+        raise KeyboardInterrupt
+
+    run = srm.simulate(ball, 1.0, events=srm.Event(clock(0.25), action=stopped))
+    assert run.status == "interrupted"
+    assert run.t[-1] == pytest.approx(0.25)
+
+
 def test_an_impact_in_a_loop_keeps_the_loop_and_loses_the_energy_it_should() -> None:
     """The crank hits a stop: with one degree of freedom the whole velocity turns, times e."""
     mechanism = srm.load("slider_crank")
@@ -254,6 +314,41 @@ def test_an_impact_of_two_masses_conserves_momentum() -> None:
     pair = srm.Mechanism(model, q0=[0.0, 1.0], v0=[3.0, -1.0])
     assert srm.impact(pair, pair.q0, pair.v0, [-1.0, 1.0], 1.0) == pytest.approx([-1.0, 3.0])
     assert srm.impact(pair, pair.q0, pair.v0, [-1.0, 1.0], 0.0) == pytest.approx([1.0, 1.0])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+@pytest.mark.parametrize("lower", [0.0, 1e-13, 1e-10])
+def test_impacts_that_are_simultaneous_but_for_rounding_all_act(
+    lower: float, rtol: float, backend: str
+) -> None:
+    model = pin.Model()
+    for name in "abc":
+        index = model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(index, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+
+    def stop(gap: Any, k: int) -> srm.Event:
+        def hit(t: float, q: Any, v: Any) -> Any:
+            v[k] *= -1.0
+            return q, v
+
+        return srm.Event(gap, direction=-1, action=hit)
+
+    stops = [
+        stop(lambda t, q, v: q[0], 0),
+        stop(lambda t, q, v: np.sin(q[1]), 1),
+        stop(lambda t, q, v: q[2] ** 3 + q[2], 2),
+    ]
+    balls = srm.Mechanism(model, q0=[0.7, 0.7, 0.7 - lower])
+    solution = srm.simulate(balls, 1.0, events=stops, rtol=rtol, backend=backend)
+    assert solution.success, solution.message
+    assert solution.t_events is not None
+    first = np.sqrt(1.4 / G)
+    for times in solution.t_events:
+        assert times == pytest.approx([first], abs=1e-9)
+    rest = 1.0 - first
+    exact = np.sqrt(1.4 * G) * rest - 0.5 * G * rest**2
+    assert solution.q[-1] == pytest.approx([exact] * 3, abs=1e-8)
 
 
 def test_terminal_events_count_over_all_segments(ball: srm.Mechanism) -> None:
@@ -356,3 +451,18 @@ def test_bad_events_and_loops_are_refused(ball: srm.Mechanism) -> None:
     pinned = srm.load("slider_crank")
     with pytest.raises(srm.InputError, match="used twice"):
         pinned.with_loop(pinned.loops[0])
+
+
+def test_forces_of_a_drive_that_lets_go_are_those_of_its_time() -> None:
+    free = srm.load("slider_crank")
+    crank = srm.Drive(srm.ConstantSpeed(4.0), joint="crank")
+    driven = srm.Mechanism(free.model, free.loops, drives=(crank,), q0=free.q0, v0=[4.0, -8.0])
+    event = srm.Event(clock(0.3), action=lambda t, q, v: srm.Switch(driven.without_drive("crank")))
+    solution = srm.simulate(driven, 0.6, events=[event])
+    before = srm.simulate(driven, 0.3).at([0.1, 0.2])
+    read = solution.at([0.1, 0.5, 0.2])
+    np.testing.assert_allclose(
+        read.drive_forces["crank"][[0, 2]], before.drive_forces["crank"], rtol=1e-4
+    )
+    assert read.drive_forces["crank"][1] == 0.0
+    np.testing.assert_array_equal(read.drive_rates["crank"], [4.0, 0.0, 4.0])

@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 import srm_mbs as srm
+from srm_mbs.systems.units import counted_turns
 from tests.mechanisms import along_x, rod
 
 Z = pin.JointModelRZ
@@ -161,6 +162,9 @@ def test_a_crank_that_cannot_be_there_has_no_modes_and_a_singular_one_is_marked(
         srm.assembly_modes(mechanism, hold=[], starts=20)
     with pytest.raises(srm.InputError, match="without loops"):
         srm.assembly_modes(srm.load("pendulum_chain"))
+    for starts in (np.nan, "many", 2.5):
+        with pytest.raises(srm.InputError, match="is not a positive whole number"):
+            srm.assembly_modes(mechanism, {"crank": 1.0}, starts=starts)
     with pytest.raises(srm.InputError, match="starts = 0"):
         srm.assembly_modes(mechanism, starts=0)
     fold = srm.assembly_modes(srm.load("slider_crank"), {"crank": 0.5 * np.pi}, starts=20)
@@ -173,3 +177,47 @@ def test_the_same_seed_finds_the_same() -> None:
     assert first[0].held == ("crank_left", "crank_right")
     assert [mode.found for mode in first] == [mode.found for mode in again]
     np.testing.assert_array_equal(first[-1].q, again[-1].q)
+
+
+def guided_rod(*joints: object) -> srm.Mechanism:
+    """A crank and a rod on ``joints``, the rod's tip on a line beside the crank's plane."""
+    model = pin.Model()
+    parent = model.addJoint(0, Z(), pin.SE3.Identity(), "crank")
+    model.appendBodyToJoint(parent, rod(), pin.SE3.Identity())
+    place = along_x(1.0)
+    for k, joint in enumerate(joints):
+        parent = model.addJoint(parent, joint, place, f"rod_{k}")
+        place = pin.SE3.Identity()
+    model.appendBodyToJoint(parent, rod(1.0, 2.5), pin.SE3.Identity())
+    model.addBodyFrame("rod", parent, pin.SE3.Identity(), 0)
+    tip, line = srm.Anchor("rod", xyz=(2.5, 0.0, 0.0)), srm.Anchor("world", xyz=(0.0, 0.0, 0.4))
+    guide = srm.LoopClosure("point_on_line", tip, line, axis=(1.0, 0.0, 0.0), name="guide")
+    mechanism = srm.Mechanism(model, (guide,), q0=np.array([0.7, 0.1, -1.0]))
+    state = srm.assemble(mechanism, hold=["crank"])
+    return mechanism.with_state(state.q, state.v)
+
+
+def test_whole_turns_of_a_universal_joint_are_no_further_modes() -> None:
+    """It has the modes of the two hinges that it consists of."""
+    y, z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    cross = guided_rod(pin.JointModelUniversal(y, z))
+    hinges = guided_rod(pin.JointModelRY(), Z())
+    found, expected = ([mode.q for mode in srm.assembly_modes(m)] for m in (cross, hinges))
+    assert len(expected) == 4
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_screw_counts_turns_that_do_not_lead_back_and_a_hinge_turns_that_do() -> None:
+    model = pin.Model()
+    x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    parent = 0
+    for name, joint in {
+        "hinge": pin.JointModelRevoluteUnaligned(y),
+        "screw": pin.JointModelHX(0.01),
+        "slide": pin.JointModelPX(),
+        "cross": pin.JointModelUniversal(x, y),
+        "endless": pin.JointModelRUBX(),
+        "ball": pin.JointModelSpherical(),
+    }.items():
+        parent = model.addJoint(parent, joint, pin.SE3.Identity(), name)
+    np.testing.assert_array_equal(counted_turns(model), [1, 0, 0, 1, 1, 0, 0, 0, 0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +158,7 @@ DESCRIPTION_FAULTS = {
     "an absent urdf": ("two_bars.urdf", "other.urdf", ("'other.urdf'", "no such file", "relative")),
     "a folder as urdf": ('"two_bars.urdf"', '"."', ("urdf", "irectory", "relative")),
     "an empty urdf": ('"two_bars.urdf"', '""', ("urdf", "irectory", "relative")),
-    "a null in urdf": ("two_bars.urdf", "two\\u0000bars.urdf", ("urdf", "no file name")),
+    "a null in urdf": ("two_bars.urdf", "two\\u0000bars.urdf", ("urdf", "not a file name")),
     "an overlong urdf": ("two_bars.urdf", "a" * 5000, ("urdf", "cannot be read")),
     "an unknown base": ('"fixed"', '"fixd"', ("base", "'fixed', 'floating' or 'planar'", "'fixd'")),
     "a number for base": ('"fixed"', "1", ("base", "'floating'")),
@@ -364,9 +365,9 @@ def test_files_of_other_formats_are_refused_by_their_content(
     name: str, text: str, needle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / name).write_text(text)
-    refusal(tmp_path / name, needle, "Formats: ", "URDF")
+    refusal(tmp_path / name, needle, "Known: ", "URDF")
     monkeypatch.chdir(tmp_path)
-    refusal(f"./{name}", needle, "Formats: ", "URDF", file=name)
+    refusal(f"./{name}", needle, "Known: ", "URDF", file=name)
 
 
 @pytest.mark.parametrize("name", ["robot.xml", "robot.urdf.xacro", "robot.yaml", "robot.toml"])
@@ -730,6 +731,12 @@ def test_inertia_that_no_body_has_is_a_warning(tmp_path: Path) -> None:
     assert any("'crank'" in note and "triangle" in note for note in mechanism.notes)
 
 
+def test_limits_that_leave_nothing_between_them_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "two_bars.urdf").write_text(URDF.replace('lower="-10"', 'lower="11"'))
+    (note,) = srm.load(tmp_path / "two_bars.urdf").notes
+    assert note == "joint 'hinge': its limits are none: lower = 11 is above upper = 10"
+
+
 def test_cutting_a_urdf_anywhere_raises_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "cut.urdf"
     for at in range(0, len(URDF), 13):
@@ -812,3 +819,48 @@ def test_joints_out_of_depth_first_order_are_refused() -> None:
         model.appendBodyToJoint(joint, body, pin.SE3.Identity())
     with pytest.raises(srm.InputError, match=r"'d' continues a branch.*'c'.*depth first"):
         srm.Mechanism(model)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda: srm.LoopClosure("point", "rod", srm.Anchor("world")),
+        lambda: srm.SpringDamper("crank", "world", 1.0, rest_length=1.0),
+        lambda: srm.Bushing(srm.Anchor("crank"), "world", (1.0,) * 6),
+        lambda: srm.Wrench("crank", (1.0, 0.0, 0.0)),
+        lambda: srm.UserForce(lambda t, q, v: np.zeros(6), at="crank"),
+        lambda: srm.Drive(srm.ConstantSpeed(1.0), a="crank", b="world", distance=True),
+    ],
+)
+def test_a_name_in_the_place_of_an_anchor_is_refused(made: Any) -> None:
+    with pytest.raises(srm.InputError, match=r"is not an anchor. Give for example srm.Anchor\("):
+        made()
+
+
+@pytest.mark.parametrize(
+    ("what", "given"),
+    [
+        ("forces", srm.TorsionSpring("crank", 1.0)),
+        ("forces", ["torsion_spring"]),
+        ("forces", [lambda t, q, v: v]),
+        ("drives", srm.Drive(srm.ConstantSpeed(1.0), "crank")),
+        ("drives", "crank"),
+        ("loops", srm.LoopClosure("point", srm.Anchor("coupler"), srm.Anchor("world"))),
+    ],
+)
+def test_elements_that_are_no_list_of_them_are_refused(what: str, given: Any) -> None:
+    mechanism = srm.load("four_bar")
+    with pytest.raises(srm.InputError, match=f"{what} = .* is not a list of {what}"):
+        replace(mechanism, **{what: given})
+
+
+@pytest.mark.parametrize("what", ["gravity", "damping"])
+def test_gravity_and_damping_that_are_not_finite_are_refused(what: str) -> None:
+    mechanism = srm.load("four_bar")
+    model = mechanism.model.copy()
+    numbers = model.gravity.linear if what == "gravity" else model.damping
+    numbers[0] = np.nan
+    if what == "gravity":
+        model.gravity.linear = numbers
+    with pytest.raises(srm.InputError, match=f"the {what} of the model is not finite"):
+        replace(mechanism, model=model)

@@ -309,6 +309,27 @@ def test_a_saved_run_knows_what_was_held(slider_crank: srm.Mechanism, tmp_path: 
     assert np.array_equal(loaded.reactions["pin"], solution.reactions["pin"])
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_controller_may_return_the_same_array_every_time(
+    slider_crank: srm.Mechanism, backend: str
+) -> None:
+    buffer = np.zeros(2)
+
+    def reusing(t: float, q: Any, v: Any) -> Any:
+        buffer[0] = np.sin(9.0 * t) - v[0]
+        return buffer
+
+    runs = [
+        srm.simulate(slider_crank, 1.0, controller=controller, sample_time=0.1, backend=backend)
+        for controller in (reusing, lambda t, q, v: reusing(t, q, v).copy())
+    ]
+    t = np.linspace(0.0, 1.0, 37)
+    same, fresh = (run.at(t) for run in runs)
+    assert np.array_equal(same.q, fresh.q)
+    assert np.array_equal(same.reactions["pin"], fresh.reactions["pin"])
+    assert abs(same.energy_balance.relative) < 1e-6
+
+
 def test_a_controller_that_fails_at_a_sample_ends_the_run_there(
     slider_crank: srm.Mechanism,
 ) -> None:
@@ -351,7 +372,6 @@ def test_many_breakpoints_cost_little(slider_crank: srm.Mechanism) -> None:
     solution = srm.simulate(slider_crank, 1.0, breakpoints=times, backend="kernel")
     assert solution.stats.steps <= 20_010
     assert solution.stats.evaluations <= 13 * 20_010
-    assert solution.stats.wall_time < 5.0
 
 
 def test_pieces_join_times_that_no_step_fits_between() -> None:
@@ -371,11 +391,12 @@ def test_pieces_join_times_that_no_step_fits_between() -> None:
     ("options", "message"),
     [
         ({"breakpoints": [[0.1]]}, "breakpoints has shape"),
-        ({"breakpoints": ["x"]}, "not finite numbers"),
-        ({"breakpoints": [np.nan]}, "not finite numbers"),
+        ({"breakpoints": ["x"]}, "does not consist of finite numbers"),
+        ({"breakpoints": [np.nan]}, "does not consist of finite numbers"),
         ({"sample_time": 0.1}, "no controller"),
         ({"sample_time": 0.0, "controller": torque}, "not a positive number"),
-        ({"sample_time": 1e-12, "controller": torque}, "samples"),
+        ({"sample_time": 1e-12, "controller": torque}, r"makes 1e\+12 samples"),
+        ({"sample_time": 1e-310, "controller": torque}, "makes inf samples"),
         ({"breakpoints": [0.5], "singular_times": [0.5]}, "a step must end at 0.5 s"),
     ],
 )

@@ -83,6 +83,35 @@ def test_one_degree_of_freedom_moves_as_the_equation_of_that_one(name: str) -> N
     np.testing.assert_allclose(v[:, i], expected[1], atol=1e-6)
 
 
+@pytest.mark.parametrize("leg", ["left_0", "right_1"])
+def test_the_feet_of_jansens_walker_draw_his_curve_with_a_flat_bottom(leg: str) -> None:
+    solution = run("jansen_walker", 1.6)
+    mechanism, model = solution.mechanism, solution.mechanism.model
+    turned = solution.q[:, mechanism.joint("crank").idx_q]
+    assert np.ptp(turned) > 2.0 * np.pi
+
+    # The foot is a triangle of bars g, h and i; its frame is in the pin between g and i.
+    g, h, i = 0.367, 0.657, 0.49
+    foot = model.getJointId(f"{leg}_foot")
+    (ankle,) = (loop.b.xyz for loop in mechanism.loops if loop.name == f"{leg}_ankle")
+    assert np.linalg.norm(ankle) == pytest.approx(g)
+    middles = (g + h + i) * model.inertias[foot].lever  # of the bars, weighted
+    tip = (2.0 * middles - (g + h) * np.array(ankle)) / (h + i)
+    assert np.linalg.norm(tip) == pytest.approx(i)
+    assert np.linalg.norm(tip - ankle) == pytest.approx(h)
+
+    data = model.createData()
+
+    def place(q: np.ndarray) -> np.ndarray:
+        pin.forwardKinematics(model, data, q)
+        return data.oMi[foot].act(tip)
+
+    x, _, z = np.array([place(solution(t)[0]) for t in np.linspace(0.0, 1.6, 400)]).T
+    assert np.ptp(x[z < z.min() + 0.005]) > 0.4
+    assert np.ptp(x) == pytest.approx(0.68, abs=0.03)
+    assert np.ptp(z) == pytest.approx(0.225, abs=0.02)
+
+
 def test_the_simple_pendulum_follows_its_elliptic_function() -> None:
     """From rest at 90 degrees from hanging: sin(phi / 2) = k sn(K - w t), k = sin(45 degrees)."""
     t = np.linspace(0.0, 10.0, 101)

@@ -250,6 +250,13 @@ def test_options_override_the_description(describe: Any, tmp_path: Path) -> None
     assert (settings.tableau, settings.rtol, set(settings.atol)) == ("dopr54", 1e-5, {1e-6})
 
 
+def test_simulate_uses_the_tableau_of_the_method_where_none_is_given(tmp_path: Path) -> None:
+    out = tmp_path / "run.npz"
+    for method, own in (("psrm", srm.PSRM()), ("srm", srm.SRM())):
+        run("simulate", "four_bar", "--t-end", 0.01, "--method", method, "--out", out)
+        assert srm.load_solution(out).settings.tableau == own.tableau
+
+
 def test_simulate_with_a_fixed_step_takes_that_many() -> None:
     output = run("simulate", "four_bar", "--t-end", 0.5, "--step", 0.05)
     assert row(output, "steps") == "10"
@@ -315,9 +322,9 @@ def test_interrupted_run_is_written_and_exits_with_1(tmp_path: Path) -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     with process:
-        next(line for line in process.stderr if "degrees of freedom" in line)  # loaded
+        next(line for line in process.stderr if "from t = 0 to 1e+06 s" in line)  # begun
         with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(timeout=1.5)
+            process.wait(timeout=0.5)
         process.send_signal(signal.SIGINT)
         output, messages = process.communicate(timeout=30)
     assert process.returncode == 1, messages
@@ -363,17 +370,21 @@ def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> Non
 @pytest.mark.parametrize(
     ("args", "start"),
     [
-        (("info", "nonsense"), "error: there is no bundled mechanism 'nonsense'. Bundled: "),
+        (("info", "nonsense"), "error: there is no bundled mechanism 'nonsense'. Known: "),
         (("info", "nonsense.toml"), "error: nonsense.toml: there is no such file"),
-        (("simulate", "four_bar", "--t-end", 0), "error: t_end: "),
-        (("simulate", "four_bar", "--t-end", "inf"), "error: t_end: "),
-        (("simulate", "four_bar", "--rtol", -1), "error: rtol: "),
-        (("simulate", "four_bar", "--atol", 0), "error: atol: "),
-        (("simulate", "four_bar", "--step", "nan"), "error: step: "),
-        (("simulate", "four_bar", "--method", "rattle"), "error: method: "),
-        (("simulate", "four_bar", "--tableau", "rk5"), "error: tableau: "),
-        (("simulate", "four_bar", "--tableau", "erk4"), "error: tableau: "),
-        (("simulate", "four_bar", "--backend", "fortran"), "error: backend: "),
+        (("simulate", "four_bar", "--t-end", 0), "error: --t-end: "),
+        (("simulate", "four_bar", "--t-end", "inf"), "error: --t-end: "),
+        (("simulate", "four_bar", "--rtol", -1), "error: --rtol: "),
+        (("simulate", "four_bar", "--atol", 0), "error: --atol: "),
+        (("simulate", "four_bar", "--step", "nan"), "error: --step: "),
+        (("simulate", "four_bar", "--method", "rattle"), "error: --method: "),
+        (("simulate", "four_bar", "--tableau", "rk5"), "error: --tableau: "),
+        (("simulate", "four_bar", "--tableau", "erk4"), "error: --tableau: "),
+        (("simulate", "four_bar", "--backend", "fortran"), "error: --backend: "),
+        (
+            ("simulate", "four_bar", "--image", "a.png", "--at", 11),
+            "error: --at: 11 s lies outside",
+        ),
         (("plot", "nonsense.npz"), "error: nonsense.npz: there is no such file"),
         (("play", "nonsense.npz"), "error: nonsense.npz: there is no such file"),
         (("plot", "none/run.npz"), "error: none/run.npz: there is no such file"),
@@ -425,7 +436,7 @@ def test_something_else_than_a_saved_run_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
     path.write_text("not a run")
     line = error_line(run("plot", path, status=2))
-    assert line.startswith(f"error: {path}: it is no saved run")
+    assert line.startswith(f"error: {path}: it is not a saved run")
     assert not path.with_suffix(".png").exists()
 
 
@@ -495,7 +506,7 @@ def test_piped_errors_are_not_wrapped_to_the_width_of_a_terminal(describe: Any) 
     done = run_apart("info", path, COLUMNS="40")
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"error: {path}: initial.gues: unknown key 'gues'. Known here: ")
+    assert line.startswith(f"error: {path}: initial.gues: unknown key 'gues'. Known: ")
 
 
 def test_piped_tables_are_not_wrapped_to_the_width_of_a_terminal() -> None:

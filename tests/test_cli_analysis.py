@@ -83,8 +83,11 @@ def test_simulate_prints_the_balance_when_asked() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("modes", "four_bar", "--hold", "crank=x"), "'crank=x' is no joint with a value"),
+        (("modes", "four_bar", "--hold", "crank=x"), "'crank=x' is not a joint with a value"),
         (("modes", "four_bar", "--hold", "crank=1,2"), "a held joint takes one value"),
+        (("modes", "four_bar", "--seed", -1), "--seed: seed = -1 is not a natural number"),
+        (("modes", "four_bar", "--hold", "crank=1", "--hold", "crank"), "'crank' is given twice"),
+        (("drag", "four_bar", "crank=1", "crank=2"), "joint 'crank' is given twice"),
         (("equilibrium", "four_bar", "--hold", "wheel"), "there is no joint 'wheel'"),
         (("linearise", "four_bar", "--at", "here"), "there is no state 'here'"),
         (("linearise", "four_bar", "--html", "x.txt"), "the suffix '.txt' is not known here"),

@@ -269,8 +269,8 @@ WRONG: dict[str, tuple[str, str]] = {
     ),
     "too few": ('joints = ["a_joint", "b_joint"]\ncoefficients = [1.0]', "2 finite numbers"),
     "a zero": ('joints = ["a_joint", "b_joint"]\nratio = 0.0', "is zero. Remove that joint"),
-    "twice": ('joints = ["a_joint", "a_joint"]\nratio = 1.0', "stands there twice"),
-    "none": ("joints = []\ncoefficients = []", "no list of names"),
+    "twice": ('joints = ["a_joint", "a_joint"]\nratio = 1.0', "is named twice"),
+    "none": ("joints = []\ncoefficients = []", "not a list of names"),
     "unknown": ('joints = ["a_joint", "c"]\nratio = 1.0', "no moving joint 'c'. Known: a_joint, b"),
     "locked": ('joints = ["a_joint", "b_joint"]\nratio = 1.0\nX', "joint 'b_joint' is locked"),
     "anchors": (

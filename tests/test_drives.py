@@ -346,14 +346,6 @@ def test_a_start_that_does_not_follow_the_drives_is_refused() -> None:
         srm.simulate(mechanism, 1.0, v0=np.zeros(mechanism.model.nv))
 
 
-def test_a_driven_start_on_a_singular_configuration_is_refused() -> None:
-    mechanism = srm.load("slider_crank")
-    drives = (srm.Drive(srm.ConstantSpeed(1.0), "crank"),)
-    top = replace(mechanism, drives=drives, q0=[0.5 * np.pi, -np.pi], v0=[1.0, -2.0])
-    with pytest.raises(srm.InputError, match=r"singular configuration.*driven motion cannot begin"):
-        srm.simulate(top, 1.0)
-
-
 def test_an_absolute_table_places_the_start() -> None:
     t = np.linspace(0.0, 1.0, 5)
     table = srm.Table(t, 1.1 + 0.2 * t)
@@ -487,7 +479,7 @@ def test_a_description_reads_tables_beside_it_and_saved_runs_keep_them(tmp_path:
 @pytest.mark.parametrize(
     ("drive", "words"),
     [
-        ('joint = "crank"\ntype = "jump"', "no law of type 'jump'.*knows constant_speed"),
+        ('joint = "crank"\ntype = "jump"', "no law of type 'jump'.*Known: constant_speed"),
         ('joint = "crank"\ntype = "sine"\nspeed = 1.0', "type 'sine' takes no speed"),
         ('joint = "crank"\ntype = "constant_speed"', "needs speed"),
         ('joint = "wheel"\ntype = "constant_speed"\nspeed = 1.0', "no moving joint 'wheel'"),

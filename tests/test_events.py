@@ -148,7 +148,7 @@ def test_nothing_of_the_run_goes_beyond_a_terminal_event(slider_crank: srm.Mecha
     assert solution.crossings == ()
     assert len(solution.drift) == len(solution.energy) == len(solution.t)
     assert solution.drift[-1, 0] < 1e-8
-    with pytest.raises(ValueError, match="dense output covers"):
+    with pytest.raises(ValueError, match="the run covers"):
         solution(end + 1e-3)
     assert scene.sample_motion(solution, (1,), 30.0).times[-1] == solution.t[-1]
     assert solution.plot().axes[-1].get_xlim()[1] < end + 0.02
@@ -279,6 +279,22 @@ def test_events_change_neither_steps_nor_states(slider_crank: srm.Mechanism) -> 
     assert np.array_equal(plain.q, watched.q)
     # three extra stages of dop853 in each step
     assert watched.stats.evaluations == plain.stats.evaluations + 3 * plain.stats.steps
+
+
+def test_events_may_come_from_a_generator(slider_crank: srm.Mechanism) -> None:
+    listed = srm.simulate(slider_crank, 5.0, events=[rate])
+    made = srm.simulate(slider_crank, 5.0, events=(event(rate) for _ in range(2)))
+    assert np.array_equal(times(made, 1), times(listed))
+    assert made.request is not None
+    assert len(list(made.request.options["events"])) == 2
+    swept = srm.sweep(
+        slider_crank,
+        [{}, {}],
+        5.0,
+        events=(event(rate) for _ in range(2)),
+        measure=lambda run: {"found": len(times(run, 1))},
+    )
+    assert swept.table["found"].tolist() == [len(times(listed))] * 2
 
 
 def test_events_see_copies(slider_crank: srm.Mechanism) -> None:

@@ -107,6 +107,7 @@ def test_what_cannot_be_dragged_is_refused() -> None:
     for values, what in (
         ({"wheel": 1.0}, "no joint 'wheel'"),
         ({"crank": np.nan}, "cannot be dragged along"),
+        ({"crank": "up"}, "cannot be dragged along"),
         ({"crank": [1.0, 2.0], "rocker": [1.0]}, r"have \[2, 1\] values"),
         ({}, r"have \[\] values"),
         ({"crank": 1.0, "rocker": 1.4}, "independently"),

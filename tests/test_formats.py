@@ -77,7 +77,7 @@ def test_a_description_names_a_file_of_another_format(tmp_path: Path) -> None:
         ('urdf = "robot.sdf"', "'robot.sdf' is a SDF, not a URDF. Write sdf = \"robot.sdf\""),
         ('sdf = "robot.urdf"', "'robot.urdf' is a URDF, not a SDF. Write urdf = \"robot.urdf\""),
         ('urdf = "robot.toml"', "'robot.toml' is a TOML description, not a URDF"),
-        ('sdf = "none.sdf"', "cannot read the SDF 'none.sdf'"),
+        ('sdf = "none.sdf"', "the SDF 'none.sdf' cannot be read"),
         ('sdf = "robot.sdf"\nurdf = "robot.urdf"', "urdf and sdf are both given"),
         ('sdf = "robot.sdf"\ncut = "joint"', "cut: a list is wanted"),
         ('sdf = "robot.sdf"\ncut = ["no such joint"]', "no such joint"),

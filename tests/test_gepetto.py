@@ -100,10 +100,10 @@ def test_meshes_and_faults_belong_to_the_urdf(tmp_path: Path) -> None:
 FAULTS = {
     "unequal closures": ("closed_loop: [[a, b]]\ntype: []\n", "type: it has 0 entries"),
     "unequal joints": ("joint_name: [hip]\n", "joint_type: it has 0 entries, joint_name has 1"),
-    "no pair": ("closed_loop: [[loop1_1]]\ntype: [3d]\n", "no pair of frames"),
+    "no pair": ("closed_loop: [[loop1_1]]\ntype: [3d]\n", "not a pair of frames"),
     "no frame": ("closed_loop: [[loop1_1, loop3]]\ntype: [3d]\n", "no frame 'loop3'"),
     "another type": ("closed_loop: [[loop1_1, loop1_2]]\ntype: [5d]\n", "no type '5d'"),
-    "a number for a type": ("closed_loop: [[loop1_1, loop1_2]]\ntype: [6]\n", "6 is no text"),
+    "a number for a type": ("closed_loop: [[loop1_1, loop1_2]]\ntype: [6]\n", "6 is not text"),
     "no joint": ("joint_name: [hop]\njoint_type: [FIXED]\n", "no joint 'hop'"),
     "a fixed joint": ("joint_name: [loop1_1_frame]\njoint_type: [FIXED]\n", "it stays"),
     "another joint type": ("joint_name: [hip]\njoint_type: [BALL]\n", "no type 'BALL'"),
@@ -117,7 +117,7 @@ FAULTS = {
     "aliases of aliases": (
         "closed_loop: [&a [x, x, x], &b [*a, *a, *a], &c [*b, *b, *b], &d [*c, *c, *c], [*d, *d]]\n"
         "type: [3d, 3d, 3d, 3d, 3d]\n",
-        "no pair of frames",
+        "not a pair of frames",
     ),
     "an object": ("closed_loop: !!python/object:os.system []\n", "not valid YAML"),
 }

@@ -136,6 +136,12 @@ def test_a_prescribed_crank_turns_uniformly() -> None:
     np.testing.assert_array_equal(same.torques, found.torques)
 
 
+def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:
+    mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
+    for motion in (run, lambda t: (run.q[0], run.v[0], run.accelerations[0])):
+        assert srm.inverse_dynamics(mechanism, motion, "crank", t=[]).torques.shape == (0, 1)
+
+
 def test_motions_that_cannot_be_are_refused() -> None:
     mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
     t, q, v, a = run.t, run.q, run.v, run.accelerations
@@ -150,6 +156,13 @@ def test_motions_that_cannot_be_are_refused() -> None:
         srm.inverse_dynamics(mechanism, (t, q, v), "crank")
     with pytest.raises(srm.InputError, match="needs times"):
         srm.inverse_dynamics(mechanism, lambda t: (q[0], v[0], a[0]), "crank")
+    for told in (None, (q[0], v[0]), (q[0], v, a[0]), ("a", v[0], a[0])):
+        with pytest.raises(srm.InputError, match="a motion of shapes"):
+            srm.inverse_dynamics(mechanism, lambda t, told=told: told, "crank", t=[0.0, 0.1])
+    with pytest.raises(srm.InputError, match="t = 'soon' does not consist of finite numbers"):
+        srm.inverse_dynamics(mechanism, lambda t: (q[0], v[0], a[0]), "crank", t="soon")
+    with pytest.raises(srm.InputError, match="weights = 'light' does not consist"):
+        srm.inverse_dynamics(mechanism, run, "crank", weights="light")
     with pytest.raises(srm.InputError, match="weights of shape"):
         srm.inverse_dynamics(mechanism, run, "crank", weights=[1.0, 2.0])
     with pytest.raises(srm.InputError, match="there is no joint 'wheel'"):

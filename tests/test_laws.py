@@ -98,9 +98,9 @@ def test_columns_of_a_csv_file_are_found_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("t,angle\n0,1\n", "there is no column 'value'.*Columns: t, angle"),
+        ("t,angle\n0,1\n", "there is no column 'value'.*Known: t, angle"),
         ("t,value,value\n0,1,1\n", "two columns 'value'"),
-        ("", "Columns: none"),
+        ("", "Known: none"),
         ("t,value\n0,1\n1,x\n", "row 2 of the table is wrong"),
         ("t,value\n0,1\n1\n", "row 2 of the table is wrong: 1 values, 2 columns"),
     ],

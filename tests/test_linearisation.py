@@ -200,3 +200,9 @@ def test_what_cannot_be_linearised_is_refused() -> None:
     reach = srm.linearise(srm.load("five_bar"))
     with pytest.raises(srm.InputError, match="amplitude of 3"):
         reach.mode_shape(0, amplitude=3.0)
+    for step in (0.0, -1e-3, np.nan, "small"):
+        with pytest.raises(srm.InputError, match=r"step = .* is not a positive number"):
+            srm.linearise(mechanism, step=step)
+    for frames in (0, 2.5):
+        with pytest.raises(srm.InputError, match=r"frames = .* is not a positive whole number"):
+            found.mode_shape(0, frames=frames)

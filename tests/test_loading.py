@@ -484,6 +484,17 @@ def test_the_ground_has_three_names(anchor: srm.Anchor) -> None:
     assert at.isIdentity()
 
 
+def test_a_file_of_the_working_folder_needs_no_suffix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("zoo").write_text(zoo_urdf(), encoding="utf-8")
+    assert srm.load("zoo").joint_names == ("shoulder", "track", "axle", "pond")
+    Path("folder").mkdir()
+    with pytest.raises(srm.InputError, match=r"^folder: it is a directory"):
+        srm.load("folder")
+
+
 # --- bundled mechanisms -------------------------------------------------------------------------
 
 
@@ -1072,9 +1083,15 @@ def test_a_legged_robot_floats_and_stands_on_a_loop() -> None:
     assert np.abs(state.residuals).max() < 1e-12
 
 
-@pytest.mark.parametrize("n", [301, 9999, 123456789])
+@pytest.mark.parametrize("n", [1001, 9999, 123456789])
 def test_an_n_four_bar_that_would_not_fit_is_refused(n: int) -> None:
-    with pytest.raises(srm.InputError, match=f"N = {n} is too large.*N <= 300"):
+    with pytest.raises(srm.InputError, match=f"N = {n} is too large.*N <= 1000"):
         srm.load(f"n_four_bar_{n}")
     with pytest.raises(srm.InputError, match="too large"):
         srm.n_four_bar(n)
+
+
+def test_without_the_kernel_an_n_four_bar_must_be_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("srm_mbs._kernel.core", None)
+    with pytest.raises(srm.InputError, match=r"too large.*N <= 300, or N <= 1000 with the comp"):
+        srm.n_four_bar(301)

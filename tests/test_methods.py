@@ -341,7 +341,7 @@ def test_any_other_eps_is_refused(eps: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"tableau": "nonsense"}, "unknown tableau"),
+        ({"tableau": "nonsense"}, "there is no tableau"),
         ({"iterations": 0}, "iterations"),
         ({"iterations": 2.0}, "iterations"),
         ({"iterations": True}, "iterations"),

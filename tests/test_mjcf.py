@@ -16,6 +16,7 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.loading.parsing import parse_description
 from srm_mbs.loading.urdf import build_urdf
 from srm_mbs.systems.forces import ForceKinematics
+from srm_mbs.visuals import visuals_of
 from tests.lockstep import compare
 from tests.mjcf_files import BODY, FOUR_BAR, TREE, TWO, TWO_LOOPS, file, model_of, translated
 from tests.sdf_files import cassie
@@ -234,6 +235,53 @@ def test_the_inertia_of_an_exact_mesh_is_that_of_mujoco(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         np.linalg.eigvalsh(inertia.inertia), np.sort(theirs.body_inertia[1]), rtol=1e-9
     )
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [
+        'refpos="0.3 -0.2 0.5" refquat="0.6 0.8 0 0" scale="2 2 2"',
+        'refpos="0.3 -0.2 0.5" scale="2 0.5 1"',
+        'refquat="2 0 0 1"',
+    ],
+)
+def test_a_mesh_that_is_moved_first_is_drawn_where_mujoco_has_it(
+    tmp_path: Path, moved: str
+) -> None:
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
+    sides = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+    (tmp_path / "tetra.obj").write_text(vertices + sides)
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        f'<mujoco><asset><mesh name="t" file="tetra.obj" {moved}/></asset><worldbody>'
+        '<body name="b" pos="0 0 1"><joint name="j"/><inertial pos="0 0 0" mass="1" '
+        'diaginertia="1 1 1"/><geom type="mesh" mesh="t" pos="0.1 0.2 0.3" quat="0.8 0 0.6 0"/>'
+        "</body></worldbody></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_path(str(path))
+    state = mujoco.MjData(model)
+    mujoco.mj_forward(model, state)
+    own = model.mesh_vert.reshape(-1, 3)
+    theirs = state.geom_xpos[0] + own @ state.geom_xmat[0].reshape(3, 3).T
+    mechanism = srm.load(path)
+    (visual,) = visuals_of(mechanism)
+    data = mechanism.model.createData()
+    pin.forwardKinematics(mechanism.model, data, mechanism.q0)
+    place = data.oMi[visual.joint] * visual.placement
+    ours = np.array([place.act(x) for x in np.array(visual.shape.vertices)])
+    apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
+    assert apart.min(axis=0).max() < 1e-6
+    assert apart.min(axis=1).max() < 1e-6
+
+
+def test_what_a_mesh_cannot_be_drawn_with_is_noted(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        '<mujoco><asset><mesh name="t" file="t.obj" refquat="1 1 0 0" scale="1 2 1"/></asset>'
+        f"<worldbody>{BODY.format('one', 'j')}</worldbody></mujoco>"
+    )
+    assert any("refquat and an unequal scale" in note for note in srm.load(path).notes)
 
 
 @pytest.mark.parametrize("sequence", ["xyz", "XYZ", "zYx", "XyZ", "yXy"])

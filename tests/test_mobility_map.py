@@ -20,6 +20,15 @@ def test_a_regular_run_keeps_its_degrees_of_freedom() -> None:
     assert found.coordinates == solution.mechanism.joint_names
 
 
+def test_a_run_that_is_read_nowhere_has_an_empty_map() -> None:
+    found = srm.mobility_map(srm.simulate(srm.load("five_bar"), 0.1, t_eval=[]))
+    assert found.degrees_of_freedom.shape == (0,)
+    assert found.singular_values.shape == (0, 3)
+    turn = srm.Event(lambda t, q, v: t - 0.05, action=lambda t, q, v: None)
+    late = srm.simulate(srm.load("five_bar"), 0.1, t_eval=[0.07], events=turn)
+    assert late.degrees_of_freedom.tolist() == [2]
+
+
 def test_an_open_chain_moves_freely() -> None:
     found = srm.mobility_map(srm.simulate(srm.load("pendulum_chain"), 0.5))
     assert set(found.degrees_of_freedom) == {3}

@@ -13,13 +13,17 @@ import pytest
 from typer.testing import CliRunner
 
 import srm_mbs as srm
-from srm_mbs import overlays
+from srm_mbs import closure_overlays, overlays
 from srm_mbs.cli import app
-from srm_mbs.overlays import Wanted, gaps_of, ramp_colours
+from srm_mbs.closure_overlays import gaps_of, ramp_colours
+from srm_mbs.moving import turns_along
+from srm_mbs.overlays import Wanted
+from srm_mbs.readout import read_out
 from srm_mbs.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.web_page import make_page
 from tests.browsing import opened
+from tests.pacing import assert_pace
 
 ROD = srm.Anchor("rod", xyz=(0.5, 0.0, 0.2))
 
@@ -47,7 +51,7 @@ def page(
     """The slider-crank with the path of a point of its rod, at whole 1/64 s."""
     path = tmp_path_factory.mktemp("page") / "page.html"
     slider_crank.export_html(path, fps=64.0, trace=[ROD])
-    with opened(browser, path.as_uri()) as shown:
+    with opened(browser, path.as_uri(), (660, 400)) as shown:
         yield shown
 
 
@@ -91,7 +95,7 @@ def test_passages_are_marked_on_the_slider_where_its_thumb_is_at_their_times(
     crossings = slider_crank.crossings
     assert len(crossings) == 4
     line = page.locator("#time").bounding_box()
-    marks = page.locator("#marks span")
+    marks = page.locator("#marks button")
     assert marks.count() == len(crossings)
     for mark, crossing in zip(marks.all(), crossings):
         box = mark.bounding_box()
@@ -107,27 +111,132 @@ def test_passages_are_marked_on_the_slider_where_its_thumb_is_at_their_times(
         assert panel(page, crossing.time)["sigma"][0] < 1e-6
 
 
-PLAYED = """async seconds => {
-  const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
-  const read = async () => { await frame(); return [performance.now(), viewer.animator.time]; };
-  viewer.animator.play();
-  await frame();
-  const [wall, time] = await read();
-  await new Promise(resolve => setTimeout(resolve, 1000 * seconds));
-  const [wall_end, time_end] = await read();
-  viewer.animator.pause();
-  return [(wall_end - wall) / 1000, time_end - time];
-}"""
+def choose_speed(page: Any, speed: str) -> None:
+    page.locator("#speed").select_option(speed)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(
+    "seconds", [1.0, pytest.param(7.3, marks=pytest.mark.stress)], ids=["short", "all"]
+)
+def test_the_run_is_played_in_real_time_to_two_percent(page: Any, seconds: float) -> None:
+    page.evaluate("seek(0.1)")
+    assert_pace(page, seconds)
 
 
 @pytest.mark.browser
 @pytest.mark.parametrize("speed", ["0.25", "4"])
-def test_the_motion_is_played_at_the_chosen_speed(page: Any, speed: str) -> None:
-    page.evaluate("seek(0.5)")
-    page.locator("#speed").select_option(speed)
-    wall, played = page.evaluate(PLAYED, 1.2)
-    page.locator("#speed").select_option("1")
-    assert played == pytest.approx(float(speed) * wall, rel=0.1)
+def test_the_motion_is_played_at_the_chosen_speed_after_scrubbing(page: Any, speed: str) -> None:
+    page.locator("#time").fill("2.5")
+    assert page.evaluate("[animator.playing, animator.time]") == [False, 2.5]
+    choose_speed(page, speed)
+    assert_pace(page, 0.6, float(speed))
+    choose_speed(page, "1")
+    page.locator("#time").fill("1")
+    assert_pace(page, 0.5)
+
+
+@pytest.mark.browser
+def test_a_page_that_cannot_keep_up_leaves_pictures_out_and_keeps_the_time(page: Any) -> None:
+    page.evaluate("""() => {
+      seek(0.5);
+      window.heavy = true;
+      (function burn() {
+        const until = performance.now() + 120;
+        while (performance.now() < until);
+        if (window.heavy) requestAnimationFrame(burn);
+      })();
+    }""")
+    assert_pace(page, 1.2)
+    page.evaluate("window.heavy = false")
+
+
+@pytest.mark.browser
+def test_keys_play_pause_and_scrub(page: Any) -> None:
+    def now() -> tuple[bool, float]:
+        playing, t = page.evaluate("[animator.playing, animator.time]")
+        return playing, t
+
+    page.evaluate("seek(2)")
+    page.locator("#meshcat-pane").click(position={"x": 300, "y": 200})  # the focus is nowhere
+    page.keyboard.press("Space")
+    page.wait_for_function("animator.playing && animator.time > 2.05")
+    page.keyboard.press("Space")
+    assert now()[0] is False
+    for key, t in [("Home", 0.0), ("ArrowRight", 0.08), ("ArrowRight", 0.16), ("ArrowLeft", 0.08)]:
+        page.keyboard.press(key)
+        assert now() == (False, pytest.approx(t, abs=1e-9))
+    page.keyboard.press("End")
+    assert now() == (False, 8.0)
+    page.keyboard.press("ArrowRight")
+    assert now() == (False, 8.0)
+    # The keys of a control are its own.
+    page.locator("#speed").focus()
+    page.keyboard.press("ArrowDown")
+    assert page.locator("#speed").input_value() == "2"
+    assert now() == (False, 8.0)
+    page.keyboard.press("ArrowUp")
+    page.locator("#loop").focus()
+    page.keyboard.press("Space")
+    assert page.locator("#loop").is_checked() is False
+    page.keyboard.press("Space")
+    assert now()[0] is False
+    page.locator("#toggle").focus()
+    page.keyboard.press("Space")
+    assert now()[0] is True
+    page.keyboard.press("Enter")
+    assert now()[0] is False
+    first = page.evaluate("about.passages[0].time")
+    page.locator("#marks button").first.focus()
+    page.keyboard.press("Enter")
+    assert page.evaluate("animator.time") == pytest.approx(first)
+
+
+@pytest.mark.browser
+def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: Any) -> None:
+    named = {
+        page.get_by_role("slider", name="time"): "#time",
+        page.get_by_role("combobox", name="speed"): "#speed",
+        page.get_by_role("checkbox", name="Loop"): "#loop",
+        page.get_by_role("img", name="slider_crank"): "#meshcat-pane",
+        page.get_by_role("group", name="values of the run"): "#panel",
+    }
+    for found, selector in named.items():
+        assert found.count() == 1, selector
+        assert found.evaluate("(node, s) => node.matches(s)", selector)
+    page.evaluate("seek(2)")
+    assert page.get_by_role("button", name="Play", exact=True).count() == 1
+    assert page.get_by_role("button", name="singular configuration passed").count() == 4
+    page.wait_for_function("slider.getAttribute('aria-valuetext') === '2.00 / 8.00 s'")
+    page.locator("#toggle").focus()
+    reached = []
+    for _ in range(4):
+        reached.append(page.evaluate("document.activeElement.id"))
+        page.keyboard.press("Tab")
+    assert reached == ["toggle", "speed", "loop", "time"]
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("size", [(1280, 720), (400, 760)])
+def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[int, int]) -> None:
+    before = page.viewport_size
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    page.wait_for_function("viewer.renderer.domElement.width > 0")
+    page.wait_for_function(f"innerWidth === {size[0]} && pane.clientWidth === {size[0]}")
+    boxes = {
+        name: page.locator(name).bounding_box()
+        for name in ("#meshcat-pane canvas", "#bar", "#panel", "#time", "output", "#toggle")
+    }
+    for name, box in boxes.items():
+        assert box["x"] >= 0.0, name
+        assert box["x"] + box["width"] <= size[0] + 0.5, name
+        assert box["y"] + box["height"] <= size[1] + 0.5, name
+    canvas, bar = boxes["#meshcat-pane canvas"], boxes["#bar"]
+    assert canvas["y"] + canvas["height"] == pytest.approx(bar["y"], abs=1.0)
+    assert boxes["#panel"]["height"] < 0.2 * size[1]
+    assert page.evaluate("parseFloat(getComputedStyle(element('panel')).fontSize)") >= 13.0
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    page.set_viewport_size(before)
 
 
 @pytest.mark.browser
@@ -183,11 +292,13 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
     tmp_path: Path,
 ) -> None:
     solution = srm.simulate(srm.load("stewart_platform"), 1.0)
-    mechanism = solution.mechanism
     solution.export_html(tmp_path / "page.html", fps=64.0, reactions=True)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         for t in (0.0, 0.515625, 1.0):
-            springs, ends = overlays.springs_of(mechanism), ends_in(page, "spring_", t)
+            springs, ends = (
+                [s for s, _ in overlays.springs_of(solution)],
+                ends_in(page, "spring_", t),
+            )
             assert len(ends) == len(springs) == 6
             for spring, (a, b) in zip(springs, ends):
                 assert np.abs(a - place(solution, t, spring.a)).max() < 1e-6
@@ -199,7 +310,7 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
         np.linalg.norm(wrench[:, :3], axis=1)
         for wrench in solution.at(np.arange(65) / 64.0).reactions.values()
     ]
-    top = np.percentile(np.concatenate(sizes), overlays.HIGH)
+    top = np.percentile(np.concatenate(sizes), closure_overlays.HIGH)
     assert float(re.findall(r"([\d.]+) N", legend)[0]) == pytest.approx(top, rel=6e-3)
     expected = ramp_colours(sizes[3][-1:] / top)[0]
     assert np.abs(np.array(colour) - expected).max() < 1e-6
@@ -216,9 +327,89 @@ def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
         words = page.locator("#notes").inner_text()
         ((start, end),) = ends_in(page, "gap_", 0.75)
     power = words.split("10")[-1].split()[0].translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
-    ((_, gap),) = gaps_of(solution, np.array([0.75])).values()
-    assert np.linalg.norm(gap) > 1e-9  # there is one
-    np.testing.assert_allclose(end - start, 10.0 ** int(power) * gap[0], atol=1e-5)
+    (gap,) = gaps_of(solution, np.array([0.75]))
+    assert np.linalg.norm(gap.arrows) > 1e-9  # there is one
+    np.testing.assert_allclose(end - start, 10.0 ** int(power) * gap.arrows[0], atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def let_go_and_tied() -> srm.Solution:
+    """The slider-crank, whose pin lets go at 0.5 s and which a rope ties at 0.9 s."""
+    mechanism = srm.load("slider_crank")
+    mechanism = srm.Mechanism(mechanism.model, mechanism.loops, mechanism.q0, mechanism.v0)
+    freed = mechanism.without_loop("pin")
+    post, end = srm.Anchor("world", xyz=(0.0, 0.0, -5.0)), srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
+
+    def tie(t: float, q: Any, v: Any) -> srm.Switch:
+        data = freed.model.createData()
+        pin.forwardKinematics(freed.model, data, q)
+        joint, placement = end.resolve(freed.model)
+        way = (data.oMi[joint] * placement).translation - np.array(post.xyz)
+        length = float(np.linalg.norm(way))
+        return srm.Switch(
+            freed.with_loop(srm.LoopClosure("distance", end, post, name="rope", length=length))
+        )
+
+    events = [
+        srm.Event(lambda t, q, v: t - 0.5, action=lambda t, q, v: srm.Switch(freed)),
+        srm.Event(lambda t, q, v: t - 0.9, action=tie),
+    ]
+    return srm.simulate(mechanism, 1.5, events=events, rtol=1e-5)
+
+
+SEEN = """t => {
+  seek(t);
+  const seen = {};
+  const overlays = Object.entries(viewer.scene_tree.find(["overlays"]).children);
+  const shapes = Object.entries(viewer.scene_tree.find(["mechanism", "rod"]).children);
+  for (const [name, node] of [...overlays, ...shapes]) seen[name] = node.object.visible;
+  return seen;
+}"""
+
+
+@pytest.mark.browser
+def test_closures_are_drawn_while_they_are_there_and_not_before_or_after(
+    browser: Any, tmp_path: Path, let_go_and_tied: srm.Solution
+) -> None:
+    let_go_and_tied.export_html(tmp_path / "page.html", fps=10.0, reactions=True, gaps=True)
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        # Between the key frames at 0.4, 0.5, ...: to the very time.
+        for t, pinned, tied in [
+            (0.0, True, False),
+            (0.499, True, False),
+            (0.501, False, False),
+            (0.899, False, False),
+            (0.901, False, True),
+            (1.5, False, True),
+        ]:
+            seen = page.evaluate(SEEN, t)
+            assert (seen["closure_0"], seen["gap_0"]) == (pinned, pinned), t
+            assert (seen["closure_1"], seen["gap_1"]) == (tied, tied), t
+            # Bars, as there are no visuals: both closures end on the rod, whose bar stays.
+            balls = [seen[name] for name in sorted(seen) if name.startswith("shape_")]
+            assert balls.count(False) == (not pinned) + (not tied), t
+        rope = ends_in(page, "closure_1", 1.2)[0, 0]
+        end = srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
+        assert np.abs(rope - place(let_go_and_tied, 1.2, end)).max() < 1e-6
+        rows = {name: value for name, value, _ in page.evaluate(READ, 0.7)}
+        assert (rows["drift |g|"], rows["sigma"]) == ("0", "\u2013")  # there are no closures
+        page.evaluate("seek(1.45)")
+        page.evaluate("animator.play()")
+        page.wait_for_function("animator.time < 0.4")  # over again
+        assert page.evaluate(SEEN, 0.2)["closure_0"] is True
+
+
+def test_what_is_not_there_has_no_gap_and_no_part_in_the_scale(
+    let_go_and_tied: srm.Solution,
+) -> None:
+    times = np.linspace(0.0, 1.5, 31)
+    pinned, tied = gaps_of(let_go_and_tied, times)
+    assert (pinned.loop.name, tied.loop.name) == ("pin", "rope")
+    assert pinned.spans == ((0.0, pytest.approx(0.5)),)
+    assert tied.spans == ((pytest.approx(0.9), 1.5),)
+    assert np.all(pinned.arrows[times > 0.51] == 0.0)
+    assert np.all(tied.arrows[times < 0.89] == 0.0)
+    assert np.linalg.norm(pinned.arrows, axis=1).max() < 1e-3
 
 
 @pytest.mark.browser
@@ -231,7 +422,7 @@ def test_a_motion_that_was_not_simulated_has_its_time_only(
     srm.JointMotion(mechanism, run.t, run.q).export_html(tmp_path / "page.html", fps=20.0)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         assert panel(page, 0.5) == {"t": (0.5, "s")}
-        assert page.locator("#marks span").count() == 0
+        assert page.locator("#marks button").count() == 0
 
 
 @pytest.mark.parametrize("name", ["slider_crank", "spatial_four_bar", "bricard", "delta_robot"])
@@ -242,20 +433,20 @@ def test_gaps_are_as_large_as_the_errors_of_the_rows_of_length(name: str) -> Non
     opened_loops = srm.JointMotion(solution.mechanism, np.zeros(1), q)
     errors = constraint_errors(solution.mechanism, np.zeros(1), q, solution.v[-1:])[0][0]
     at = 0
-    gaps = gaps_of(opened_loops, np.zeros(1))
+    gaps = {gap.loop.name: gap.arrows for gap in gaps_of(opened_loops, np.zeros(1))}
     assert gaps
     for loop in solution.mechanism.loops:
         rows = errors[at : at + loop.rows.count][loop.rows.blocks[0]]
         at += loop.rows.count
         if len(rows):
-            size = np.linalg.norm(gaps[loop.name][1])
+            size = np.linalg.norm(gaps[loop.name])
             assert size == pytest.approx(np.linalg.norm(rows), rel=1e-9, abs=1e-15)
 
 
 def test_quaternions_along_a_turning_direction_turn_z_to_it_without_twist() -> None:
     angle = np.linspace(0.0, 4.0 * np.pi, 200)  # through -z, where the shortest turn is not unique
     directions = np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)])
-    quaternions = overlays.turns_along(directions)
+    quaternions = turns_along(directions)
     for quaternion, direction in zip(quaternions, directions):
         turned = pin.Quaternion(quaternion).matrix()
         np.testing.assert_allclose(turned[:, 2], direction, atol=1e-12)
@@ -266,7 +457,7 @@ def test_quaternions_along_a_turning_direction_turn_z_to_it_without_twist() -> N
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"trace": ["rod"]}, "'rod' cannot be traced"),
+        ({"trace": ["rod"]}, "'rod' is not a point of a link"),
         ({"trace": ROD}, "trace is one anchor"),
         ({"trace": [srm.Anchor("nothing")]}, "no link 'nothing'"),
         ({"trace": [srm.Anchor("world", xyz=(1.0, 0.0, 0.0))]}, "lies on the ground"),
@@ -301,6 +492,18 @@ def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Sol
     assert reach == pytest.approx(FILLED, abs=0.02)
 
 
+def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
+    for name, t_end, named in [("n_four_bar_2", 2.0, True), ("n_four_bar_13", 2.0, False)]:
+        solution = srm.simulate(srm.load(name), t_end)
+        about = read_out(solution, np.linspace(0.0, t_end, 5))
+        assert len(about["passages"]) == len(solution.crossings) > 0
+        assert all((": " in passage["text"]) == named for passage in about["passages"])
+    solution = srm.simulate(srm.load("slider_crank"), 240.0)
+    assert len(solution.crossings) > 100
+    texts = [passage["text"] for passage in read_out(solution, np.linspace(0, 240, 5))["passages"]]
+    assert not any(": " in text for text in texts)
+
+
 def test_names_do_not_end_the_script_of_a_page() -> None:
     from srm_mbs.drawing import import_meshcat
 
@@ -331,8 +534,8 @@ def test_the_command_line_draws_the_path_of_a_point_of_a_link(
 @pytest.mark.parametrize(
     ("model", "options", "words"),
     [
-        ("slider_crank", ["--trace", "rod"], "'rod' is no point of a link"),
-        ("slider_crank", ["--trace", "rod:1,2"], "'rod:1,2' is no point of a link"),
+        ("slider_crank", ["--trace", "rod"], "'rod' is not a point of a link"),
+        ("slider_crank", ["--trace", "rod:1,2"], "'rod:1,2' is not a point of a link"),
         ("slider_crank", ["--trace", "bar:1,2,3"], "--trace: there is no link 'bar'"),
         ("simple_pendulum", ["--reactions"], "--reactions: the mechanism has no closures"),
     ],

@@ -22,8 +22,9 @@ from PIL import Image
 import srm_mbs as srm
 from srm_mbs.loading.parsing import parse_description
 from srm_mbs.systems.loops import closure_errors
+from tools import plot_pictures, singular_pictures
 from tools.method_tables import filled
-from tools.singular_pictures import by_scipy, draw
+from tools.singular_pictures import by_scipy
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -273,16 +274,24 @@ def test_the_run_that_jumps_on_the_page_on_singular_configurations_hardly_shows_
     assert np.abs(energy / energy[0] - 1.0).max() < 1e-3
 
 
-def test_the_pictures_of_singular_configurations_can_be_drawn_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("page", "folder", "draw"),
+    [
+        ("singular_configurations.md", "singular", singular_pictures.draw),
+        ("plots.md", "plots", plot_pictures.draw),
+    ],
+)
+def test_the_pictures_of_a_page_can_be_drawn_again(
+    page: str, folder: str, draw: Callable[[Path], None], tmp_path: Path
+) -> None:
     draw(tmp_path)
-    page = PAGES["singular_configurations.md"].read_text(encoding="utf-8")
-    shown = re.findall(r"\(singular/(\w+\.png)\)", page)
+    shown = re.findall(rf"\({folder}/(\w+\.png)\)", PAGES[page].read_text(encoding="utf-8"))
     assert sorted(shown) == sorted(path.name for path in tmp_path.iterdir())
     for name in shown:
-        with Image.open(tmp_path / name) as new, Image.open(DOCS / "singular" / name) as old:
+        with Image.open(tmp_path / name) as new, Image.open(DOCS / folder / name) as old:
             assert new.size == old.size, name
             assert np.std(np.asarray(new.convert("L"), dtype=float)) > 5.0, f"{name} is blank"
-    assert sum(path.stat().st_size for path in (DOCS / "singular").iterdir()) < 150_000
+    assert sum(path.stat().st_size for path in (DOCS / folder).iterdir()) < 150_000
 
 
 # --- docstrings on the site ----------------------------------------------------------------------

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import srm_mbs as srm
-from srm_mbs import plots
+from srm_mbs.plotting import panels, run
 from srm_mbs.solution import Solution
 
 
@@ -86,7 +86,7 @@ def test_drift_that_is_zero_is_drawn_at_the_floor_of_the_logarithmic_axis(
     axes = slider_crank.plot().axes[0]
     assert axes.get_yscale() == "log"
     drawn = line(axes, r"$\Vert g").get_ydata()
-    assert drawn.min() == plots.SMALLEST_DRIFT
+    assert drawn.min() == run.SMALLEST_DRIFT
     np.testing.assert_array_equal(drawn, np.maximum(slider_crank.drift[:, 0], 1e-17))
     assert "zeros drawn at 1e-17" in axes.get_title(loc="left")
 
@@ -132,7 +132,7 @@ def test_many_singular_passages_are_ticks_instead_of_full_lines(
 ) -> None:
     (lines,) = slider_crank.plot().axes[3].collections
     assert lines.get_segments()[0][1, 1] == 1.0
-    monkeypatch.setattr(plots, "FULL_LINES", 1)
+    monkeypatch.setattr(panels, "FULL_LINES", 1)
     (ticks,) = slider_crank.plot().axes[3].collections
     assert ticks.get_segments()[0][1, 1] < 0.1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -65,7 +66,9 @@ def view_of(solution: srm.Solution, fps: float) -> View:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("t", [0.0, 0.4, 0.9, 1.5])
+@pytest.mark.parametrize(
+    "t", [0.4, 1.5, *(pytest.param(t, marks=pytest.mark.stress) for t in (0.0, 0.9))]
+)
 def test_the_bob_is_where_forward_kinematics_puts_it(tmp_path: Path, t: float) -> None:
     solution = run()
     path = tmp_path / "picture.png"
@@ -124,6 +127,49 @@ def test_an_mp4_without_ffmpeg_says_what_is_missing(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_film_without_its_encoder_and_a_time_without_its_picture_are_refused_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendering.shutil, "which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    for options, words in (
+        (["--video", str(tmp_path / "film.mp4")], "ffmpeg, which is not installed"),
+        (["--at", "0.4"], "--at: it is the time of a picture, and none is asked for"),
+    ):
+        done = CliRunner().invoke(app, ["simulate", "simple_pendulum", *options])
+        assert done.exit_code == 2
+        assert words in done.output
+        assert "steps" not in done.output
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_the_frames_of_a_film_from_the_command_line_show_the_bob_where_it_is(
+    tmp_path: Path, suffix: str
+) -> None:
+    saved, film = tmp_path / "run.npz", tmp_path / f"film{suffix}"
+    solution = srm.simulate(srm.load("simple_pendulum"), 0.5)
+    solution.save(saved)
+    done = CliRunner().invoke(app, ["play", str(saved), "--video", str(film)])
+    assert done.exit_code == 0, done.output
+    width, height = 720, 480
+    decoder = [str(rendering.encoder_of(Path("any.mp4"))), "-loglevel", "error", "-i", str(film)]
+    raw = subprocess.run(
+        [*decoder, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
+    )
+    frames = np.frombuffer(raw.stdout, np.uint8).reshape(-1, height, width, 3) / 255.0
+    assert len(frames) == 13  # 25 per second, and the one at the start
+    view = view_of(solution, 25.0)
+    for t in (0.0, 0.2, 0.48):
+        angle = solution(t)[0][0]
+        place = np.array([math.cos(angle), 0.0, math.sin(angle)])
+        x, y, depth = view.axes @ (place - view.target)
+        half = 0.5 * height
+        scale = half / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)
+        expected = np.array([0.5 * width + scale * x, half - scale * y])
+        np.testing.assert_allclose(orange_at(frames[round(t * 25.0)]), expected, atol=3.0)
+
+
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
@@ -169,7 +215,7 @@ def test_without_playwright_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "playwright.sync_api", None)
-    with pytest.raises(srm.InputError, match=r"pip install 'srm-mbs\[render\]'"):
+    with pytest.raises(srm.InputError, match=r'pip install "srm-mbs\[render\]"'):
         run().export_image(tmp_path / "a.png")
 
 

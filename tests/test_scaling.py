@@ -232,3 +232,15 @@ def test_sigma_has_the_same_size_in_maximal_coordinates(name: str, joints: str) 
         ratios.append(here / tree.evaluate(0.0, np.array(q + len(q) * [0.0])).sigma)
     assert min(ratios) > 0.5
     assert max(ratios) < 2.0
+
+
+@pytest.mark.parametrize("at", [0.0, 1e-17, 3e-16])
+def test_points_that_coincide_but_for_rounding_give_no_length(at: float) -> None:
+    model = pin.Model()
+    for name, offset in (("a", 0.0), ("b", at)):
+        place = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.3 + offset]))
+        index = model.addJoint(0, pin.JointModelRZ(), place, name)
+        model.appendBodyToJoint(index, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    units = srm.Mechanism(model, q0=[0.1, 0.2]).structure.units
+    assert units.length == 1.0
+    assert units.rate == pytest.approx(np.sqrt(9.81))

@@ -172,8 +172,19 @@ def test_loose_tolerances_are_capped_with_a_warning(four_bar: srm.Mechanism) -> 
 
 
 def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mechanism) -> None:
-    with pytest.warns(srm.SrmWarning, match="below round-off"):
+    with pytest.warns(srm.SrmWarning, match=r"below round-off: using 2\.2e-13"):
         srm.simulate(four_bar, 0.01, rtol=1e-16)
+    expected = r"rtol = 1e-13 is below round-off next to singular configurations.*using 2\.2e-13"
+    with pytest.warns(srm.SrmWarning, match=expected):
+        solution = srm.simulate(four_bar, 0.01, rtol=1e-13)
+    assert solution.settings.rtol == 1000 * np.finfo(float).eps
+
+
+def test_mechanisms_without_closures_may_ask_for_tighter_tolerances() -> None:
+    pendulum = srm.load("simple_pendulum")
+    assert srm.simulate(pendulum, 0.01, rtol=1e-13).settings.rtol == 1e-13
+    with pytest.warns(srm.SrmWarning, match=r"below round-off: using 2\.2e-14"):
+        srm.simulate(pendulum, 0.01, rtol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +198,7 @@ def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mech
         ({"rtol": -1e-6}, "rtol"),
         ({"atol": [1e-6, 1e-6]}, "atol"),
         ({"atol": 0.0}, "atol"),
-        ({"method": "newmark"}, "This version has 'psrm', 'srm'"),
+        ({"method": "newmark"}, "Known: 'psrm', 'srm'"),
         ({"method": srm.SRM(T="inverse")}, "no such matrix"),
         ({"tableau": "rk45"}, "dopr54"),
         ({"tableau": "erk4"}, "step="),
@@ -197,6 +208,8 @@ def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mech
         ({"t_eval": [0.0, 2.0]}, "t_eval"),
         ({"t_eval": [0.5, 0.2]}, "increase"),
         ({"q0": np.zeros(2)}, "q0"),
+        ({"q0": "home"}, "q0"),
+        ({"v0": [[1.0], [2.0, 3.0]]}, "v0"),
         ({"q0": np.zeros(3)}, "violates the closures: row pin"),
         ({"v0": np.ones(3)}, "v0.*srm.assemble"),
         ({"v0": np.full(3, np.nan)}, "v0"),
@@ -229,7 +242,7 @@ def test_invalid_options_raise_before_any_stepping(
         ({"prediction": "extrapolated"}, "there is no PSRM with"),
         ({"correction": "late"}, "there is no PSRM with"),
         ({"eps": -1.0}, "eps"),
-        ({"tableau": "nonsense"}, "unknown tableau"),
+        ({"tableau": "nonsense"}, "there is no tableau"),
     ],
 )
 def test_a_method_refuses_what_it_cannot_do(options: dict[str, Any], words: str) -> None:
@@ -333,6 +346,18 @@ def test_a_progress_callable_sees_every_accepted_step(four_bar: srm.Mechanism) -
     seen: list[float] = []
     solution = srm.simulate(four_bar, 0.5, progress=lambda t, h, x: seen.append(t))
     assert seen == list(solution.t[1:])
+
+
+@pytest.mark.parametrize("backend", ["python", "auto"])
+def test_what_a_progress_callable_does_to_the_state_changes_nothing(
+    four_bar: srm.Mechanism, backend: str
+) -> None:
+    def spoil(t: float, h: float, x: Any) -> None:
+        x[:] = np.nan
+
+    spoilt = srm.simulate(four_bar, 0.5, progress=spoil, backend=backend)
+    plain = srm.simulate(four_bar, 0.5, backend=backend)
+    assert np.array_equal(spoilt.q, plain.q)
 
 
 def test_two_runs_are_identical(four_bar: srm.Mechanism) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import pickle
 from typing import Any
 
 import numpy as np
@@ -106,6 +108,63 @@ def test_a_clone_continues_identically_and_independently(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_a_clone_knows_the_force_that_acted_before(
+    slider_crank: srm.Mechanism, backend: str
+) -> None:
+    simulator = srm.Simulator(slider_crank, rtol=1e-4, backend=backend)
+    for torque in (0.0, 30.0, 30.0):
+        simulator.step(0.1, [torque, 0.0])
+    clone = simulator.clone()
+    for each in (simulator, clone):
+        each.step(0.1, [0.0, 0.0])
+    assert np.array_equal(clone.v, simulator.v)
+
+
+def test_copies_are_clones_and_pickles_are_refused(slider_crank: srm.Mechanism) -> None:
+    simulator = srm.Simulator(slider_crank)
+    simulator.step(0.1)
+    for other in (copy.copy(simulator), copy.deepcopy(simulator)):
+        other.step(0.1)
+        assert simulator.t == 0.1
+        assert other.t == 0.2
+    with pytest.raises(srm.InputError, match="another process"):
+        pickle.dumps(simulator)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_steps_within_rounding_move_the_time_and_spoil_nothing(
+    slider_crank: srm.Mechanism, backend: str
+) -> None:
+    simulator = srm.Simulator(slider_crank, rtol=1e-9, backend=backend)
+    plain = srm.Simulator(slider_crank, rtol=1e-9, backend=backend)
+    for _ in range(3):
+        simulator.step(1e-17)
+    for each in (simulator, plain):
+        each.step(1.0)
+    simulator.step(np.spacing(1.0))
+    assert simulator.t == 1.0 + np.spacing(1.0)
+    for each in (simulator, plain):
+        each.step(0.5)
+    assert simulator.t == pytest.approx(1.5, abs=1e-15)
+    assert np.abs(simulator.q - plain.q).max() < 1e-9
+    simulator.reset(t=1e15)
+    with pytest.raises(srm.InputError, match="below the rounding"):
+        simulator.step(0.01)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_times_are_of_double_precision_whatever_the_type_of_a_step(
+    slider_crank: srm.Mechanism, backend: str
+) -> None:
+    simulator = srm.Simulator(slider_crank, backend=backend)
+    simulator.reset(t=1000.0)
+    dt = np.float32(0.001)
+    for _ in range(10):
+        simulator.step(dt)
+    assert simulator.t == pytest.approx(1000.0 + 10 * float(dt), abs=1e-11)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_forces_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator, other = (srm.Simulator(slider_crank, backend=backend) for _ in range(2))
     tau = np.zeros(2)
@@ -178,6 +237,8 @@ def test_a_failed_step_raises_and_leaves_the_last_good_state(
     [
         (0.0, None, "dt = 0.0"),
         (np.nan, None, "dt = nan"),
+        ("soon", None, "dt = 'soon'"),
+        (None, None, "dt = None"),
         (0.1, [1.0], "tau ="),
         (0.1, [np.nan, 0.0], "tau ="),
         (0.1, "x", "tau ="),
@@ -192,6 +253,12 @@ def test_bad_steps_are_refused(
     with pytest.raises(srm.InputError, match=message):
         simulator.step(dt, tau)
     assert simulator.t == 0.1
+    simulator.reset()
+    with pytest.raises(srm.InputError, match=message):
+        simulator.step(dt, tau)
+    for t in (np.nan, "now"):
+        with pytest.raises(srm.InputError, match="t = "):
+            simulator.reset(t=t)
 
 
 def test_other_methods_run_on_the_reference(slider_crank: srm.Mechanism) -> None:

@@ -22,6 +22,8 @@ assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
 load = cache(srm.load)
 
+Z_AXIS = (0.0, 0.0, 1.0)
+
 # name: (nv, rank, redundant rows)
 JANSEN = tuple(
     f"{side}_{k}_{pin}.y"
@@ -529,3 +531,24 @@ def test_sigma_is_about_one_in_the_middle_of_the_motion(name: str) -> None:
         sigmas.append(system.evaluate(0.0, np.concatenate([q, 0.0 * q])).sigma)
     assert 0.75 < np.median(sigmas) < 1.33
     assert min(sigmas) < 0.05
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("bodies", ["named", "not named"])
+def test_a_point_mass_on_a_ball_joint_is_refused_by_the_name_of_the_joint(
+    closed: bool, bodies: str
+) -> None:
+    """It has no inertia about its rod: its spin is not determined, closures or not."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "swivel")
+    bob = pin.Inertia(1.0, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
+    model.appendBodyToJoint(joint, bob, pin.SE3.Identity())
+    model.addFrame(pin.Frame("tip", joint, along_x(1.0), pin.FrameType.OP_FRAME))
+    if bodies == "named":
+        model.addBodyFrame("bob", joint, pin.SE3.Identity(), 0)
+    floor = srm.LoopClosure("point_on_plane", srm.Anchor(frame="tip"), srm.Anchor("world"), Z_AXIS)
+    mechanism = srm.Mechanism(model, (floor,) if closed else ())
+    carried = "bob" if bodies == "named" else "its body"
+    for use in (lambda: srm.simulate(mechanism, 1.0), lambda: mechanism.degrees_of_freedom):
+        with pytest.raises(srm.InputError, match=f"joint 'swivel'.*{carried}.*moment of inertia"):
+            use()

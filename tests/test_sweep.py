@@ -135,6 +135,15 @@ def test_periods_of_pendulums_are_those_of_the_elliptic_integral(processes: Exec
     assert sweep.table["period"] == pytest.approx(exact, rel=1e-9)
 
 
+def test_masses_and_lengths_reach_the_runs() -> None:
+    masses, lengths = np.array([1.0, 3.0, 0.5]), np.array([1.0, 0.4, 2.0])
+    sweep = srm.sweep(
+        pendulum, {"mass": masses, "length": lengths}, 0.5, measure=lambda s: {"E": s.energy[-1]}
+    )
+    exact = -masses * 9.81 * lengths * np.cos(0.3)
+    assert sweep.table["E"] == pytest.approx(exact, rel=1e-6)
+
+
 def test_joint_values_are_assembled_case_by_case(four_bar: srm.Mechanism) -> None:
     cases = [{"q": {"crank": angle}, "v": {"crank": 1.5}} for angle in (0.6, 0.9)]
     sweep = srm.sweep(four_bar, cases, 0.3, measure=states)
@@ -301,7 +310,7 @@ def test_the_file_of_another_sweep_is_refused(tmp_path: Path, four_bar: srm.Mech
     with pytest.raises(srm.InputError, match="line 3 is damaged"):
         again(four_bar, cases, 0.1)
     file.write_bytes(b"my notes")
-    with pytest.raises(srm.InputError, match="no file of a sweep"):
+    with pytest.raises(srm.InputError, match="not a file of a sweep"):
         again(four_bar, cases, 0.1)
     assert file.read_bytes() == b"my notes"
     with pytest.raises(srm.InputError, match="cannot be used"):
@@ -378,9 +387,9 @@ def test_bad_input_is_refused_before_any_run(four_bar: srm.Mechanism, processes:
         (lambda: srm.sweep("four_bar", one, 1.0), "neither a mechanism nor a function"),
         (lambda: srm.sweep(four_bar, [], 1.0), "no cases"),
         (lambda: srm.sweep(four_bar, "q0", 1.0), "no cases"),
-        (lambda: srm.sweep(four_bar, [3.0], 1.0), r"cases\[0\]: 3.0 is no set"),
+        (lambda: srm.sweep(four_bar, [3.0], 1.0), r"cases\[0\]: 3.0 is not a set"),
         (lambda: srm.sweep(four_bar, {"q0": [[0.0]], "v0": []}, 1.0), "lengths"),
-        (lambda: srm.sweep(four_bar, {"q0": 1.0}, 1.0), "no columns"),
+        (lambda: srm.sweep(four_bar, {"q0": 1.0}, 1.0), "not columns"),
         (lambda: srm.sweep(four_bar, {"a": {"mass": 1.0}}, 1.0), r"cases\['a'\].*'mass'"),
         (lambda: srm.sweep(four_bar, [{"q": {}, "v0": [0.0]}], 1.0), "Give one of the two"),
         (lambda: srm.sweep(pendulum, [{"status": 1.0}], 1.0), "column of every table"),

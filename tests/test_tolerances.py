@@ -94,3 +94,20 @@ def test_spatial_dead_points_cost_few_rejections(tol: float, most: float) -> Non
     attempts = [*solution.rejected[:, 0], *solution.replaced[:, 0]]
     around = [t for t in attempts if np.abs(near - t).min() < 0.1]
     assert len(around) <= most * passages
+
+
+def test_an_absolute_tolerance_beyond_all_measure_ends_the_run_with_a_reason() -> None:
+    chain = srm.load("pendulum_chain")
+    for backend in ("python", "auto"):
+        run = srm.simulate(
+            chain, 1.0, atol=1e-300, q0=[0.0, 0.0, 1.0], v0=np.zeros(3), backend=backend
+        )
+        assert run.status == "failed"
+        assert "Stopped at t = 0 s" in run.message
+    circle = srm.SemiExplicitDAE(
+        f=lambda t, x: np.array([x[0] - x[1], x[0] + x[1]]),
+        B=lambda t, x: x,
+        g=lambda t, x: 0.5 * (x @ x - 1.0),
+        G=lambda t, x: x,
+    )
+    assert "atol" in srm.solve_dae(circle, (0.0, 1.0), [1.0, 0.0], atol=1e-300).message

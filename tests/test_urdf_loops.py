@@ -488,7 +488,7 @@ FAULTS = {
     ),
     "loop with two axes": (
         urdf_plus("revolute").replace(DIRECTION, 2 * DIRECTION),
-        "<axis> stands there twice",
+        "<axis> is given twice",
     ),
     "loop with a zero axis": (
         urdf_plus("revolute").replace(text(AXIS), "0 0 0"),

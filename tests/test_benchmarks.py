@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+import srm_mbs as srm
 from benchmarks.work_precision import (
     command,
     plots,
@@ -34,7 +35,7 @@ from benchmarks.work_precision.records import Measurement, Results
 from benchmarks.work_precision.references import by_extrapolation, by_gauss, by_scipy
 from benchmarks.work_precision.reliability import measure_reliability, summary
 from benchmarks.work_precision.scaling import measure_scaling
-from benchmarks.work_precision.skip import measure_unneeded
+from benchmarks.work_precision.skip import ITEMS, measure_unneeded
 from benchmarks.work_precision.trees import Equations
 from srm_mbs.cli import app
 from srm_mbs.systems.multibody import make_system
@@ -339,6 +340,37 @@ def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     assert (tmp_path / "work_precision_pendulum_chain.png").is_file()
 
 
+def test_what_is_measured_again_replaces_results_and_the_rest_is_kept(tmp_path: Path) -> None:
+    def measured(problem: str, peer: str) -> records.Measurement:
+        return records.Measurement(problem, peer, "", "rtol", 1e-6, "ok")
+
+    fresh = records.Results({"processors": 2}, {"pin": "4.1.0"}, {"repeats": 5})
+    old = replace(
+        fresh,
+        problems={"pendulum_chain": {}, "spatial_four_bar": {}},
+        measurements=[
+            measured("pendulum_chain", "ours"),
+            measured("pendulum_chain", "mujoco"),
+            measured("spatial_four_bar", "ours"),
+        ],
+        skipped=[records.Skipped("ours", "not there")],
+        unneeded=[{"item": "zero rows"}],
+        scaling={"loops": []},
+    )
+    path = tmp_path / "results.json"
+    old.save(path)
+    kept = records.continued(path, fresh, ["work", "scaling"], ["pendulum_chain"], ["ours"])
+    assert kept.measurements == old.measurements[1:]
+    assert kept.problems == old.problems
+    assert kept.skipped == old.skipped  # of the section on reliability
+    assert kept.unneeded == old.unneeded
+    assert kept.scaling == {}
+
+    for what, value in (("versions", {"pin": "4.2.0"}), ("machine", {"processors": 4})):
+        with pytest.raises(ValueError, match=f"other {what}"):
+            records.continued(path, replace(fresh, **{what: value}), ["work"], [], [])
+
+
 def test_fewer_than_five_repeats_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -386,19 +418,35 @@ def test_the_reference_of_the_squeezing_mechanism_ends_as_published() -> None:
 def test_the_readme_gets_one_figure_and_one_table_between_its_marks(
     results: Results, tmp_path: Path
 ) -> None:
-    page, data = tmp_path / "README.md", tmp_path / "docs" / "results.json"
+    # A time that three digits show as 2.87 ms, and as 2.88 ms when four digits were kept before.
+    results = replace(
+        results,
+        measurements=[
+            replace(row, cpu={**row.cpu, "least": 2.8746e-3}) if row.cpu else row
+            for row in results.measurements
+        ],
+    )
+    page, data, docs = tmp_path / "README.md", tmp_path / "results.json", tmp_path / "docs"
     page.write_text("# Title\n\n## Measured\n\ntext\n")
-    data.parent.mkdir()
+    docs.mkdir()
     results.save(data)
-    for _ in range(2):
-        readme.main([str(data), "--readme", str(page)])
-    text = page.read_text()
+    readme.main([str(data), "--docs", str(docs), "--readme", str(page)])
+    # Again from the brief results in the documentation.
+    kept, text = docs / "work_precision.json", page.read_text()
+    brief = kept.read_text()
+    readme.main(["--docs", str(docs), "--readme", str(page)])
+    assert page.read_text() == text
+    assert kept.read_text() == brief
+    assert '"all"' in data.read_text()
+    assert '"all"' not in brief
+    assert "2.87 /" in readme.table(results)
+    assert readme.table(records.load(kept)) in text
     assert text.count(readme.BEGIN) == text.count(readme.END) == 1
     assert text.count("## Beside other simulators") == 1
-    assert "![CPU time against error](docs/results.png)" in text
+    assert "![CPU time against error](docs/work_precision.png)" in text
     assert results.problems["slider_crank_regular"]["title"] in text
     assert text.endswith("## Measured\n\ntext\n")
-    assert data.with_suffix(".png").stat().st_size > 10_000
+    assert kept.with_suffix(".png").stat().st_size > 10_000
     with pytest.raises(ValueError, match="marks"):
         readme.rewritten(f"{readme.END} {readme.BEGIN}", "new")
 
@@ -410,6 +458,14 @@ def test_what_is_skipped_is_measured_on_the_same_motion() -> None:
     assert 0.0 < row["skipped"] < row["done"]
 
 
+@pytest.mark.stress
+def test_every_thing_that_is_skipped_is_measured_on_the_same_motion() -> None:
+    out = Results({}, {}, {})
+    measure_unneeded(out, repeats=1, thin=False, say=quiet)
+    assert len(out.unneeded) >= len(ITEMS)
+
+
+@pytest.mark.stress
 def test_cost_against_size_has_ours_beside_pinocchio() -> None:
     out = Results({}, {}, {})
     measure_scaling(out, repeats=1, thin=True, say=quiet)
@@ -421,6 +477,10 @@ def test_cost_against_size_has_ours_beside_pinocchio() -> None:
         names = list(row)
         parts = names[names.index("of a Python run: Pinocchio") :][:4]
         assert sum(row[part] for part in parts) == pytest.approx(1.0)
+        if srm.backend() == "kernel":
+            parts = names[names.index("of a run: Pinocchio") :][:4]
+            assert sum(row[part] for part in parts) == pytest.approx(1.0)
+            assert min(row[part] for part in parts) > 0.0
         if "evaluation in the kernel (us)" in row:
             parts = names[names.index("of a run: Pinocchio") :][:4]
             assert sum(row[part] for part in parts) == pytest.approx(1.0)

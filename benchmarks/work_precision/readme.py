@@ -1,9 +1,9 @@
 """One figure and one table for the README, from a results file.
 
-    python -m benchmarks.work_precision.readme [RESULTS.json] [--readme FILE]
+    python -m benchmarks.work_precision.readme [RESULTS.json] [--docs DIR] [--readme FILE]
 
-Rewrites what stands between the two marks in the README, or puts it before the section "Measured",
-and draws the figure beside the results.
+Rewrites what stands between the two marks in the README, or puts it before the section "Measured".
+The results, in brief, and the figure go to the documentation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from benchmarks.work_precision.tables import (
 )
 
 ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "docs" / "work_precision.json"
+DOCS = ROOT / "docs"
+NAME = "work_precision.json"
 BEGIN, END = "<!-- work-precision: begin -->", "<!-- work-precision: end -->"
 BEFORE = "## Measured"
 SHOWN = ("slider_crank_whirl", "slider_crank_regular", "n_four_bar_2", "walking_robot")
@@ -116,18 +117,23 @@ def rewritten(text: str, new: str) -> str:
 
 def main(given: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("results", nargs="?", type=Path, default=RESULTS, metavar="RESULTS.json")
+    parser.add_argument("results", nargs="?", type=Path, metavar="RESULTS.json")
+    parser.add_argument("--docs", type=Path, default=DOCS, metavar="DIR")
     parser.add_argument("--readme", type=Path, default=ROOT / "README.md", metavar="FILE")
     arguments = parser.parse_args(given)
-    results = records.load(arguments.results)
-    picture = arguments.results.with_suffix(".png")
+    kept = arguments.docs / NAME
+    results = records.load(arguments.results or kept)
+    results.save(kept, brief=True)
+    # The page shows what is kept: numbers rounded twice could differ from it in the last digit.
+    results = records.load(kept)
+    picture = kept.with_suffix(".png")
     shown = [problem for problem in SHOWN if problem in results.problems]
     plots.overview(results, shown or list(results.problems)[:4]).savefig(picture, dpi=130)
     readme = arguments.readme
     path = Path(os.path.relpath(picture, readme.parent)).as_posix()
     text = readme.read_text(encoding="utf-8")
     readme.write_text(rewritten(text, block(results, path)), encoding="utf-8")
-    print(f"written: {picture}, {readme}")
+    print(f"written: {kept}, {picture}, {readme}")
 
 
 if __name__ == "__main__":

@@ -3,17 +3,17 @@
     python -m benchmarks.loop_scaling [--loops 1 20 320] [--repeats 5]
 
 Run from a checkout with the compiled kernel.  N-four-bars, at a regular configuration (upright),
-half-way down, and next to the N-fold singular one.  The load-time analysis, which takes minutes
-for hundreds of loops, is replaced by the row scales of two loops, spread by 5 % as it spreads
-them.  CPU times of this thread, least of the repeats; ``constraintDynamics`` is called from Python.
+half-way down, and next to the N-fold singular one.  CPU times of this thread, least of the repeats,
+but for loading (with its analysis and the closing of the loops) and the largest memory of the
+process so far, once; ``constraintDynamics`` is called from Python.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,42 +23,11 @@ import pinocchio as pin
 import srm_mbs as srm
 from srm_mbs._kernel import core
 from srm_mbs.arrays import FloatArray
-from srm_mbs.loading import generated
 from srm_mbs.systems.multibody import ClosedSystem
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
 ANGLES = {"regular": 0.5 * np.pi, "half-way": 0.8, "singular": 1e-3}
 SECONDS = 0.05
-
-
-def n_four_bar(n: int) -> srm.Mechanism:
-    """As :func:`srm_mbs.n_four_bar`, without its load-time analysis."""
-    small = srm.n_four_bar(2)
-    base = small.loops[0]
-    loops = tuple(
-        replace(
-            base,
-            name=f"pin_{i}",
-            a=replace(base.a, link=f"coupler_{i}"),
-            b=replace(base.b, link=f"crank_{i + 1}"),
-        )
-        for i in range(n)
-    )
-    model = pin.buildModelFromXML(generated.n_four_bar(n)[1])
-    known = small.structure
-    per_loop = base.rows.count
-    spread = 1.0 + 0.05 * np.random.default_rng(0).standard_normal(n * per_loop)
-    kept = np.tile(known.kept[:per_loop], n)
-    mechanism = srm.Mechanism(model, loops, q0=np.zeros(model.nq), v0=np.zeros(model.nv))
-    mechanism.__dict__["structure"] = replace(
-        known,
-        row_names=tuple(f"pin_{i}.{k}" for i in range(n) for k in range(per_loop)),
-        row_scale=np.tile(known.row_scale[:per_loop], n) * spread,
-        kept=kept,
-        rank=int(kept.sum()),
-        units=replace(known.units, coordinate=np.ones(model.nv)),
-    )
-    return mechanism
 
 
 def state(model: pin.Model, angle: float) -> tuple[FloatArray, FloatArray]:
@@ -116,16 +85,19 @@ def main() -> None:
     if core is None:
         raise SystemExit("the compiled kernel is not built")
     head = "".join(f"{kind} {where:>9}  " for where in ANGLES for kind in ("dense", "sparse"))
-    print(f"loops  auto    {head}constraintDynamics  (us)")
+    print(f"loops  load (s)  memory (GB)  auto    {head}constraintDynamics  (us)")
+    srm.n_four_bar(1)  # what is imported and made once
     for n in arguments.loops:
-        mechanism = n_four_bar(n)
+        start = time.thread_time()
+        mechanism = srm.n_four_bar(n)
+        load = time.thread_time() - start
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         model, constants = mechanism.model, ClosedSystem(mechanism).constants()
         cells: dict[str, list[float]] = {}
         chosen = ""
         for choice in ("auto", "dense", "sparse"):
             if choice in cells:
                 continue
-            # One at a time: each holds a pinocchio.Data, of 8 GB for 320 loops.
             twin = core.System(model, constants | {"algebra": choice}, None)
             name = "sparse" if twin.sparse else "dense"
             chosen = name if choice == "auto" else chosen
@@ -140,7 +112,7 @@ def main() -> None:
             for k in range(len(ANGLES))
             for name in ("dense", "sparse")
         )
-        print(f"{n:5d}  {chosen:6s}  {ours}{theirs:18.1f}", flush=True)
+        print(f"{n:5d}  {load:8.2f}  {memory:11.2f}  {chosen:6s}  {ours}{theirs:18.1f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -113,9 +113,15 @@ def nothing_for_singular_configurations() -> Iterator[None]:
     """``simulate`` with no placement, guard, watch, look at the start and look for bifurcations."""
 
     def control(
-        system: Any, method: Any, step: Any, first_step: Callable[[], float], t_end: float, *_: Any
+        system: Any,
+        method: Any,
+        step: Any,
+        first_step: Callable[[], float],
+        span: tuple[float, float],
+        *_: Any,
+        **__: Any,
     ) -> Any:
-        return step_size_control(method.scheme, 0.0, t_end, step, first_step), ()
+        return step_size_control(method.scheme, *span, step, first_step), ()
 
     def start(system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any) -> Memory:
         return method.start(system, t, state, norm)  # type: ignore[no-any-return]

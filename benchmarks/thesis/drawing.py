@@ -10,15 +10,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.thesis.entries import Rows
-from srm_mbs.plots import BLACK, BLUE, GREY, VERMILION
+from srm_mbs.plotting.style import BLACK, BLUE, GREY, VERMILION, prepare
+from srm_mbs.plotting.style import PALETTE as COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["BLACK", "BLUE", "COLOURS", "GREY", "MARKERS", "VERMILION"]
 
-COLOURS = (BLACK, "#E69F00", BLUE, "#009E73", VERMILION, "#CC79A7", "#56B4E9", GREY)
-"""Okabe and Ito's palette."""
 MARKERS = "osD^vP*X"
 WIDTH, FONT_SIZE = 6.6, 8.0
 RESOLUTION = 100
@@ -37,17 +36,8 @@ def panels(rows: int, height: float, columns: int = 1, **options: Any) -> tuple[
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for one in axes.ravel():
-        prepare(one)
+        prepare(one, "both", FONT_SIZE)
     return figure, axes
-
-
-def prepare(axes: Axes) -> None:
-    """Ticks, grid and frame."""
-    axes.tick_params(labelsize=FONT_SIZE - 0.5, which="both", direction="in")
-    axes.grid(color="#E4E4E4", linewidth=0.5)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 def label(axes: Axes, x: str = "", y: str = "", title: str = "") -> None:

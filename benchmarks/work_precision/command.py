@@ -24,18 +24,22 @@ def parser() -> argparse.ArgumentParser:
     """What the command takes."""
     out = argparse.ArgumentParser(
         prog="python -m benchmarks.work_precision",
-        description="Run time against error, beside other simulators, on one thread.",
+        add_help=False,
+        description="Compare run time and error with other simulators, on one thread.",
         epilog="Everything takes about two hours. Peers that are not installed are skipped: "
-        "pip install mujoco exudyn scikit-sundae scipy-dae.",
+        "pip install mujoco exudyn scikit-sundae scipy-dae. Results that DIR already holds are "
+        "kept, but for what is measured again.",
     )
-    out.add_argument("--out", type=Path, required=True, metavar="DIR", help="where results go")
+    out.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="Folder of the results."
+    )
     out.add_argument(
         "--problems",
         nargs="+",
         choices=PROBLEMS,
         default=list(PROBLEMS),
         metavar="NAME",
-        help=f"all by default: {', '.join(PROBLEMS)}",
+        help=f"Mechanisms and states.  [default: {', '.join(PROBLEMS)}]",
     )
     out.add_argument(
         "--peers",
@@ -43,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
         choices=PEERS,
         default=list(PEERS),
         metavar="NAME",
-        help=f"all by default: {', '.join(PEERS)}",
+        help=f"Simulators.  [default: {', '.join(PEERS)}]",
     )
     out.add_argument(
         "--sections",
@@ -51,15 +55,24 @@ def parser() -> argparse.ArgumentParser:
         choices=SECTIONS,
         default=list(SECTIONS),
         metavar="NAME",
-        help=f"all by default: {', '.join(SECTIONS)}",
+        help=f"Parts of the benchmark.  [default: {', '.join(SECTIONS)}]",
     )
     out.add_argument(
-        "--repeats", type=int, default=timing.REPEATS, help="timed calls per setting, 5 or more"
+        "--repeats",
+        type=int,
+        default=timing.REPEATS,
+        metavar="N",
+        help=f"Timed calls per setting, {timing.REPEATS} or more.  [default: %(default)s]",
     )
     out.add_argument(
-        "--limit", type=float, default=LIMIT, metavar="S", help="CPU time that ends a sweep"
+        "--limit",
+        type=float,
+        default=LIMIT,
+        metavar="S",
+        help="CPU time (s) that ends a series.  [default: %(default)g]",
     )
-    out.add_argument("--thin", action="store_true", help="every third setting: a quick look")
+    out.add_argument("--thin", action="store_true", help="Take every third setting: a quick look.")
+    out.add_argument("-h", "--help", action="help", help="Show this message and exit.")
     return out
 
 
@@ -80,6 +93,13 @@ def main(arguments: Sequence[str]) -> int:
             "backend": srm.backend(),
         },
     )
+    if path.exists():
+        try:
+            results = records.continued(
+                path, results, chosen.sections, chosen.problems, chosen.peers
+            )
+        except ValueError as error:
+            parser().error(f"{error}: choose another --out")
     peers = [PEERS[name] for name in chosen.peers]
 
     def say(text: str) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ OURS, FLOOR = "ours", "reduced"
 """Names of the two peers that are not counted among the other simulators."""
 DIGITS = 5
 """Significant digits of the numbers in the file."""
+BRIEF_DIGITS = 4
+"""Those in a brief file: times scatter more."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +80,18 @@ class Results:
     scaling: dict[str, Any] = field(default_factory=dict)
     schema: int = SCHEMA
 
-    def save(self, path: Path) -> None:
-        """Write to ``path``; complete at any moment."""
-        data = _plain(asdict(self))
+    def save(self, path: Path, brief: bool = False) -> None:
+        """Write to ``path``; complete at any moment.
+
+        A brief file is for the repository: of the repeats' times it has the least and the median,
+        and fields of measurements with their default are left out.
+        """
+        data = _plain(asdict(self), BRIEF_DIGITS if brief else DIGITS)
+        if brief:
+            data["measurements"] = [_brief(row) for row in data["measurements"]]
+        separators = (",", ":") if brief else (", ", ": ")
         # A row per line: files stay small, and differences between two can be read.
-        entries = [f"{json.dumps(key)}: {_rows(value)}" for key, value in data.items()]
+        entries = [f"{json.dumps(key)}: {_rows(value, separators)}" for key, value in data.items()]
         text = "{\n" + ",\n".join(entries) + "\n}"
         scratch = path.with_suffix(".part")
         scratch.write_text(text + "\n", encoding="utf-8")
@@ -105,19 +115,74 @@ def load(path: Path) -> Results:
     return Results(**data)
 
 
-def _rows(value: Any) -> str:
+def continued(
+    path: Path,
+    fresh: Results,
+    sections: Sequence[str],
+    problems: Sequence[str],
+    peers: Sequence[str],
+) -> Results:
+    """``fresh`` with the results in ``path`` that will not be measured again.
+
+    Parameters
+    ----------
+    sections, problems, peers
+        What will be: names of sections, and of problems and peers in the section "work".
+
+    Raises
+    ------
+    ValueError
+        If the file has another schema, or was measured on another machine, with other versions or
+        with other settings: such numbers do not compare.
+    """
+    old = load(path)
+    for what in ("machine", "versions", "settings"):
+        if getattr(old, what) != getattr(fresh, what):
+            raise ValueError(f"{path} was measured with other {what}")
+
+    def again(row: Measurement | Preparation | Skipped) -> bool:
+        if row.peer not in peers:
+            return False
+        if row.problem is None:  # of the section on reliability
+            return "reliability" in sections
+        return "work" in sections and row.problem in problems
+
+    return replace(
+        fresh,
+        problems=old.problems,
+        peers=old.peers,
+        measurements=[row for row in old.measurements if not again(row)],
+        preparations=[row for row in old.preparations if not again(row)],
+        skipped=[row for row in old.skipped if not again(row)],
+        reliability=[] if "reliability" in sections else old.reliability,
+        unneeded=[] if "unneeded" in sections else old.unneeded,
+        scaling={} if "scaling" in sections else old.scaling,
+    )
+
+
+def _rows(value: Any, separators: tuple[str, str]) -> str:
     if isinstance(value, list) and value:
-        lines = ",\n ".join(json.dumps(row, allow_nan=False) for row in value)
+        rows = (json.dumps(row, allow_nan=False, separators=separators) for row in value)
+        lines = ",\n ".join(rows)
         return f"[\n {lines}\n]"
-    return json.dumps(value, allow_nan=False)
+    return json.dumps(value, allow_nan=False, separators=separators)
 
 
-def _plain(value: Any) -> Any:
-    """``value`` with floats of DIGITS digits; those that JSON has not are None."""
+def _plain(value: Any, digits: int) -> Any:
+    """``value`` with floats of so many digits; those that JSON has not are None."""
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _plain(entry, digits) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
+        return [_plain(entry, digits) for entry in value]
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return value
+
+
+def _brief(row: dict[str, Any]) -> dict[str, Any]:
+    """A measurement without the times of single repeats and without what has its default."""
+    defaults = {field.name: field.default for field in fields(Measurement)}
+    brief = {key: value for key, value in row.items() if value != defaults[key]}
+    for times in brief.keys() & {"cpu", "wall"}:
+        brief[times] = {key: value for key, value in row[times].items() if key != "all"}
+    return brief

@@ -3,11 +3,16 @@
 N-four-bars for loops, open chains for coordinates.  ``run``: whole runs with the default backend,
 over their evaluations or steps.  Where the time goes:
 
-* Pinocchio: its calls in an evaluation, made from Python (0.25 us of each is the call itself);
-* algebra: the rest of an evaluation; in the Python backend LAPACK on matrices of the same size
-  apart from Python;
-* stepping: what one more evaluation costs in a run beyond itself;
-* Python around the kernel: what a run costs however short it is.
+* Pinocchio: in the kernel the pass over the tree in a loop of its own; in the Python backend its
+  calls (0.25 us of each is the call itself);
+* algebra: in the kernel the rest of an evaluation, closures and forces included; in the Python
+  backend LAPACK on matrices of the same size;
+* stepping: the time in the kernel that no evaluation accounts for;
+* Python around the kernel: the time of a run outside it.
+
+Evaluations in the kernel are measured at states of the run, since near singular configurations
+they cost more; the four parts add up to one and are differences of measured times, so that a small
+one may come out negative.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import time
 import timeit
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
@@ -27,6 +33,8 @@ from benchmarks.work_precision.peers.pinocchio_dynamics import PinocchioDynamics
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.records import Results
+from srm_mbs.arrays import FloatArray
+from srm_mbs.compiled.run import CompiledRun
 from srm_mbs.compiled.twin import twin_of
 from srm_mbs.systems.multibody import make_system
 
@@ -37,6 +45,8 @@ LONGEST_LOAD = 120.0
 RTOL = 1e-8
 STEPS = 60
 """About how many steps the measured runs take."""
+STATES = 8
+"""States of a run at which evaluations are measured."""
 
 
 def per_call(call: Callable[[], Any], repeats: int, seconds: float = 0.02) -> float:
@@ -88,15 +98,44 @@ def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
     }
 
 
-def kernel_evaluation(mechanism: srm.Mechanism, repeats: int) -> float | None:
-    """Microseconds of an evaluation in the kernel's own loop; None where runs do not use it."""
-    if srm.backend() != "kernel":
-        return None
+def kernel_evaluation(mechanism: srm.Mechanism, t_end: float, repeats: int) -> tuple[float, float]:
+    """Microseconds of an evaluation, and of the pass over the tree in it, in the kernel's own loop:
+    means over states of a run."""
     twin = twin_of(make_system(mechanism))
-    state = np.concatenate([mechanism.q0, mechanism.v0])
+    states = srm.simulate(mechanism, t_end, rtol=RTOL).steps.states
+    chosen = states[np.linspace(0, len(states) - 1, STATES).astype(int)]
     number = 20
-    cost = per_call(lambda: twin.repeat(0.0, state, number), repeats)
-    return cost / number
+
+    def costs(state: FloatArray) -> tuple[float, float]:
+        evaluation = per_call(lambda: twin.repeat(0.0, state, number), repeats, 0.005)
+        return evaluation, per_call(lambda: twin.repeat_tree(state, number), repeats, 0.005)
+
+    evaluation, tree = np.mean([costs(state) for state in chosen], axis=0) / number
+    return float(evaluation), float(tree)
+
+
+def _inside(mechanism: srm.Mechanism, t_end: float, repeats: int) -> tuple[float, float]:
+    """Least CPU microseconds of a run, and of what it spends in the kernel."""
+    advance = CompiledRun.advance
+    spent = 0.0
+
+    def timed(run: CompiledRun, steps: int = 0) -> int:
+        nonlocal spent
+        start = time.process_time()
+        try:
+            return advance(run, steps)
+        finally:
+            spent += time.process_time() - start
+
+    found = []
+    with patch.object(CompiledRun, "advance", timed):
+        for _ in range(3 * repeats):
+            spent = 0.0
+            start = time.process_time()
+            srm.simulate(mechanism, t_end, rtol=RTOL)
+            found.append((time.process_time() - start, spent))
+    cost, inside = min(found)
+    return 1e6 * cost, 1e6 * inside
 
 
 def _run_cost(
@@ -125,20 +164,19 @@ def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float | None]:
         "run, per evaluation (us)": auto,
         "run, per step (us)": cost / steps,
     }
-    in_kernel = kernel_evaluation(mechanism, repeats)
-    if in_kernel is None:
+    if srm.backend() != "kernel":
         python = auto
     else:
-        twice, more, _ = _run_cost(mechanism, "auto", 2.0 * t_end, repeats)
-        marginal = (twice - cost) / (more - evaluations)
-        python = _run_cost(mechanism, "python", t_end, repeats)
-        python = python[0] / python[1]
+        whole, inside = _inside(mechanism, t_end, repeats)
+        in_kernel, tree = kernel_evaluation(mechanism, t_end, repeats)
+        python_cost, python_evaluations, _ = _run_cost(mechanism, "python", t_end, repeats)
+        python = python_cost / python_evaluations
         row |= {
             "evaluation in the kernel (us)": in_kernel,
-            "of a run: Pinocchio": min(pinocchio, in_kernel) / auto,
-            "algebra": max(in_kernel - pinocchio, 0.0) / auto,
-            "stepping": (marginal - in_kernel) / auto,
-            "Python around the kernel": (auto - marginal) / auto,
+            "of a run: Pinocchio": tree * evaluations / whole,
+            "algebra": (in_kernel - tree) * evaluations / whole,
+            "stepping": (inside - in_kernel * evaluations) / whole,
+            "Python around the kernel": (whole - inside) / whole,
         }
     within = min(evaluation, python)
     return row | {

@@ -95,7 +95,7 @@ def _open_chain() -> Item:
 
 def _zero_rows() -> Item:
     mechanism = srm.load("n_four_bar_5")
-    whole = mechanism.with_state(mechanism.q0, mechanism.v0)
+    whole = replace(mechanism)  # anew: copies share what follows from the structure
     structure = mechanism.structure
     kept = np.ones_like(structure.kept)
     whole.__dict__["structure"] = replace(structure, kept=kept)

@@ -1,4 +1,4 @@
-"""A DAE that is no mechanism: a batch reactor held at a set point.
+"""A DAE that is not a mechanism: a batch reactor held at a set point.
 
 Two species react, A -> B -> C, and a feed u of A is chosen at every time so that the amount of B
 follows a wanted curve exactly.  In the form x' = f - B y, 0 = g(t, x) the feed is the multiplier

@@ -21,9 +21,9 @@ swinging = [s for s in linear.eigenvalues if s.imag > 0.0]
 for k, s in enumerate(sorted(swinging, key=lambda s: s.imag), 1):
     print(f"{k:6d} {abs(s) / (2.0 * np.pi):16.3f} {-s.real / abs(s):15.4f}")
 
-push = np.zeros(mechanism.model.nv)
-still = mechanism.with_state(rest.q, push)
-start = srm.assemble(still, {}, {"platform": [0.3, 0.0, 0.0, 0.0, 0.0, 0.0]})
+# The push: a velocity of the platform along x, to which the rates of the legs are made to fit.
+still = mechanism.with_state(rest.q, np.zeros(mechanism.model.nv))
+start = srm.assemble(still, v={"platform": [0.3, 0.0, 0.0, 0.0, 0.0, 0.0]})
 run = srm.simulate(still, 5.0, q0=start.q, v0=start.v, rtol=1e-8)
 first = mechanism.joint("platform").idx_q
 away = np.linalg.norm(run.q[:, first : first + 3] - rest.q[first : first + 3], axis=1)

@@ -49,6 +49,10 @@ def picture(name: str) -> None:
         few.save(path, optimize=True)
 
 
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def page() -> str:
     """The page, from the descriptions and what the package finds in them."""
     parts = [
@@ -61,8 +65,9 @@ def page() -> str:
     for name in srm.bundled_models():
         mechanism = srm.load(name)
         counted = (
-            f"{mechanism.model.nv} joint coordinates, {len(mechanism.loops)} closures of rank "
-            f"{mechanism.structure.rank}, {mechanism.degrees_of_freedom} degrees of freedom."
+            f"{_counted(mechanism.model.nv, 'joint coordinate')}, "
+            f"{_counted(len(mechanism.loops), 'closure')} of rank {mechanism.structure.rank}, "
+            f"{_counted(mechanism.degrees_of_freedom, 'degree')} of freedom."
         )
         parts += [f"## {name}", f"![{name}](gallery/{name}.png)", f"{summary(name)}  {counted}"]
     return "\n\n".join(parts) + "\n"

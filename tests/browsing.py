@@ -23,6 +23,7 @@ def opened(browser: Any, address: str, size: tuple[int, int] = (900, 600)) -> It
         if kind == "error" and not location["url"].endswith("favicon.ico"):  # meshcat serves none
             complaints.append(text)
 
+    page.set_default_timeout(120_000.0)  # ms: machines may be busy
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda message: complain(message.type, message.text, message.location))
     allowed = ("file:", "data:", "blob:", address)

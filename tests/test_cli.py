@@ -51,7 +51,7 @@ def run_apart(*args: object, **environment: str) -> subprocess.CompletedProcess[
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=180,
     )
 
 
@@ -326,7 +326,7 @@ def test_interrupted_run_is_written_and_exits_with_1(tmp_path: Path) -> None:
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(timeout=0.5)
         process.send_signal(signal.SIGINT)
-        output, messages = process.communicate(timeout=30)
+        output, messages = process.communicate(timeout=120)
     assert process.returncode == 1, messages
     assert row(output, "status") == "interrupted"
     assert "Interrupted at t = " in messages
@@ -359,7 +359,7 @@ def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> Non
     with process:
         next(line for line in process.stderr if "slider_crank is played at http://" in line)
         process.send_signal(signal.SIGINT)
-        messages = process.communicate(timeout=30)[1]
+        messages = process.communicate(timeout=120)[1]
     assert process.returncode == 0, messages
     assert "Traceback" not in messages
 

@@ -625,7 +625,7 @@ def has_colour(image: Any, colour: tuple[float, ...]) -> bool:
 def test_the_picture_shows_the_coloured_bodies_on_a_light_background(exported: Any) -> None:
     page, solution = exported
     bodies_in(page, 0.0)
-    page.wait_for_timeout(200)
+    page.evaluate("new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))")
     image = pixels(page)
     assert np.median(image) > 0.85
     for visual in visuals_of(solution.mechanism):

@@ -454,7 +454,7 @@ def test_the_readme_gets_one_figure_and_one_table_between_its_marks(
 def test_what_is_skipped_is_measured_on_the_same_motion() -> None:
     out = Results({}, {}, {})
     measure_unneeded(out, repeats=2, thin=True, say=quiet)
-    # Which is less is for the benchmark to say: with two repeats beside other work it may be either.
+    # Which is less is for the benchmark to say: two repeats beside other work may show either.
     (row,) = out.unneeded
     assert min(row["skipped"], row["done"]) > 0.0
 

@@ -13,8 +13,9 @@ import srm_mbs as srm
 from srm_mbs import kernel, workspaces
 from srm_mbs.errors import EvaluationError
 from srm_mbs.loading import generated
-from srm_mbs.systems import pivoting, ranks, structure
+from srm_mbs.systems import pivoting, ranks, walking
 from srm_mbs.systems.closure_geometry import ClosureGeometry
+from srm_mbs.systems.driven import DrivenKinematics
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.pivoting import RowAlgebra, coordinate_parents, row_algebra, trees
 from srm_mbs.systems.projection import cholesky, pivoted_qr, unwhiten, whiten
@@ -55,7 +56,7 @@ def rows_of(n: int = 0) -> tuple[pin.Model, np.ndarray, np.ndarray]:
     q = pin.integrate(model, mechanism.q0, move)
     data = model.createData()
     pin.crba(model, data, q, pin.Convention.WORLD)
-    rows = structure.DrivenKinematics(model, mechanism.loops, ())
+    rows = DrivenKinematics(model, mechanism.loops, ())
     rows.update(data, q, with_bias=False)
     assert not rows.G[~rows.pattern()].any()
     M = np.triu(data.M)
@@ -252,7 +253,7 @@ def test_pivots_decide_as_singular_values_do(name: str, monkeypatch: pytest.Monk
     """Ranks, redundant rows, row scales and mobility of every bundled mechanism."""
     found = srm.load(name)
     assert found.mobility
-    monkeypatch.setattr(structure, "row_algebra", lambda *_: BySingularValues())
+    monkeypatch.setattr(walking, "row_algebra", lambda *_: BySingularValues())
     same_decisions(found, srm.load(name), TURNED if name == "bricard" else 1e-12)
 
 

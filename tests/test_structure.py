@@ -16,6 +16,7 @@ from srm_mbs.systems import structure
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.systems.structure import Structure, analyse
+from srm_mbs.systems.walking import Walker
 from tests.mechanisms import along_x, floating_ring, rescaled, rod
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
@@ -495,8 +496,11 @@ def test_row_scales_are_the_same_for_all_rows_of_one_kind_in_a_closure() -> None
 
 
 @pytest.mark.parametrize("name", CLOSED_MODELS)
-def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(name: str) -> None:
-    mechanism = load(name)
+def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(structure, "BLUNT", 0.0)
+    mechanism = load.__wrapped__(name)
     model, units = mechanism.model, mechanism.structure.units
     rows = LoopKinematics(model, mechanism.loops)
     data = model.createData()
@@ -517,6 +521,46 @@ def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(n
         start = own.stop
         size = np.sqrt(squares[own].mean())
         assert_close(mechanism.structure.row_scale[own], size, rtol=0.25)  # 24 samples
+
+
+BALANCED = ("delta_robot", "spatial_slider_crank", "squeezing_mechanism")
+
+
+@pytest.mark.parametrize("name", CLOSED_MODELS)
+def test_rows_are_balanced_where_the_last_pivot_would_be_small_everywhere(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = load(name).structure
+    monkeypatch.setattr(structure, "BLUNT", 0.0)
+    before = analyse(load(name))
+    assert found.sigma_ref >= 0.1
+    assert (before.sigma_ref < 0.1) == (name in BALANCED)
+    if name in BALANCED:
+        assert found.sigma_ref > 0.5
+        assert same(replace(found, row_scale=before.row_scale, sigma_ref=before.sigma_ref), before)
+    else:
+        assert same(found, before)
+
+
+@pytest.mark.parametrize("name", ["bricard", "delta_robot", "squeezing_mechanism", "n_four_bar_40"])
+def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: str) -> None:
+    mechanism = load(name)
+    walker = Walker(mechanism, mechanism.structure.units)
+    walker.set_scale(mechanism, np.random.default_rng(0))
+    q = next(walker.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
+    found = walker.distances(q)
+    used = np.flatnonzero(np.isfinite(found))
+    assert len(used) == mechanism.structure.rank
+    model, data = mechanism.model, mechanism.model.createData()
+    rows = LoopKinematics(model, mechanism.loops)
+    M = np.triu(pin.crba(model, data, q, pin.Convention.WORLD))
+    rows.update(data, q, with_bias=False)
+    L = np.linalg.cholesky(M + np.triu(M, 1).T)
+    W = np.linalg.solve(L, (rows.G / walker.scale[:, None]).T)[:, used]
+    for k, distance in enumerate(found[used]):
+        others = np.delete(W, k, axis=1)
+        nearest = others @ np.linalg.lstsq(others, W[:, k], rcond=None)[0]
+        assert np.linalg.norm(W[:, k] - nearest) == pytest.approx(distance, rel=1e-9)
 
 
 MOTIONS = {"slider_crank": [1, -2], "parallelogram": [1, -1, 1], "n_four_bar_2": [1, -1, 1, -1, 1]}

@@ -29,6 +29,7 @@ from srm_mbs.systems.singular import (
     participants,
     smallest_singular_value,
 )
+from srm_mbs.systems.structure import BLUNT
 
 SLACK = 1.5
 """How much faster sigma may change between two stages than it was seen to change around them."""
@@ -36,9 +37,6 @@ NEAR_ZERO = 0.05
 """Part of the sigmas around that sigma must be able to reach between two stages."""
 LINGERS = 0.05
 """sigma below which a motion is close to a singular configuration, wherever it comes from."""
-BLUNT = 0.1
-"""Usual size of the last pivot below which it is small for other reasons than singular
-configurations nearby, such as a slender body whose turning about its axis a closure holds."""
 SUBDIVISION = 4
 """Samples on the dense output per interval between two stages."""
 LEFT_AT = 0.02

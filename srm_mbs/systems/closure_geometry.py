@@ -18,8 +18,8 @@ import pinocchio as pin
 from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics, world_jacobian
-from srm_mbs.systems.structure import ROUNDING_ROW
 from srm_mbs.systems.units import coordinate_units, row_units
+from srm_mbs.systems.walking import ROUNDING_ROW
 from srm_mbs.workspaces import workspace
 
 

@@ -18,7 +18,8 @@ from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.driven import DriveRows
 from srm_mbs.systems.loops import world_jacobian
 from srm_mbs.systems.ranks import null_basis
-from srm_mbs.systems.structure import Walker, row_names
+from srm_mbs.systems.structure import row_names
+from srm_mbs.systems.walking import Walker
 from srm_mbs.workspaces import workspace
 
 if TYPE_CHECKING:

@@ -233,7 +233,8 @@ def export_html(
         Key frames per second; between them the browser goes straight.  More are taken where bodies
         would be seen beside their places, such as in short runs of fast mechanisms, and fewer where
         their number would get too large (:data:`srm_mbs.scene.MAX_BODY_FRAMES`), to keep the file
-        below 5 MB unless there are mesh files or very many bodies.
+        below 5 MB unless there are mesh files or very many bodies, or the run takes the better part
+        of an hour.
     trace
         Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
     gaps

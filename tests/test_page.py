@@ -240,6 +240,31 @@ def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[
 
 
 @pytest.mark.browser
+@pytest.mark.parametrize(
+    ("span", "panel", "clock"),
+    [
+        ((5.0, 9.0), "6.000", "6.00 / 9.00 s"),
+        ((-3.0, 1.0), "\u22122.000", "\u22122.00 / 1.00 s"),
+        ((0.0, 4e-6), "0.000001000", "0.00000100 / 0.00000400 s"),
+    ],
+)
+def test_panel_and_slider_tell_the_time_of_the_run_with_the_digits_that_it_needs(
+    browser: Any, tmp_path: Path, span: tuple[float, float], panel: str, clock: str
+) -> None:
+    solution = srm.simulate(srm.load("slider_crank"), span[1], t0=span[0])
+    solution.export_html(tmp_path / "page.html")
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        page.evaluate("seek(0.25 * viewer.animator.duration)")
+        page.wait_for_function(
+            "words => document.querySelector('output').value === words", arg=clock
+        )
+        assert (
+            page.evaluate("document.querySelector('#panel td:nth-child(2)').textContent") == panel
+        )
+        assert page.locator("#time").get_attribute("aria-valuetext") == clock
+
+
+@pytest.mark.browser
 def test_without_the_loop_the_motion_stops_at_its_end_and_can_be_played_again(page: Any) -> None:
     page.locator("#loop").uncheck()
     page.evaluate("seek(7.8)")

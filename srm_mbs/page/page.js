@@ -92,6 +92,16 @@ function shown(value) {
     .replace("-", "\u2212").replace("e-", "e\u2212").replace("e+", "e");
 }
 
+// Of times in a run of some duration: enough to see it go on.
+function digits_of(duration) {
+  if (duration === 0 || duration >= 1) return 2;
+  return Math.min(Math.max(4, 2 + Math.ceil(-Math.log10(duration))), 15);
+}
+
+function fixed(time, digits) {
+  return time.toFixed(digits).replace("-", "\u2212");
+}
+
 // Bar: meshcat's own controls remain under "Open Controls".
 for (const speed of SPEEDS) {
   const option = element("speed").appendChild(document.createElement("option"));
@@ -171,14 +181,15 @@ function listen() {
   if (laid_out !== animator.actions) lay_out();
   slider.value = animator.time;
   element("toggle").textContent = animator.playing ? "Pause" : "Play";
-  const digits = animator.duration > 0 && animator.duration < 1 ? 4 : 2;
-  clock.value = `${animator.time.toFixed(digits)} / ${animator.duration.toFixed(digits)} s`;
+  // In the time of the run, as in the panel: meshcat's own begins at 0.
+  const digits = digits_of(animator.duration), end = about.start + animator.duration;
+  clock.value = `${fixed(about.start + animator.time, digits)} / ${fixed(end, digits)} s`;
   slider.setAttribute("aria-valuetext", clock.value);
   // While a run is computed there is no animation.
   const computed = about.live && animator.duration === 0;
   const time = computed ? state[0] : about.start + animator.time;
   if (scene !== null || animator.duration > 0 || time > 0) step_back();
-  if (about.panel) cells[0].textContent = time.toFixed(digits + 1);
+  if (about.panel) cells[0].textContent = fixed(time, digits + 1);
   about.values.forEach((value, i) => {
     const here = computed ? state[value.live] ?? null : value_at(value.samples, time);
     cells[i + 1].textContent = shown(here);

@@ -264,12 +264,20 @@ def _may_vanish(t: FloatArray, sigma: FloatArray, around: int) -> BoolArray:
     """Between which neighbouring samples (k - 1,) sigma may have come close to zero."""
     dt = np.diff(t)
     slope = np.abs(np.diff(sigma)) / dt
-    widest = np.array([slope[max(0, i - around) : i + around + 1].max() for i in range(len(slope))])
-    size = np.array([sigma[max(0, i - around) : i + around + 2].max() for i in range(len(slope))])
+    widest = _largest(slope, around, around)
+    size = _largest(sigma, around, around + 1)[:-1]
     lowest = 0.5 * (sigma[:-1] + sigma[1:] - SLACK * widest * dt)
     # A run that lingers next to a singular configuration takes steps far below its distance.
     lingers = np.minimum(sigma[:-1], sigma[1:]) < LINGERS
     out: BoolArray = (lowest < NEAR_ZERO * size) | lingers
+    return out
+
+
+def _largest(values: FloatArray, before: int, after: int) -> FloatArray:
+    """The largest of each value (n,) and its neighbours, as far as there are any."""
+    padded = np.pad(values, (before, after), constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, before + after + 1)
+    out: FloatArray = windows.max(axis=1)
     return out
 
 

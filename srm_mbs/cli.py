@@ -41,6 +41,7 @@ from srm_mbs.cli_playback import (
     Reactions,
     Trace,
     Video,
+    check_overlays,
     check_pictures,
     check_time,
     drawn,
@@ -189,6 +190,7 @@ def simulate(
 
     mechanism = srm_mbs.load(model)
     shown = drawn(mechanism, trace, gaps, reactions)
+    check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
     check_time(at, t_end)

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any, ParamSpec, get_type_hints
 
 import typer
-from typer.models import OptionInfo
+from typer.models import ArgumentInfo, OptionInfo
 
-from srm_mbs.errors import InputError, SrmError, SrmWarning
+from srm_mbs.errors import CHECK_WRITING, InputError, SrmError, SrmWarning
 
 RUN_FAILED, BAD_INPUT = 1, 2
 Given = ParamSpec("Given")
@@ -88,6 +88,8 @@ def _as_written(element: str, command: Callable[..., None]) -> str:
     for given in getattr(hint, "__metadata__", ()):
         if isinstance(given, OptionInfo):
             return (given.param_decls or ("--" + element.replace("_", "-"),))[0]
+        if isinstance(given, ArgumentInfo):
+            return str(given.metavar)
     return element
 
 
@@ -145,8 +147,12 @@ def write_files(
         try:
             write(path)
         except (OSError, SrmError) as error:
-            text = os_problem(error) if isinstance(error, OSError) else str(error)
-            say("error", f"{path}: {text.removeprefix(f'{path}: ')}")
+            if isinstance(error, OSError):
+                why = error.strerror or error
+                error = InputError(
+                    f"it cannot be written: {why}", file=str(path), remedy=CHECK_WRITING
+                )
+            say("error", f"{path}: {str(error).removeprefix(f'{path}: ')}")
             failed = True
         else:
             written.append(path)

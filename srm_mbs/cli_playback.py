@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -75,20 +77,41 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
         encoder_of(video)
 
 
-def check_time(at: float | None, t_end: float) -> None:
-    """Refuse a picture of a time (s) that a run up to ``t_end`` (s) does not have.
+def check_time(at: float | None, t_end: float, start: float = 0.0) -> None:
+    """Refuse a picture of a time (s) that a run from ``start`` to ``t_end`` (s) does not have.
 
     Raises
     ------
     InputError
         If it has not.
     """
-    if at is not None and not (0.0 <= at <= t_end or t_end <= 0.0):
+    if at is not None and not (start <= at <= t_end or t_end <= start):
         raise InputError(
-            f"{at:g} s lies outside the run, from 0 to {t_end:g} s",
+            f"{at:g} s lies outside the run, from {start:g} to {t_end:g} s",
             element="--at",
             remedy="Give a time of the run",
         )
+
+
+def check_overlays(
+    trace: list[str] | None, gaps: bool, reactions: bool, seen: Iterable[object]
+) -> None:
+    """Refuse what would be drawn where nothing is: none of the options ``seen`` is given.
+
+    Raises
+    ------
+    InputError
+        If so.
+    """
+    if any(seen):
+        return
+    for option, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
+        if given:
+            raise InputError(
+                "it is drawn in the animation, and none is asked for",
+                element=option,
+                remedy="Give --html, --image, --video, --play or --live too",
+            )
 
 
 def drawn(
@@ -123,6 +146,8 @@ def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
             x, y, z = (float(number) for number in numbers.split(","))
         except ValueError:
             colon = ""
+        else:
+            colon = colon if math.isfinite(x + y + z) else ""
         if not colon:
             raise InputError(
                 f"{text!r} is not a point of a link",
@@ -149,6 +174,7 @@ def play(
     """
     check_pictures(image, at, video)
     solution = srm_mbs.load_solution(run)
+    check_time(at, solution.span[1], solution.span[0])
     options = drawn(solution.mechanism, trace, gaps, reactions)
     if image is None and video is None:
         play_run(solution, options)

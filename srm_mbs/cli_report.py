@@ -9,6 +9,7 @@ import typer
 
 import srm_mbs
 from srm_mbs.cli_output import Run, check_output, reported, table
+from srm_mbs.errors import InputError
 
 
 @reported()
@@ -49,6 +50,12 @@ def report(
 
     path = run.with_suffix(".html") if out is None else out
     check_output(path, "--out", (".html", ".htm"))
+    if no_second_run and rtol is not None:
+        raise InputError(
+            "it is the tolerance of the second run, which --no-second-run leaves out",
+            element="--rtol",
+            remedy="Leave out one of the two",
+        )
     solution = srm_mbs.load_solution(run)
     if not no_second_run:
         typer.echo("making the run again, to estimate its error", err=True)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from srm_mbs.solution import Solution
 
 
-CHECK_WRITING = "Check the folder and its permissions"
+CHECK_WRITING = "Check the folder, its permissions and the space on the disk"
 """Remedy for a file that cannot be written."""
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import zipfile
 from contextlib import nullcontext
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -310,8 +311,14 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
     """
     try:
         opened = path.open("rb") if isinstance(path, Path) else nullcontext(path)
-        with opened as source, np.load(source, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with opened as source:
+            if not zipfile.is_zipfile(
+                source
+            ):  # NumPy would speak of pickles, and how to trust them
+                raise ValueError("no archive of arrays")
+            source.seek(0)
+            with np.load(source, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("meta")))
         if meta["format"] != FORMAT:
             raise InputError(
@@ -368,6 +375,10 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         return solution
     except FileNotFoundError as error:
         raise InputError("there is no such file", file=name, remedy="Check the path") from error
+    except OSError as error:
+        raise InputError(
+            f"it cannot be read: {error.strerror or error}", file=name, remedy=SAVED_BY
+        ) from error
     except InputError as error:
         raise error.located(name) from error
     except Exception as error:  # a damaged file makes NumPy and zipfile raise almost anything

@@ -92,6 +92,7 @@ def test_simulate_prints_the_balance_when_asked() -> None:
         (("linearise", "four_bar", "--at", "here"), "there is no state 'here'"),
         (("linearise", "four_bar", "--html", "x.txt"), "the suffix '.txt' is not known here"),
         (("drag", "four_bar", "crank"), "joint 'crank' has no value"),
+        (("drag", "four_bar", "crank=nan"), "JOINT=VALUE[,VALUE...]: joint 'crank' cannot be"),
     ],
 )
 def test_bad_input_is_one_line_with_status_2(arguments, message: str) -> None:

@@ -562,13 +562,24 @@ def test_the_command_line_draws_the_path_of_a_point_of_a_link(
         ("slider_crank", ["--trace", "rod"], "'rod' is not a point of a link"),
         ("slider_crank", ["--trace", "rod:1,2"], "'rod:1,2' is not a point of a link"),
         ("slider_crank", ["--trace", "bar:1,2,3"], "--trace: there is no link 'bar'"),
+        ("slider_crank", ["--trace", "rod:1,2,nan"], "--trace: 'rod:1,2,nan' is not a point"),
         ("simple_pendulum", ["--reactions"], "--reactions: the mechanism has no closures"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_before_the_run(
-    model: str, options: list[str], words: str
+    model: str, options: list[str], words: str, tmp_path: Path
 ) -> None:
-    done = CliRunner().invoke(app, ["simulate", model, *options])
+    page = ["--html", str(tmp_path / "page.html")]
+    done = CliRunner().invoke(app, ["simulate", model, *page, *options])
     assert done.exit_code == 2
     assert words in done.output
+    assert "steps" not in done.output
+
+
+@pytest.mark.parametrize("options", [["--trace", "rod:1,0,0"], ["--gaps"], ["--reactions"]])
+def test_what_would_be_drawn_nowhere_is_refused_before_the_run(options: list[str]) -> None:
+    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
+    assert done.exit_code == 2
+    assert f"error: {options[0]}: it is drawn in the animation" in done.output
+    assert "--html" in done.output
     assert "steps" not in done.output

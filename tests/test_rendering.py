@@ -142,6 +142,14 @@ def test_a_film_without_its_encoder_and_a_time_without_its_picture_are_refused_b
         assert "steps" not in done.output
 
 
+def test_a_picture_of_a_time_outside_a_saved_run_is_refused_by_its_option(tmp_path: Path) -> None:
+    srm.simulate(srm.load("simple_pendulum"), 2.0, t0=1.0).save(tmp_path / "run.npz")
+    options = ["--image", str(tmp_path / "image.png"), "--at", "0.5"]
+    done = CliRunner().invoke(app, ["play", str(tmp_path / "run.npz"), *options])
+    assert done.exit_code == 2
+    assert "error: --at: 0.5 s lies outside the run, from 1 to 2 s" in done.output
+
+
 @pytest.mark.browser
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_the_frames_of_a_film_from_the_command_line_show_the_bob_where_it_is(

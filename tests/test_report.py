@@ -408,6 +408,7 @@ def test_the_command_writes_the_page_beside_the_run(
     [
         (["--out", "report.pdf"], "the suffix '.pdf' is not known here"),
         (["--rtol", "1e-6"], "two runs alike"),
+        (["--rtol", "1e-8", "--no-second-run"], "--rtol: it is the tolerance of the second run"),
     ],
 )
 def test_the_command_refuses_what_it_cannot_do(saved: Path, options: list[str], words: str) -> None:

@@ -164,8 +164,9 @@ def test_the_file_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_file_that_is_no_run_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "strange.npz"
     path.write_bytes(content)
-    with pytest.raises(srm.InputError, match=r"strange\.npz: it is not a saved run"):
+    with pytest.raises(srm.InputError, match=r"strange\.npz: it is not a saved run") as refused:
         srm.load_solution(path)
+    assert "pickle" not in str(refused.value)
 
 
 def test_another_npz_and_a_missing_file_are_refused(tmp_path: Path) -> None:
@@ -174,6 +175,8 @@ def test_another_npz_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         srm.load_solution(tmp_path / "other.npz")
     with pytest.raises(srm.InputError, match="no such file"):
         srm.load_solution(tmp_path / "missing.npz")
+    with pytest.raises(srm.InputError, match="it cannot be read: Is a directory"):
+        srm.load_solution(tmp_path)
 
 
 def test_a_damaged_file_is_refused_whatever_is_wrong_with_it(tmp_path: Path) -> None:

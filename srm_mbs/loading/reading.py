@@ -254,7 +254,7 @@ def _generated(n: int, overrides: Overrides) -> Reading:
             + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
         )
     text, urdf = _n_four_bar_texts(n)
-    return _of_description(text, str(models_folder() / f"n_four_bar_{n}.toml"), overrides, urdf)
+    return _of_description(text, f"n_four_bar_{n}, generated", overrides, urdf)
 
 
 def n_four_bar(n: int) -> Mechanism:

@@ -21,7 +21,7 @@ from srm_mbs.records import Request
 from srm_mbs.segmented import SegmentedSolution
 from srm_mbs.simulation import simulate
 from srm_mbs.solution import Solution
-from srm_mbs.stepping.events import TOGETHER, Event, prepare_events
+from srm_mbs.stepping.events import Event, prepare_events, together
 from srm_mbs.systems.consistent import onto_closures
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
 
@@ -110,13 +110,13 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
     floors = [0.0] * len(events)
     parts: list[Solution] = []
     acted: list[int] = []
-    guard: float | None = None
+    guards: list[float | None] = [None] * len(events)
     t = float(options["t0"])
     span = t_end - t
     status, message = "", ""
     while not status:
         armed = [
-            _Armed(event, prepared[i], counts[i], i in acted, floors[i], guard)
+            _Armed(event, prepared[i], counts[i], i in acted, floors[i], guards[i])
             for i, event in enumerate(events)
         ]
         try:
@@ -140,7 +140,9 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
         if status != "event" or any(len(found[i]) >= armed[i].left for i in due):
             break
         acted = [i for i in due if armed[i].acts]
-        guard = TOGETHER * float(solution.steps.times[-1] - solution.steps.times[-2])
+        # What was counted here is not counted again just after; the rest has still to be.
+        near = 2.0 * together(*solution.steps.times[-2:].tolist())
+        guards = [near if len(times) and times[-1] >= t - near else 0.0 for times in found]
         try:
             names = [armed[i].__name__ for i in acted]
             log.debug("%s: action of %s at t = %.9g s", mechanism.name, ", ".join(names), t)

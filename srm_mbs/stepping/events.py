@@ -49,13 +49,21 @@ from srm_mbs.systems.base import System
 TOGETHER = 1e-10
 """A zero within this fraction of the first step after the start counts as lying on it, and within
 this fraction of the last step after the end of a run as lying there."""
+ROUNDING = 16.0 * float(np.finfo(float).eps)
+"""The same over the time itself: two equal zeros come out of the search up to 8 eps each apart."""
 RETURNS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
 NEAR_ZERO = 0.5
 """A vertex is examined if it is nearer to zero than this fraction of its neighbours."""
 
+
 StateFunction = Callable[[float, FloatArray], Any]
 """(t, state) -> a float that passes zero at the event."""
+
+
+def together(t: float, t_new: float) -> float:
+    """Times within the step from ``t`` to ``t_new`` that are closer than this (s) are one."""
+    return max(TOGETHER * (t_new - t), ROUNDING * max(abs(t), abs(t_new)))
 
 
 @dataclass(frozen=True)
@@ -79,8 +87,8 @@ class Event:
     floor
         Size of values that count as zero: of an event that closures hold at zero, the rounding.
     guard
-        Time after the start of the run up to which a zero lies on it; None for TOGETHER of the
-        first step.  A segment of a run begins where its predecessor stopped to count.
+        Time after the start of the run up to which a zero lies on it; None for :func:`together`
+        of the first step.  In a segment of a run 0 for zeros that its predecessor did not count.
     """
 
     name: str
@@ -276,7 +284,7 @@ class EventWatch:
             self._values[i] = values[-1]
         if not found:
             return None
-        return self._record(sorted(found), dense, TOGETHER * (t_new - t))
+        return self._record(sorted(found), dense, together(t, t_new))
 
     def _departing(
         self, i: int, dense: DenseOutput, nodes: list[tuple[float, float]]
@@ -300,7 +308,7 @@ class EventWatch:
         if nodes[0][0] == self._start and not event.departs:
             guard = event.guard
             if guard is None:
-                guard = TOGETHER * (nodes[-1][0] - self._start)
+                guard = together(self._start, nodes[-1][0])
             earliest = self._start + guard
         zeros = []
         for left, right in pairwise(nodes):
@@ -314,12 +322,12 @@ class EventWatch:
         return zeros
 
     def _record(
-        self, found: list[tuple[float, int]], dense: DenseOutput, together: float
+        self, found: list[tuple[float, int]], dense: DenseOutput, close: float
     ) -> Stop | None:
         stop: Stop | None = None
         for time, i in found:
             if stop is not None:
-                if time > stop.time + together:
+                if time > stop.time + close:
                     break
                 time = stop.time
             self._times[i].append(time)

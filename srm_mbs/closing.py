@@ -150,24 +150,41 @@ def _search(
     free: IndexArray,
     steps: int,
     bounds: tuple[Any, Any],
+    *,
+    near: bool,
 ) -> FloatArray:
     """Least-squares solve of the closing residual over the free coordinates, from q.
 
     To round-off: next to closings that are not isolated, or where G loses rank, convergence is
     slow, and stopping early would leave the rest to Newton's steps, which may lead anywhere.
+
+    Along directions that do not move the closures SciPy's trust region goes as far as it reaches,
+    to the side that rounding chooses.  With ``near``, Levenberg's damping, rows for the step with
+    the size of the residual, keeps such closings next to q (Yamashita, Fukushima: On the rate of
+    convergence of the Levenberg-Marquardt method, 2001); it vanishes with the residual, whose zeros
+    stay.
     """
     from scipy.optimize import least_squares
+
+    def residual(delta: FloatArray) -> FloatArray:
+        out: FloatArray = np.append(problem.mismatch(problem.move(q, delta, free)), zeros)
+        return out
 
     def jacobian(delta: FloatArray) -> FloatArray:
         full = np.zeros(problem.model.nv)
         full[free] = delta * problem.unit[free]
         chart = pin.dIntegrate(problem.model, q, full, pin.ARG1)
-        at_end = problem.mismatch_jacobian(problem.move(q, delta, free)) / problem.unit
+        here = problem.move(q, delta, free)
+        at_end = problem.mismatch_jacobian(here) / problem.unit
         out: FloatArray = ((at_end @ chart) * problem.unit)[:, free]
+        if near:
+            damping = max(float(np.linalg.norm(problem.mismatch(here))), CLOSED)
+            out = np.vstack([out, damping * np.eye(len(free))])
         return out
 
+    zeros = np.zeros(len(free) if near else 0)
     found = least_squares(
-        lambda delta: problem.mismatch(problem.move(q, delta, free)),
+        residual,
         np.zeros(len(free)),
         jac=jacobian,
         method="trf",
@@ -220,9 +237,13 @@ def close_from(
 
     ``bounds`` are the least and largest motions of these, in units.
     """
-    if np.linalg.norm(problem.mismatch(q)) > CLOSED:
-        q = _search(problem, q, free, steps, bounds)
-    return problem.unwound(_polish(problem, q, free))
+    if np.linalg.norm(problem.mismatch(q)) <= CLOSED:
+        return problem.unwound(_polish(problem, q, free))
+    for near in (True, False):  # far away where loops close nowhere near, were it by rounding only
+        found = _polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
+        if problem.closed(found):
+            break
+    return problem.unwound(found)
 
 
 def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) -> FloatArray:

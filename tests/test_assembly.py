@@ -193,12 +193,17 @@ def test_no_hinge_is_wound_up(seed: int) -> None:
     assert np.abs(state.q - guess).max() <= PI + 1e-9
 
 
-def test_a_guess_next_to_a_continuum_of_closings_stays_next_to_it() -> None:
+@pytest.mark.parametrize("away", [0.12, 1e-3, -0.6])
+@pytest.mark.parametrize("angle", [-0.01, 1.0, -2.5])
+def test_a_guess_next_to_a_continuum_of_closings_leads_to_the_nearest(
+    angle: float, away: float
+) -> None:
     """With the cranks on the ground line, coupler and second crank turn about the same point."""
     mechanism = load("n_four_bar_1")
-    state = srm.assemble(mechanism, q={"crank_0": 0.0}, guess={"coupler_0": 0.05, "crank_1": -0.07})
+    guess = {"coupler_0": angle + 0.5 * away, "crank_1": angle - 0.5 * away}
+    state = srm.assemble(mechanism, q={"crank_0": 0.0}, guess=guess)
     check(mechanism, state)
-    assert np.abs(state.q).max() < 0.1
+    assert state.q == pytest.approx([0.0, angle, angle], abs=1e-9)
     # There the second crank may turn, the first may not.
     rates = srm.assemble(mechanism, state.q, [1.0, 1.0, 1.0]).v
     assert rates[0] == pytest.approx(0.0, abs=1e-12)

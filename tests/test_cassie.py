@@ -61,7 +61,9 @@ def test_cassie_floats_with_twelve_rows_of_which_ten_are_independent() -> None:
         rows.append(one - other)
     values = np.linalg.svd(np.vstack(rows), compute_uv=False)
     assert values[9] > 1e-4
-    assert values[10] < 1e-10
+    # The axes of the right foot and of its rod are parallel to 7.4e-8 in the file, and no lever of
+    # these loops is as long as 1 m.
+    assert values[10] < 7.4e-8
 
 
 @pytest.mark.parametrize(("tableau", "order", "steps"), [("erk4", 4, 500), ("dopr54", 5, 350)])

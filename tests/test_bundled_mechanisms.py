@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from tools.models import made
 
 ROOT = Path(__file__).parents[1]
 MADE = made()
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 DEGREES = {
     "watt_six_bar": 1,
     "stephenson_six_bar": 1,
@@ -49,9 +51,13 @@ def run(name: str, t_end: float, rtol: float = 1e-9) -> srm.Solution:
 
 @pytest.mark.parametrize("name", MADE)
 def test_the_files_are_those_that_the_generator_writes(name: str) -> None:
-    urdf, description = MADE[name]()
-    assert (ROOT / "urdf" / f"{name}.urdf").read_text(encoding="utf-8") == urdf
-    assert (ROOT / "models" / f"{name}.toml").read_text(encoding="utf-8") == description
+    """But for the last digits, which come out differently on other processors."""
+    for written, file in zip(MADE[name](), (f"urdf/{name}.urdf", f"models/{name}.toml")):
+        kept = (ROOT / file).read_text(encoding="utf-8")
+        assert NUMBER.split(kept) == NUMBER.split(written)
+        found, expected = (np.array(NUMBER.findall(text), dtype=float) for text in (kept, written))
+        # Sums of some tens of products of numbers up to 10, each rounded to 2e-16.
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", MADE)

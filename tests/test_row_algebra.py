@@ -232,9 +232,10 @@ def test_rows_that_depend_on_each_other_have_the_singular_values_of_all_of_them(
 # --- decisions ----------------------------------------------------------------------------------
 
 CHAINS = ("n_four_bar_5", "n_four_bar_20")
-TURNED = 5e-3
+TURNED = 0.3
 """Bricard's row that is dependent on closed configurations only: the walk closes along it by
-another step, so that its samples differ."""
+another step, so that its samples differ.  Over 40 seeds of the walk their median has a standard
+deviation of 3.7 %, the ratio of two one of 5.2 %: this is six of them."""
 
 
 def same_decisions(a: srm.Mechanism, b: srm.Mechanism, sigma: float) -> None:

@@ -99,11 +99,9 @@ def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
     motion, view = picture.motion, picture.view
     names = node_names(picture.mechanism)
     _light(scene, view)
-    shift = np.eye(4)
-    shift[:3, 3] = -view.target
     root = scene["/mechanism"]
-    root.set_transform(shift)
     animation = meshcat.animation.Animation(default_framerate=motion.rate)
+    _shift(meshcat, animation, root, picture)
     drawn = {visual.joint for visual in picture.visuals} - {0}
     for k, joint in enumerate(motion.joints):
         if joint in drawn:
@@ -116,7 +114,7 @@ def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
         node = root[f"{names[visual.joint]}/shape_{number}"]
         _put(meshcat, node, visual.shape, visual.placement, visual.colour)
         _show(meshcat, animation, node, visual.spans, motion)
-    _draw_overlays(meshcat, scene["/overlays"], shift, picture, animation)
+    _draw_overlays(meshcat, scene["/overlays"], picture, animation)
     if animation.clips:
         # For ever: a page that is looked at late still moves; "pause" stops it.
         scene.set_animation(animation, play=True, repetitions=math.inf)
@@ -135,13 +133,21 @@ def _put(
     node.set_transform(placement)
 
 
-def _draw_overlays(
-    meshcat: Any, root: Any, shift: FloatArray, picture: Picture, animation: Any
-) -> None:
+def _shift(meshcat: Any, animation: Any, root: Any, picture: Picture) -> None:
+    """Put what the camera looks at at the origin, and keep it there."""
+    shift = np.eye(4)
+    shift[:3, 3] = -picture.view.target
+    root.set_transform(shift)
+    if picture.along is not None:
+        places = -picture.view.target - picture.along
+        _move(meshcat, animation, root, {"position": ("vector3", places)}, picture.motion)
+
+
+def _draw_overlays(meshcat: Any, root: Any, picture: Picture, animation: Any) -> None:
     """Shapes with a motion of their own, and paths."""
     overlays = picture.overlays
     if overlays.moving:
-        root.set_transform(shift)
+        _shift(meshcat, animation, root, picture)
     for moving in overlays.moving:
         node = root[moving.name]
         for number, (shape, at, colour) in enumerate(moving.parts):

@@ -39,6 +39,10 @@ ASPECT = 1.5  # width by height of the window that the picture is made for
 FILLED = 0.84  # of the window
 SMALLEST = 1e-9  # distance of the camera (m) below which there is nothing to see
 SAMPLES = 300  # frames that are looked at to find the camera's place
+FREE = ("JointModelFreeFlyer", "JointModelPlanar")
+ALONG_FROM = 5.0
+"""The picture goes along with a mechanism that is free in space and would be seen so many times
+smaller if it stood still."""
 
 
 # Motion -------------------------------------------------------------------------------------
@@ -247,7 +251,10 @@ class Picture:
     overlays
         What is drawn beside them.
     view
-        The camera's place.
+        The camera's place, at the start of the run.
+    along : (n, 3) m or None
+        How far the camera has gone along with the mechanism at the key frames; None if it stands
+        still.
     """
 
     mechanism: Mechanism
@@ -255,6 +262,7 @@ class Picture:
     motion: Motion
     overlays: Overlays
     view: View
+    along: FloatArray | None = None
 
 
 def make_picture(
@@ -279,14 +287,45 @@ def make_picture(
     others += len(loops) * (2 * wanted.gaps + 2 * wanted.reactions)
     motion = sample_motion(solution, tuple(sorted(joints)), fps, others, extra)
     points = seen_points(visuals, motion)
-    extent = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
+    extent = _extent(points)
+    moving = [visual for visual in visuals if visual.joint]
+    along = _way(mechanism, moving, motion)
+    if along is not None:
+        near = seen_points(moving, motion, along)
+        if extent > ALONG_FROM * _extent(near):
+            points, travelled, extent = near, extent, _extent(near)
+        else:
+            along = None
     overlays = make_overlays(solution, wanted, motion, extent)
-    view = choose_view(mechanism, np.concatenate([points, overlays.points()]))
-    return Picture(mechanism, visuals, motion, overlays, view)
+    if along is not None:
+        overlays.notes.append(
+            {"text": f"the picture goes along with the mechanism, which travels {travelled:.3g} m"}
+        )
+    else:
+        points = np.concatenate([points, overlays.points()])
+    return Picture(mechanism, visuals, motion, overlays, choose_view(mechanism, points), along)
 
 
-def seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
-    """Corners (n, 3) m of all shapes at sampled times."""
+def _extent(points: FloatArray) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
+
+
+def _way(mechanism: Mechanism, moving: list[Visual], motion: Motion) -> FloatArray | None:
+    """How far (n, 3) m the bodies have come on average; None if a joint holds one to the ground."""
+    model = mechanism.model
+    bases = [joint for joint in range(1, model.njoints) if model.parents[joint] == 0]
+    held = any(model.joints[joint].shortname() not in FREE for joint in bases)
+    if held or not moving or len(motion.times) == 1:
+        return None
+    drawn = [motion.joints.index(joint) for joint in sorted({visual.joint for visual in moving})]
+    middle = motion.positions[:, drawn].mean(axis=1)
+    return np.asarray(middle - middle[0])
+
+
+def seen_points(
+    visuals: list[Visual], motion: Motion, along: FloatArray | None = None
+) -> FloatArray:
+    """Corners (n, 3) m of all shapes at sampled times, as seen by who has gone ``along``."""
     chosen = np.unique(np.linspace(0, len(motion.times) - 1, SAMPLES).astype(int))
     corners: dict[int, list[FloatArray]] = {0: [np.empty((0, 3))]}
     for visual in visuals:
@@ -297,5 +336,6 @@ def seen_points(visuals: list[Visual], motion: Motion) -> FloatArray:
         together = np.concatenate(own)
         for i in chosen:
             rotation = pin.Quaternion(motion.quaternions[i, k]).matrix()
-            points.append(together @ rotation.T + motion.positions[i, k])
+            place = motion.positions[i, k] - (0.0 if along is None else along[i])
+            points.append(together @ rotation.T + place)
     return np.concatenate(points)

@@ -23,6 +23,7 @@ from srm_mbs.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.web_page import make_page
 from tests.browsing import opened
+from tests.mechanisms import floating_ring
 from tests.pacing import assert_pace
 
 ROD = srm.Anchor("rod", xyz=(0.5, 0.0, 0.2))
@@ -515,6 +516,57 @@ def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Sol
     slope = np.tan(np.radians(0.5 * FIELD_OF_VIEW)) * (view.distance + depth)
     reach = max(np.abs(x / slope).max() / ASPECT, np.abs(y / slope).max())
     assert reach == pytest.approx(FILLED, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def flight() -> srm.Solution:
+    """A ring of four rods that crosses 200 m in 4 s."""
+    ring = floating_ring()
+    v = np.array(ring.v0)
+    v[:3] += 50.0 * np.array([1.0, 0.0, 0.0])  # a free joint's rates are in its body's axes
+    return srm.simulate(ring, 4.0, v0=v)
+
+
+def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.Solution) -> None:
+    picture = make_picture(flight, 30.0, Wanted())
+    assert picture.along is not None
+    assert picture.along[0] == pytest.approx(0.0, abs=1e-12)
+    assert 150.0 < np.linalg.norm(picture.along[-1]) < 210.0
+    assert picture.view.distance < 20.0
+    (note,) = picture.overlays.notes
+    assert re.fullmatch(r"the picture goes along with .* which travels \d+ m", note["text"])
+
+
+def test_the_picture_stands_still_where_a_joint_holds_to_the_ground_or_little_is_gained(
+    slider_crank: srm.Solution,
+) -> None:
+    assert make_picture(slider_crank, 30.0, Wanted()).along is None
+    assert make_picture(srm.simulate(floating_ring(), 1.0), 30.0, Wanted()).along is None
+
+
+@pytest.mark.browser
+def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera(
+    browser: Any, flight: srm.Solution, tmp_path: Path
+) -> None:
+    point = srm.Anchor("d", xyz=(1.0, 0.0, 0.0))
+    flight.export_html(tmp_path / "page.html", trace=[point])
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        for t in (0.0, 1.0, 2.5, 4.0):
+            middles, ball = page.evaluate(
+                """t => {
+                  seek(t);
+                  viewer.scene.updateMatrixWorld(true);
+                  const at = node => new MeshCat.THREE.Vector3().setFromMatrixPosition(
+                    node.object.matrixWorld).toArray();
+                  const {mechanism, overlays} = viewer.scene_tree.children;
+                  return [Object.values(mechanism.children).filter(x => x.children.shape_0 ||
+                    Object.keys(x.children).length > 1).map(at), at(overlays.children.point_0)];
+                }""",
+                t,
+            )
+            assert len(middles) >= 4
+            assert np.abs(middles).max() < 3.0
+            assert min(np.linalg.norm(np.array(ball) - middle) for middle in middles) < 1.0 + 1e-3
 
 
 def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:

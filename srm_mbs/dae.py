@@ -12,6 +12,7 @@ from srm_mbs.errors import ControllerError, EvaluationError, InputError, Simulat
 from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method, SweepNode
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.options import (
+    check_progress,
     checked_method,
     checked_placement,
     checked_rtol,
@@ -203,6 +204,7 @@ def solve_dae(
     norm = ErrorNorm(
         _absolute_tolerance(atol, rtol, state.size), rtol, NEGLIGIBLE if step is None else 0.0
     )
+    check_progress(progress, "(t, h, x)")
     system = DaeSystem(problem, t0, state, t_end, getattr(method, "T", "identity"))
     _check_start(system, method, t0, state)
 

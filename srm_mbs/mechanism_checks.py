@@ -15,7 +15,7 @@ from srm_mbs.errors import InputError
 
 def check_tree(model: pin.Model) -> None:
     """Refuse a tree that cannot move, or whose joints are not in depth-first order, or where
-    gravity or damping is not finite.
+    gravity or damping is not finite, or damping negative.
 
     Raises
     ------
@@ -34,6 +34,14 @@ def check_tree(model: pin.Model) -> None:
                 f"the {what} of the model is not finite: {numbers}",
                 element=f"model.{what}",
                 remedy="Give finite numbers",
+            )
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:]):
+        damping = model.damping[joint.idx_v : joint.idx_v + joint.nv]
+        if (damping < 0.0).any():
+            raise InputError(
+                f"the damping of the joint {name!r} is negative: {damping}",
+                element="model.damping",
+                remedy="Give no negative numbers; a force that feeds energy in is an srm.UserForce",
             )
     _check_order(model)
 

@@ -56,6 +56,22 @@ def positive(value: Any, what: str, unit: str = "") -> float:
     return number
 
 
+def check_progress(progress: Any, arguments: str) -> None:
+    """Refuse what is neither a boolean nor a function of ``arguments``, as messages name them.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if not (callable(progress) or isinstance(progress, bool | np.bool_)):
+        raise InputError(
+            f"progress = {progress!r} is neither True or False nor a function",
+            element="progress",
+            remedy=f"Give True for a progress bar, or a function of {arguments}",
+        )
+
+
 def finite(value: Any, what: str) -> float:
     """``value`` as a finite number of seconds."""
     if type(value) is float and math.isfinite(value):

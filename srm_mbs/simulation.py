@@ -20,6 +20,7 @@ from srm_mbs.methods.psrm import PSRM
 from srm_mbs.options import (
     check_avoidable,
     check_embedded,
+    check_progress,
     checked_breakpoints,
     checked_placement,
     checked_rtol,
@@ -176,6 +177,7 @@ def simulate(
             element="controller",
             remedy="Give a function of (t, q, v) that returns the generalised forces",
         )
+    check_progress(progress, "(t, h, state)")
     if acting(events):
         from srm_mbs.segments import simulate_segments
 

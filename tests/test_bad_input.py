@@ -864,3 +864,29 @@ def test_gravity_and_damping_that_are_not_finite_are_refused(what: str) -> None:
         model.gravity.linear = numbers
     with pytest.raises(srm.InputError, match=f"the {what} of the model is not finite"):
         replace(mechanism, model=model)
+
+
+def test_joint_damping_that_would_drive_is_refused_with_the_joint() -> None:
+    mechanism = srm.load("four_bar")
+    model = mechanism.model.copy()
+    model.damping = np.array([0.0, -0.1, 0.0])
+    with pytest.raises(srm.InputError, match="damping of the joint 'coupler' is negative"):
+        replace(mechanism, model=model)
+
+
+@pytest.mark.parametrize("progress", [3, "yes", None])
+def test_progress_is_a_boolean_or_a_function(progress: Any) -> None:
+    four_bar = srm.load("four_bar")
+    circle = srm.SemiExplicitDAE(
+        f=lambda t, x: np.array([x[0] - x[1], x[0] + x[1]]),
+        B=lambda t, x: x,
+        g=lambda t, x: 0.5 * (x @ x - 1.0),
+        G=lambda t, x: x,
+    )
+    for call in (
+        lambda: srm.simulate(four_bar, 0.1, progress=progress),
+        lambda: srm.sweep(four_bar, [{}], 0.1, progress=progress),
+        lambda: srm.solve_dae(circle, (0.0, 0.1), [1.0, 0.0], progress=progress),
+    ):
+        with pytest.raises(srm.InputError, match=f"progress = {progress!r} is neither"):
+            call()

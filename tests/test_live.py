@@ -18,6 +18,13 @@ from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.multibody import make_system
 from tests.browsing import opened
 
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may keep a server that lives from answering for longer than a run waits."""
+    monkeypatch.setattr("srm_mbs.live.PATIENCE", 60.0)
+
+
 BODY = """name => {
   viewer.scene.updateMatrixWorld(true);
   const root = viewer.scene_tree.find(["mechanism"]);

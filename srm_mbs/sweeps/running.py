@@ -14,7 +14,7 @@ from typing import Any
 
 from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.options import checked_span
+from srm_mbs.options import check_progress, checked_span
 from srm_mbs.preparation import mechanism_method
 from srm_mbs.progress import Counted, counting
 from srm_mbs.simulation import simulate
@@ -129,6 +129,7 @@ def sweep(
             remedy="Give an executor of the kind of concurrent.futures; of a Dask client its "
             "get_executor()",
         )
+    check_progress(progress, "(done, total)")
     _check_options(simulate_options)
     if isinstance(simulate_options.get("events"), Iterator):  # for every run
         simulate_options["events"] = list(simulate_options["events"])

@@ -36,6 +36,7 @@ from srm_mbs.request_storage import request_entry, request_from
 from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import StepData
 from srm_mbs.systems.held import HeldForce
+from srm_mbs.systems.loops import Elimination
 from srm_mbs.systems.multibody import make_system
 from srm_mbs.systems.structure import Structure, row_names
 from srm_mbs.systems.units import Units
@@ -142,6 +143,7 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
         "v0": mechanism.v0,
         "row_scale": structure.row_scale,
         "kept": structure.kept,
+        "eliminations": np.array(structure.eliminations, dtype=float).reshape(-1, 3),
         "coordinate_unit": structure.units.coordinate,
     }
     opened = path.open("wb") if isinstance(path, Path) else nullcontext(path)
@@ -339,6 +341,10 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
             Units(structure["length"], arrays["coordinate_unit"], structure["rate"]),
             structure["samples"],
             tuple(structure["notes"]),
+            tuple(
+                Elimination(int(row), int(other), factor)
+                for row, other, factor in arrays.get("eliminations", np.zeros((0, 3))).tolist()
+            ),
         )
         zones = {
             int(index): (

@@ -129,6 +129,34 @@ def floating_slider_crank(
     return srm.Mechanism(model, (loop,), q0=q, v0=v)
 
 
+def slider_crank_of_points(apart: float) -> srm.Mechanism:
+    """slider_crank of two free bodies, whose hinges are two points each, ``apart`` (m) from each
+    other on the axis; so are those of the tip on its plane."""
+    base = srm.load("slider_crank")
+    model = pin.Model()
+    model.name = "slider_crank_of_points"
+    model.gravity.linear = base.model.gravity.linear
+    first, second = np.cumsum(-base.q0)
+    tip = 2.0 * np.array([np.cos(first), 0.0, -np.sin(first)])
+    q: list[float] = []
+    for name, turn, origin in (("crank", first, np.zeros(3)), ("rod", second, tip)):
+        joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(joint, rod(1.0, 2.0), pin.SE3.Identity())
+        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+        q += [*origin, 0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)]
+    ends = (("crank", 0.0, "world", 0.0), ("rod", 0.0, "crank", 2.0), ("rod", 2.0, "world", 0.0))
+    loops = []
+    for name, (a, at_a, b, at_b) in zip(("pivot", "hinge", "pin"), ends):
+        for k, y in enumerate((0.0, apart)):
+            anchors = srm.Anchor(a, xyz=(at_a, y, 0.0)), srm.Anchor(b, xyz=(at_b, y, 0.0))
+            if name == "pin":
+                plane = (0.0, 0.0, 1.0)
+                loops.append(srm.LoopClosure("point_on_plane", *anchors, plane, f"pin_{k}"))
+            else:
+                loops.append(srm.LoopClosure("point", *anchors, name=f"{name}_{k}"))
+    return srm.Mechanism(model, tuple(loops), q0=np.array(q))
+
+
 def rescaled(
     mechanism: srm.Mechanism, length: float = 1.0, mass: float = 1.0, time: float = 1.0
 ) -> srm.Mechanism:

@@ -13,7 +13,13 @@ import srm_mbs as srm
 from srm_mbs.stepping import crossings as crossings_module
 from srm_mbs.systems import structure
 from tests import reduced
-from tests.mechanisms import along_x, ball_dead_point, floating_slider_crank, rod
+from tests.mechanisms import (
+    along_x,
+    ball_dead_point,
+    floating_slider_crank,
+    rod,
+    slider_crank_of_points,
+)
 
 PI = np.pi
 
@@ -302,3 +308,27 @@ def test_passages_are_listed_where_the_last_pivot_stays_small_everywhere(
     found = srm.simulate(mechanism, 10.0, rtol=1e-6).crossings
     assert [c.time for c in found] == pytest.approx([c.time for c in expected], abs=1e-4)
     assert all(c.loops == ("pin",) and not c.switched for c in found)
+
+
+@pytest.mark.parametrize("apart", [2.0, 0.1, 1e-2, 1e-4])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+def test_hinges_of_two_points_next_to_each_other_pass_like_hinges(
+    apart: float, rtol: float, tmp_path: Path
+) -> None:
+    """What holds them against turning is small everywhere; passages must be seen from afar."""
+    expected = srm.simulate(srm.load("slider_crank"), 6.0, rtol=1e-12)
+    mechanism = slider_crank_of_points(apart)
+    assert mechanism.structure.rank == 11
+    assert mechanism.structure.sigma_ref > 0.1
+    solution = srm.simulate(mechanism, 6.0, rtol=rtol)
+    solution.save(tmp_path / "run.npz")
+    for found in (solution, srm.load_solution(tmp_path / "run.npz")):
+        times = [c.time for c in found.crossings]
+        assert times == pytest.approx([c.time for c in expected.crossings], abs=1e-4)
+        assert {"pin_0", "pin_1"} & set(found.crossings[0].loops)
+        assert not any(c.switched for c in found.crossings)
+        t = np.linspace(0.1, 6.0, 60)
+        quaternions = found(t)[0].reshape(60, 2, 7)[:, :, 3:]
+        angles = 2.0 * np.arctan2(quaternions[:, :, 1], quaternions[:, :, 3])
+        off = angles + np.cumsum(expected(t)[0], axis=1)
+        assert np.abs(np.angle(np.exp(1j * off))).max() < 10.0 * rtol

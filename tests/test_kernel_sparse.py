@@ -15,7 +15,7 @@ from srm_mbs.compiled.twin import twin_of
 from srm_mbs.systems.multibody import ClosedSystem
 from tests import reduced
 from tests.lockstep import compare
-from tests.mechanisms import floating_ring, floating_slider_crank
+from tests.mechanisms import floating_ring, floating_slider_crank, slider_crank_of_points
 from tests.test_kernel import agree
 
 pytestmark = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
@@ -28,6 +28,7 @@ MECHANISMS: dict[str, Callable[[], srm.Mechanism]] = {
     "spatial_dead_point": lambda: srm.load("spatial_dead_point"),
     "squeezing_mechanism": lambda: srm.load("squeezing_mechanism"),
     "free and ball joints": floating_ring,
+    "hinges of two points": lambda: slider_crank_of_points(0.01),
     "islands": lambda: islands((1.0, 1.3)),
     "many islands": lambda: islands(tuple(np.linspace(1.0, 1.3, 40))),
 }

@@ -19,7 +19,7 @@ from srm_mbs.arrays import FloatArray, IndexArray
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.loops import LoopKinematics, world_jacobian
 from srm_mbs.systems.units import coordinate_units, row_units
-from srm_mbs.systems.walking import ROUNDING_ROW
+from srm_mbs.systems.walking import DEPENDENT, ROUNDING_ROW
 from srm_mbs.workspaces import workspace
 
 
@@ -95,6 +95,38 @@ class ClosureGeometry:
     def normalised(self, q: FloatArray) -> FloatArray:
         """G of :meth:`closure`, rows over their usual size: what ranks are judged by."""
         return self.closure(q)[1] / self.row_size[:, None]
+
+    @cached_property
+    def _shares(self) -> list[tuple[int, int, float]]:
+        """The eliminations of the load-time analysis, between normalised rows."""
+        eliminations = self.mechanism.structure.eliminations
+        if not eliminations:
+            return []
+        size = (self.row_unit * self.row_size).tolist()
+        return [(e.row, e.other, e.factor * size[e.other] / size[e.row]) for e in eliminations]
+
+    def _without_shares(self, q: FloatArray) -> FloatArray:
+        G = self.normalised(q)
+        for row, other, share in self._shares:
+            G[row] -= share * G[other]
+        return G
+
+    @cached_property
+    def _left(self) -> FloatArray:
+        """Size of what is left of each row (rows,), where the mechanism starts."""
+        start = self.at(self.mechanism.q0, 0.0)
+        before, left = (
+            np.linalg.norm(rows, axis=1)
+            for rows in (self.normalised(start), self._without_shares(start))
+        )
+        out: FloatArray = np.where(left > DEPENDENT * before, left / np.maximum(before, left), 1.0)
+        return out
+
+    def separated(self, q: FloatArray) -> FloatArray:
+        """As :meth:`normalised`, where nearly parallel rows of closures between the same bodies
+        are replaced by their differences, as large as themselves: what is small everywhere hides
+        no singular configuration."""
+        return self._without_shares(q) / self._left[:, None] if self._shares else self.normalised(q)
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v, rows over their usual size, for the rates u (nv,) in units."""

@@ -21,7 +21,7 @@ from srm_mbs.drives import NOMINAL, Drive, in_order_of_rows, positions
 from srm_mbs.laws import Curve
 from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.systems.loops import LoopKinematics, all_rows, closure_errors
+from srm_mbs.systems.loops import Elimination, LoopKinematics, all_rows, closure_errors
 from srm_mbs.workspaces import workspace
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ class DrivenKinematics:
         The tree, its closures, and its drives in any order.
     curves
         s of each drive by its name; without them the rows are g(q) alone.
-    scale, keep
+    scale, keep, eliminations
         As for :class:`~srm_mbs.systems.loops.LoopKinematics`, over all rows; those of drives are
-        kept in any case.
+        kept in any case, and nothing is taken off them.
 
     Attributes
     ----------
@@ -57,6 +57,7 @@ class DrivenKinematics:
         curves: dict[str, Curve] | None = None,
         scale: FloatArray | None = None,
         keep: BoolArray | None = None,
+        eliminations: Sequence[Elimination] = (),
     ) -> None:
         ordered = in_order_of_rows(drives)
         points = [drive.closure for drive in ordered if drive.closure is not None]
@@ -65,7 +66,9 @@ class DrivenKinematics:
         total = closed + len(self._joints)
         scale = np.ones(total) if scale is None else scale
         keep = np.ones(total, dtype=bool) if keep is None else keep
-        self._inner = LoopKinematics(model, [*loops, *points], scale[:closed], keep[:closed])
+        self._inner = LoopKinematics(
+            model, [*loops, *points], scale[:closed], keep[:closed], eliminations
+        )
         start = len(self._inner.g)
         m = start + len(self._joints)
         self.g, self.bias, self.pushed = np.zeros(m), np.zeros(m), np.zeros(m)

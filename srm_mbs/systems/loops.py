@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -210,6 +210,17 @@ class _LoopRows:
             out += dot(n, m), dot(n, plus_cross(cross3(bias, m), w, cross3(w, m)))
 
 
+class Elimination(NamedTuple):
+    """``factor`` times the row ``other`` is taken off the row ``row``, both unscaled.
+
+    Of closures between the same bodies, where no factor depends on the configuration.
+    """
+
+    row: int
+    other: int
+    factor: float
+
+
 class LoopKinematics:
     """Rows of all closures of a mechanism.
 
@@ -221,6 +232,8 @@ class LoopKinematics:
         Rows are divided by it; ones by default (then g is in m and rad, lengths unscaled).
     keep : (rows,) bool
         Rows to evaluate; all by default.
+    eliminations
+        Applied one after the other to the rows that are kept; none by default.
 
     Attributes
     ----------
@@ -234,6 +247,7 @@ class LoopKinematics:
         loops: Sequence[LoopClosure],
         scale: FloatArray | None = None,
         keep: BoolArray | None = None,
+        eliminations: Sequence[Elimination] = (),
     ) -> None:
         total = sum(loop.rows.count for loop in loops)
         scale = np.ones(total) if scale is None else scale
@@ -256,6 +270,12 @@ class LoopKinematics:
         self._constant = [
             (slice(rows.first_row, rows.first_row + rows.count), rows.G)
             for rows in self._joint_rows
+        ]
+        place = (np.cumsum(mask) - 1).tolist()
+        size = scale.tolist()
+        self._eliminations = [
+            Elimination(place[row], place[other], factor * size[other] / size[row])
+            for row, other, factor in eliminations
         ]
         self._allocate()
 
@@ -286,6 +306,10 @@ class LoopKinematics:
         return {
             "loops": [loop.constants() for loop in self._loops if isinstance(loop, _LoopRows)],
             "joint_rows": [row for rows in self._joint_rows for row in rows.constants()],
+            "eliminations": [
+                (e.row, e.other, e.factor, np.flatnonzero(self._support[e.row]).tolist())
+                for e in self._eliminations
+            ],
         }
 
     def update(self, data: pin.Data, q: FloatArray, with_bias: bool = True) -> None:
@@ -312,6 +336,9 @@ class LoopKinematics:
         np.multiply(G, self._support, G)
         for own, entries in self._constant:
             G[own] = entries
+        for row, other, factor in self._eliminations:
+            for each in (G, self.g, self.bias):
+                each[row] -= factor * each[other]
 
 
 def all_rows(mechanism: Mechanism) -> LoopKinematics:

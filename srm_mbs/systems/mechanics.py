@@ -134,6 +134,7 @@ class Mechanics(Manifold):
         return {
             "loops": [],
             "joint_rows": [],
+            "eliminations": [],
             "drives": [],
             "rows": 0,
             "structural_rank": 0,

@@ -83,8 +83,9 @@ class ClosedSystem(Mechanics):
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref)
 
     def _resolved_loops(self) -> LoopKinematics:
-        structure = self.structure
-        return LoopKinematics(self.model, self.mechanism.loops, structure.row_scale, structure.kept)
+        mechanism, structure = self.mechanism, self.structure
+        scale, kept = structure.row_scale, structure.kept
+        return LoopKinematics(self.model, mechanism.loops, scale, kept, structure.eliminations)
 
     def _gap_scales(self) -> FloatArray:
         structure = self.structure
@@ -108,7 +109,15 @@ class ClosedSystem(Mechanics):
             return None
         curves = mechanism.drive_curves
         scale, kept = structure.row_scale, structure.kept
-        return DrivenKinematics(self.model, mechanism.loops, mechanism.drives, curves, scale, kept)
+        return DrivenKinematics(
+            self.model,
+            mechanism.loops,
+            mechanism.drives,
+            curves,
+            scale,
+            kept,
+            structure.eliminations,
+        )
 
     @cached_property
     def _mass_matrix(self) -> FloatArray:

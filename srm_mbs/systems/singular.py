@@ -166,8 +166,8 @@ def nearest_singular(
 def smallest_singular_value(
     geometry: ClosureGeometry, q: FloatArray, structural_rank: int
 ) -> float:
-    """The last structural singular value of the normalised G at q."""
-    return singular_value(geometry.normalised(q), structural_rank)
+    """The last structural singular value of the normalised, separated G at q."""
+    return singular_value(geometry.separated(q), structural_rank)
 
 
 @dataclass(frozen=True)

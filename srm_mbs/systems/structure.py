@@ -17,6 +17,7 @@ from srm_mbs.arrays import BoolArray, FloatArray, IndexArray
 from srm_mbs.drives import in_order_of_rows
 from srm_mbs.inertias import check_inertia
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.loops import Elimination
 from srm_mbs.systems.projection import PIVOT_ZERO
 from srm_mbs.systems.units import Units, coordinate_units
 from srm_mbs.systems.walking import Walker
@@ -64,6 +65,9 @@ class Structure:
         Number of closed configurations visited.
     notes
         Sentences for the user, such as a weak gap between structural and redundant pivots.
+    eliminations
+        Rows that are taken off others, in this order, where rows of closures between the same
+        bodies are nearly parallel.
     """
 
     row_names: tuple[str, ...]
@@ -75,6 +79,7 @@ class Structure:
     units: Units
     samples: int
     notes: tuple[str, ...]
+    eliminations: tuple[Elimination, ...] = ()
 
     def at(self, mechanism: Mechanism) -> Structure:
         """The same facts with the units of ``mechanism``, which differs in its start only."""
@@ -142,17 +147,19 @@ def _sampled(walker: Walker, configurations: Iterable[FloatArray]) -> _Samples:
 
 
 def _balanced(walker: Walker, samples: _Samples, rank: int) -> _Samples:
-    """``samples`` after :meth:`Walker.balance`; as they are, with their scale, if that does not
-    raise the last pivot or makes more rows independent."""
+    """``samples`` after :meth:`Walker.separate` and :meth:`Walker.balance`; as they are, with
+    their scale, if that does not raise the last pivot or makes more rows independent."""
     regular = np.flatnonzero(samples.ranks() == rank)
     chosen = regular[:: -(-len(regular) // BALANCING_SAMPLES)]
     scale = walker.scale
-    walker.balance([samples.configurations[i] for i in chosen])
+    measured = [samples.configurations[i] for i in chosen]
+    walker.separate(measured, samples.largest > ZERO_ROW)
+    walker.balance(measured)
     again = _sampled(walker, samples.configurations)
     before = float(np.median(samples.last_pivots(rank)))
     if int(again.ranks().max()) == rank and np.median(again.last_pivots(rank)) > before:
         return again
-    walker.scale = scale
+    walker.scale, walker.eliminations = scale, ()
     return samples
 
 
@@ -216,5 +223,14 @@ def analyse(mechanism: Mechanism) -> Structure:
             log.warning("%s: %s", mechanism.name, notes[-1])
     visited = len(samples.configurations)
     return Structure(
-        names, walker.scale, kept, rank, loop_rank, sigma_ref, units, visited, tuple(notes)
+        names,
+        walker.scale,
+        kept,
+        rank,
+        loop_rank,
+        sigma_ref,
+        units,
+        visited,
+        tuple(notes),
+        walker.eliminations,
     )

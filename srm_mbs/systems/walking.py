@@ -9,12 +9,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import lapack
 
-from srm_mbs.arrays import FloatArray
+from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.systems.driven import DrivenKinematics
-from srm_mbs.systems.loops import world_jacobian
+from srm_mbs.systems.loops import Elimination, world_jacobian
 from srm_mbs.systems.pivoting import RowAlgebra, row_algebra, trees
 from srm_mbs.systems.projection import cholesky, unwhiten, whiten
 from srm_mbs.systems.units import Units, row_units
@@ -26,6 +27,11 @@ ROUNDING_ROW = 1e-12
 """Rows of one kind whose rms stays below this part of their uncancelled terms are rounding."""
 NULL = 1e-7
 """Pivots (of scaled rows) below this leave their direction free on the walk."""
+PARALLEL = 0.3
+"""Part of a row that is left of it without its shares in others, below which it is nearly
+parallel to them."""
+DEPENDENT = 1e-6
+"""The same, below which it follows from them."""
 CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
 
@@ -42,6 +48,8 @@ class Walker:
     ----------
     scale : (rows,)
         Scale by which rows are divided; ones until :meth:`set_scale`.
+    eliminations
+        Rows that are taken off others; none until :meth:`separate`.
     """
 
     def __init__(self, mechanism: Mechanism, units: Units) -> None:
@@ -52,7 +60,13 @@ class Walker:
         self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
         self.closed = len(self.row_unit)
         self.scale = np.ones(len(self._rows.g))
-        pattern = self._rows.pattern()
+        self.eliminations: tuple[Elimination, ...] = ()
+        pattern = self._pattern = self._rows.pattern()
+        self._anchored = [
+            at
+            for at, closure in enumerate(loop for loop in mechanism.loops for _ in loop.row_names)
+            if not closure.rows.joint_rows
+        ]
         self._all = row_algebra(pattern, self.model)
         driven = self.closed < len(self.scale)
         self._loops = row_algebra(pattern[: self.closed], self.model) if driven else self._all
@@ -66,11 +80,19 @@ class Walker:
         self._rows.update(self.data, q, with_bias=False)
         self._factorised = None
 
+    def _scaled(self, q: FloatArray) -> FloatArray:
+        """G (rows, nv) of the rows after the eliminations, over their scale."""
+        self._evaluate(q)
+        G = self._rows.G.copy()
+        for row, other, factor in self.eliminations:
+            G[row] -= factor * G[other]
+        G /= self.scale[:, None]
+        return G
+
     def factorised(self, q: FloatArray) -> tuple[RowAlgebra, RowAlgebra]:
         """The algebra of all scaled rows, and that of the loops', in the mass metric at q."""
         if self._factorised is not q:
-            self._evaluate(q)
-            G = self._rows.G / self.scale[:, None]
+            G = self._scaled(q)
             self._all.factor(self.data.M, G, NULL)
             if self._loops is not self._all:
                 self._loops.factor(self.data.M, G[: self.closed], NULL)
@@ -147,6 +169,53 @@ class Walker:
         used = size * np.sqrt(rows.row_squares) > 0.5
         out: FloatArray = np.divide(1.0, size, out=np.full(count, np.nan), where=used)
         return out
+
+    def separate(self, samples: Sequence[FloatArray], kept: BoolArray) -> None:
+        """Take off rows what makes them nearly parallel to others between the same bodies.
+
+        Such as those of two points next to each other that hold a hinge: their difference, which
+        holds it against turning, is small everywhere.  The last pivot then tells that a row is
+        about to depend on others only where that is smaller still, whatever the scales.
+
+        Parameters
+        ----------
+        samples
+            Closed configurations.
+        kept : (rows,) bool
+            Rows that take part.
+        """
+        groups: dict[bytes, list[int]] = {}
+        for row in self._anchored:
+            if kept[row]:
+                groups.setdefault(self._pattern[row].tobytes(), []).append(row)
+        parts = []
+        for q in samples:
+            white = self._scaled(q).T
+            for tree in self._trees:
+                white[tree] = whiten(cholesky(self.data.M[tree, tree]), white[tree])
+            parts.append(white)
+        scales = self.scale.tolist()
+        found: list[Elimination] = []
+        for rows in groups.values():
+            W = np.concatenate([white[:, rows] for white in parts])
+            size = np.linalg.norm(W, axis=0)
+            basis: list[int] = []
+            for k in (lapack.dgeqp3(W)[1] - 1).tolist():
+                shares = np.linalg.lstsq(W[:, basis], W[:, k], rcond=None)[0]
+                left = W[:, k] - W[:, basis] @ shares
+                length = np.linalg.norm(left)
+                if not length > DEPENDENT * size[k]:
+                    continue
+                if length < PARALLEL * size[k]:
+                    W[:, k] = left
+                    row = rows[k]
+                    found += [
+                        Elimination(row, rows[j], share * scales[row] / scales[rows[j]])
+                        for j, share in zip(basis, shares.tolist())
+                    ]
+                basis.append(k)
+        self.eliminations = tuple(found)
+        self._factorised = None
 
     def balance(self, samples: Sequence[FloatArray]) -> None:
         """Scale each row by its usual distance from the span of the others.

@@ -35,6 +35,8 @@ public:
         return out;
     }
 
+    double* filled(int row) override { return &A_[row * count()]; }
+
     void normal(const double* g, double* white) const override {
         const int n = count();
         std::fill(white, white + n, 0.0);

@@ -238,6 +238,12 @@ struct PySystem {
                                        nb::cast<std::vector<int>>(row["in_v"]),
                                        number(row, "offset")});
         }
+        for (nb::handle item : nb::cast<nb::list>(d["eliminations"])) {
+            const auto e = nb::cast<nb::tuple>(item);
+            data.eliminations.push_back({nb::cast<int>(e[0]), nb::cast<int>(e[1]),
+                                         nb::cast<double>(e[2]),
+                                         nb::cast<std::vector<int>>(e[3])});
+        }
         for (nb::handle item : nb::cast<nb::list>(d["drives"])) {
             const nb::dict drive = nb::cast<nb::dict>(item);
             data.drives.push_back({whole(drive, "row"), number(drive, "factor"),

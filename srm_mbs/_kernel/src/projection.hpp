@@ -21,6 +21,8 @@ public:
     // Column `row` of G^T (nv,), of which the entries of the row's support are to be written
     // before factor(), which overwrites them.
     virtual double* column(int row) = 0;
+    // The same column once it is filled.
+    virtual double* filled(int row) = 0;
 
     // Factorises the upper triangle of M (nv, nv) and G, and solves for the multiplier with the
     // forces f (nv,) and bias (rows,).  threshold < 0: none.

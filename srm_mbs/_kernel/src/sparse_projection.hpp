@@ -34,6 +34,7 @@ public:
     SparseProjection(int structural_rank, double sigma_ref, const Pattern& pattern);
 
     double* column(int row) override { return &A_[static_cast<std::size_t>(row) * nv]; }
+    double* filled(int row) override { return column(row); }
     void normal(const double* g, double* white) const override;
     void multiplier(const double* white, double* g) const override;
     void remove_normal(double* white) const override;

@@ -116,6 +116,13 @@ void System::update_loops(const double* q, bool with_bias) {
         g_[joints.row] = g;
         bias_[joints.row] = 0.0;
     }
+    for (const Elimination& e : data_.eliminations) {
+        double* const out = projection_->filled(e.row);
+        const double* const other = projection_->filled(e.other);
+        for (const int j : e.columns) out[j] -= e.factor * other[j];
+        g_[e.row] -= e.factor * g_[e.other];
+        if (with_bias) bias_[e.row] -= e.factor * bias_[e.other];
+    }
 }
 
 // A row of G = (force, moment) J.

@@ -43,6 +43,13 @@ struct JointRow {
     double offset;
 };
 
+// factor times the row other is taken off the row row, in their columns of G.
+struct Elimination {
+    int row, other;
+    double factor;
+    std::vector<int> columns;
+};
+
 // A driven row: that of a closure among the loops, or of a joint coordinate.
 struct DrivenRow {
     int row;
@@ -58,6 +65,7 @@ using Controller = std::function<void(double, const double*, const double*, doub
 struct SystemData {
     std::vector<LoopRows> loops;
     std::vector<JointRow> joint_rows;
+    std::vector<Elimination> eliminations;
     std::vector<DrivenRow> drives;      // in the order of their rows, which are the last
     int rows = 0, structural_rank = 0;
     double sigma_ref = 1.0;

@@ -341,6 +341,11 @@ def test_a_file_that_is_not_utf8_is_named(content: bytes, suffix: str, tmp_path:
     refusal(path, "not UTF-8", "Save it as UTF-8")
 
 
+def test_a_saved_run_in_place_of_a_mechanism_is_told_what_it_is_for(tmp_path: Path) -> None:
+    srm.simulate(srm.load("four_bar"), 0.1).save(tmp_path / "run.npz")
+    refusal(tmp_path / "run.npz", "not the file of a mechanism", "srm-mbs plot, play")
+
+
 @pytest.mark.parametrize("content", [b"\0\0\0\0", b"\x7fELF\x02\x01", b"hello", b""])
 @pytest.mark.parametrize("suffix", [".toml", ".urdf"])
 def test_a_file_of_another_kind_is_named(content: bytes, suffix: str, tmp_path: Path) -> None:

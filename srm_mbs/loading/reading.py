@@ -54,6 +54,12 @@ def read_text(path: Path) -> str:
             "there is no such file", file=str(path), remedy="Check the path"
         ) from error
     except UnicodeDecodeError as error:
+        if path.suffix.lower() == ".npz":
+            raise InputError(
+                "it is not the file of a mechanism",
+                file=str(path),
+                remedy="Give a saved run to srm.load_solution, or to srm-mbs plot, play or report",
+            ) from error
         raise InputError(
             f"it is not UTF-8 text: {error}", file=str(path), remedy="Save it as UTF-8"
         ) from error

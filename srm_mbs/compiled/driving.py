@@ -103,7 +103,7 @@ def integrate(
                 continue
             if reason not in (CHUNK_FULL, FINISHED):
                 trouble = why_stopped(reason, system, run)
-                loop.fail(record, run.t, run.h, run.memory().sigma, trouble, run.adaptive)
+                loop.fail(record, run.t, run.h, run.memory(), trouble, run.adaptive)
                 break
             if not one_by_one or run.count == made:
                 continue

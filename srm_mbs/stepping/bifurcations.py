@@ -21,6 +21,8 @@ LOOKED_AT = 0.02
 """sigma below which a motion that turns back is looked at."""
 UNDECIDED = 100.0
 """Distance to the singular configuration (units), over rtol, below which errors could decide."""
+SLOW = 0.01
+"""Part of the largest speed of a run below which its end is without momentum."""
 WITHIN = 0.05
 """How far (units) the singular configuration is looked for."""
 SAMPLES = 21
@@ -99,6 +101,13 @@ def _turns_back(nq: int, steps: StepData, unit: FloatArray) -> set[int]:
     return set(np.flatnonzero(reverses & close).tolist())
 
 
+def _slow(nq: int, steps: StepData, unit: FloatArray) -> bool:
+    """Whether the run ends slowly, compared with its fastest: one that cannot go on while it moves
+    has another trouble than its momentum."""
+    speeds = np.linalg.norm(steps.states[:, nq:] / unit, axis=1)
+    return bool(speeds[-1] <= SLOW * speeds.max())
+
+
 def _ranges(marked: list[int], steps: StepData) -> list[tuple[int, int]]:
     """First and last of the ``marked`` steps between which the motion does not get away."""
     out: list[tuple[int, int]] = []
@@ -161,9 +170,10 @@ def find_bifurcations(
     if not steps.held.any() and not steps.sigmas.min() < LOOKED_AT:
         return ()
     held = set(np.flatnonzero(steps.held).tolist())
-    turning = _turns_back(system.nq, steps, system.mechanism.structure.units.coordinate)
+    unit = system.mechanism.structure.units.coordinate
+    turning = _turns_back(system.nq, steps, unit)
     last = steps.count - 1
-    stops = failed and steps.sigmas[last].min() < LOOKED_AT
+    stops = failed and steps.sigmas[last].min() < LOOKED_AT and _slow(system.nq, steps, unit)
     marked = sorted(held | turning | ({last} if stops else set()))
     found: list[Bifurcation] = []
     if not marked:

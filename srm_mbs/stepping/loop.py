@@ -210,13 +210,11 @@ def integrate(
             if not h > max(smallest, 4.0 * np.spacing(abs(t))):
                 if not (record.attempts and record.attempts[-1].t == t):
                     trouble = BELOW_ROUND_OFF
-                fail(record, t, h, memory.sigma, trouble, control.adaptive, words)
+                fail(record, t, h, memory, trouble, control.adaptive, words)
                 break
             if len(record.times) % WATCHED_STEPS == 0 and _stands_still(record, t, t_end):
                 covered = t - record.times[-WATCHED_STEPS]
-                fail(
-                    record, t, h, memory.sigma, standstill(covered, words), control.adaptive, words
-                )
+                fail(record, t, h, memory, standstill(covered, words), control.adaptive, words)
                 break
             result: StepResult | None
             try:
@@ -231,13 +229,13 @@ def integrate(
                 ratio = np.inf if result is None else result.error_ratio
                 record.attempts.append(Attempt(t, h, ratio, verdict))
                 if not control.adaptive and verdict is Verdict.REJECTED:
-                    fail(record, t, h, memory.sigma, trouble or NOT_FINITE, False, words)
+                    fail(record, t, h, memory, trouble or NOT_FINITE, False, words)
                     break
                 continue
             trouble = ""
             reason = closures.trouble(result)
             if reason:
-                fail(record, t, h, memory.sigma, reason, control.adaptive, words)
+                fail(record, t, h, memory, reason, control.adaptive, words)
                 break
             result.placement = placement
             method.accept(memory, result)
@@ -320,7 +318,7 @@ def fail(
     record: RunRecord,
     t: float,
     h: float,
-    sigma: float,
+    memory: Memory,
     trouble: str,
     adaptive: bool,
     words: Words = MECHANISM,
@@ -329,7 +327,7 @@ def fail(
 
     Parameters
     ----------
-    sigma
+    memory
         At ``t``.
     trouble
         Why; empty if no step was short enough for the error estimate.
@@ -340,9 +338,14 @@ def fail(
     """
     record.status = "failed"
     reason = trouble or "the error estimate stays above the tolerance however small the step"
-    near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < 0.05 else ""
+    close = memory.sigma < 0.05
+    near = f" {words.singular} (sigma = {memory.sigma:.1e})." if close else ""
+    remedy = f"Try a smaller {'rtol' if adaptive else 'step'}, another tableau"
+    predicts = not memory.sweeps or memory.sweeps[-1].history is not None
+    if close and adaptive and not trouble and not predicts:
+        near += " Sweeps solve for the multiplier next to it: rounding grows as steps get shorter."
+        remedy = "Try a larger rtol, PSRM in its split form"
     record.message = (
         f"Stopped at t = {t:.6g} s with step {h:.1e} s: {reason}.{near} "
-        f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
-        f"tableau, or check that {words.goes_on}."
+        f"Everything up to there is kept. {remedy}, or check that {words.goes_on}."
     )

@@ -149,13 +149,22 @@ def linearise(
             show_default="chosen",
         ),
     ] = None,
-    mode: Annotated[int, typer.Option(metavar="N", help="Mode that --html shows.")] = 0,
+    mode: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=0, help="Mode that --html shows.", show_default="0"),
+    ] = None,
     html: Html = None,
 ) -> None:
     """Linearise a mechanism: A, B, eigenvalues and mode shapes."""
     from srm_mbs.coordinates import coordinate_names
     from srm_mbs.findings import eigenvalue_rows, matrix_rows, state_names
 
+    if mode is not None and html is None:
+        raise InputError(
+            "there is no page that could show it",
+            element="--mode",
+            remedy="Give --html, or leave it out",
+        )
     if html is not None:
         check_output(html, "--html", (".html", ".htm"))
     mechanism = srm_mbs.load(model)
@@ -166,7 +175,7 @@ def linearise(
     typer.echo()
     header = ("mode", "eigenvalue 1/s", "frequency Hz", "damping")
     table(eigenvalue_rows(found), (*header, *coordinate_names(mechanism)))
-    _write_page(html, lambda: found.mode_shape(mode))
+    _write_page(html, lambda: found.mode_shape(mode or 0))
 
 
 def _state(mechanism: Mechanism, at: str) -> tuple[Any, ...]:

@@ -20,7 +20,7 @@ def report(
         typer.Option(
             metavar="OUT.html",
             help="Write the page to this file.",
-            show_default="RUN.html",
+            show_default="RUN_report.html",
         ),
     ] = None,
     no_animation: Annotated[
@@ -48,7 +48,7 @@ def report(
     """
     from srm_mbs.report import write_report
 
-    path = run.with_suffix(".html") if out is None else out
+    path = run.with_name(f"{run.stem}_report.html") if out is None else out
     check_output(path, "--out", (".html", ".htm"))
     if no_second_run and rtol is not None:
         raise InputError(

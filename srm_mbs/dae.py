@@ -13,6 +13,7 @@ from srm_mbs.methods.base import NEGLIGIBLE, ErrorNorm, Method, SweepNode
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.options import (
     check_progress,
+    checked_atol,
     checked_method,
     checked_placement,
     checked_rtol,
@@ -76,12 +77,7 @@ def _start(x0: Any) -> FloatArray:
 def _absolute_tolerance(atol: Any, rtol: float, nx: int) -> FloatArray:
     if atol is None:
         return np.full(nx, rtol)
-    remedy = f"Give one positive number or {nx}"
-    array = numbers(atol, "atol", remedy)
-    if array.shape not in ((), (nx,)) or not (array > 0.0).all():
-        raise InputError(
-            f"atol has shape {array.shape} or is not positive", element="atol", remedy=remedy
-        )
+    array = checked_atol(atol, (nx,), f"Give one positive number or {nx}")
     return np.broadcast_to(array, (nx,)).copy()
 
 

@@ -69,7 +69,7 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         raise InputError(
             f"the compiled kernel cannot make this run: {reason}",
             element="backend",
-            remedy='Use backend="auto", which takes the Python reference where it has to',
+            remedy="Use the backend auto, which takes the Python reference where it has to",
         )
     if reason == OUTDATED:
         warn_outdated()

@@ -285,6 +285,28 @@ def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) 
     return np.arange(first, end, dtype=np.float64) * np.float64(period)
 
 
+def checked_atol(atol: Any, lengths: tuple[int, ...], remedy: str) -> FloatArray:
+    """``atol`` as one positive number () or several, as many as one of ``lengths``.
+
+    Raises
+    ------
+    InputError
+        With ``remedy``, if it is something else.
+    """
+    array = numbers(atol, "atol", remedy)
+    if array.shape not in ((), *((length,) for length in lengths)):
+        raise InputError(f"atol has shape {array.shape}", element="atol", remedy=remedy)
+    if not (array > 0.0).all():
+        raise InputError(
+            f"atol = {array.min():g} is not positive"
+            if array.ndim == 0
+            else f"the smallest atol, {array.min():g}, is not positive",
+            element="atol",
+            remedy=remedy,
+        )
+    return array
+
+
 def check_embedded(scheme: ButcherTableau, step: float | None) -> None:
     """Refuse step-size control for a scheme without an embedded pair.
 
@@ -297,7 +319,7 @@ def check_embedded(scheme: ButcherTableau, step: float | None) -> None:
         raise InputError(
             f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
             element="tableau",
-            remedy="Give step=, or use tvd32, dopr54 or dop853",
+            remedy="Give a step, or use tvd32, dopr54 or dop853",
         )
 
 

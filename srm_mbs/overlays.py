@@ -62,16 +62,17 @@ class Wanted:
         Raises
         ------
         InputError
-            As :meth:`anchors`, or if reactions are wanted and no closure has anchors.
+            As :meth:`anchors`, or if gaps or reactions are wanted and no closure has anchors.
         """
         self.anchors(mechanisms[0])
         loops = [loop for mechanism in mechanisms for loop in mechanism.loops]
-        if self.reactions and not any(loop.anchors for loop in loops):
-            raise InputError(
-                "the mechanism has no closures with reactions",
-                element="reactions",
-                remedy="Leave the option out",
-            )
+        for element, wanted in (("gaps", self.gaps), ("reactions", self.reactions)):
+            if wanted and not any(loop.anchors for loop in loops):
+                raise InputError(
+                    f"the mechanism has no closures with {element}",
+                    element=element,
+                    remedy="Leave the option out",
+                )
 
     def anchors(self, mechanism: Mechanism) -> list[tuple[int, pin.SE3]]:
         """Joint and placement of the traced points.

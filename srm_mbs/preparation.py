@@ -15,7 +15,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.methods.base import Method
 from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.options import checked_method, numbers, step_size_control
+from srm_mbs.options import checked_atol, checked_method, step_size_control
 from srm_mbs.stepping.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.stepping.guard import BranchGuard
 from srm_mbs.stepping.singular_times import Placing, placed
@@ -67,11 +67,7 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
         return tolerance
     nv = mechanism.model.nv
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
-    array = numbers(atol, "atol", remedy)
-    if array.shape not in ((), (nv,), (2 * nv,)) or not (array > 0.0).all():
-        raise InputError(
-            f"atol has shape {array.shape} or is not positive", element="atol", remedy=remedy
-        )
+    array = checked_atol(atol, (nv, 2 * nv), remedy)
     if array.shape == (nv,):
         array = np.tile(array, 2)
     return np.broadcast_to(array, (2 * nv,)).copy()

@@ -341,7 +341,7 @@ def test_a_controller_that_fails_at_a_sample_ends_the_run_there(
             slider_crank, 1.0, controller=controller, sample_time=0.1, backend=backend
         )
         assert solution.status == "failed"
-        assert "returned shape (1,)" in solution.message
+        assert "returned an array of shape (1,)" in solution.message
         assert solution.t[-1] == pytest.approx(0.3)
 
 

@@ -91,6 +91,7 @@ def test_simulate_prints_the_balance_when_asked() -> None:
         (("equilibrium", "four_bar", "--hold", "wheel"), "there is no joint 'wheel'"),
         (("linearise", "four_bar", "--at", "here"), "there is no state 'here'"),
         (("linearise", "four_bar", "--html", "x.txt"), "the suffix '.txt' is not known here"),
+        (("linearise", "four_bar", "--mode", "1"), "--mode: there is no page that could show it"),
         (("drag", "four_bar", "crank"), "joint 'crank' has no value"),
         (("drag", "four_bar", "crank=nan"), "JOINT=VALUE[,VALUE...]: joint 'crank' cannot be"),
     ],

@@ -389,7 +389,7 @@ def test_a_function_that_fails_on_the_way_leaves_the_partial_solution(
         ({"singular_times": [0.0]}, "singular_times"),
         ({"events": [3]}, "events"),
         ({"method": "bdf"}, "no method"),
-        ({"tableau": "erk4"}, "step="),
+        ({"tableau": "erk4"}, "Give a step"),
         ({"problem": problem_two(G=lambda t, x: 2.0 * x)}, "finite differences"),
         ({"problem": problem_two(g_t=lambda t, x: 0.0)}, "g_t.*finite differences"),
         ({"problem": problem_two(g_t=None)}, "g depends on t"),

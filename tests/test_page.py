@@ -497,12 +497,13 @@ def test_what_cannot_be_traced_is_an_input_error(
     assert not list(tmp_path.iterdir())
 
 
-def test_reactions_of_an_open_chain_and_of_a_prescribed_motion_are_refused(
+def test_reactions_and_gaps_of_an_open_chain_and_reactions_of_a_prescribed_motion_are_refused(
     tmp_path: Path, slider_crank: srm.Solution
 ) -> None:
     pendulum = srm.simulate(srm.load("simple_pendulum"), 0.1)
-    with pytest.raises(srm.InputError, match="no closures with reactions"):
-        pendulum.export_html(tmp_path / "page.html", reactions=True)
+    for what in ("reactions", "gaps"):
+        with pytest.raises(srm.InputError, match=f"no closures with {what}"):
+            pendulum.export_html(tmp_path / "page.html", **{what: True})
     motion = srm.JointMotion(slider_crank.mechanism, slider_crank.t, slider_crank.q)
     with pytest.raises(srm.InputError, match="not simulated has no reactions"):
         motion.export_html(tmp_path / "page.html", reactions=True)

@@ -394,7 +394,7 @@ def test_the_command_writes_the_page_beside_the_run(
     monkeypatch.setattr("srm_mbs.report.pictures_section", lambda *_: "")  # they take a second
     done = CliRunner().invoke(app, ["report", str(saved), "--no-animation"])
     assert done.exit_code == 0, done.output
-    path = saved.with_suffix(".html")
+    path = saved.with_name(f"{saved.stem}_report.html")
     assert f"written: {path}" in done.output
     assert re.search(r"^estimated error +good +No joint is off", done.output, re.MULTILINE)
     assert "making the run again" in done.output

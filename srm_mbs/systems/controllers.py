@@ -27,9 +27,17 @@ def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> Fl
         tau = np.array(controller(t, q.copy(), v.copy()), dtype=float, order="C")
     except Exception as error:
         raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
-    if tau.shape != v.shape or not np.isfinite(tau).all():
+    trouble = unusable(tau, len(v))
+    if trouble:
         raise ControllerError(
-            f"the controller returned shape {tau.shape} or non-finite values at t = {t:.6g} s; "
-            f"it must return {len(v)} finite generalised forces"
+            f"the controller returned {trouble} at t = {t:.6g} s; it must return {len(v)} finite "
+            "generalised forces"
         )
     return tau
+
+
+def unusable(given: FloatArray, size: int) -> str:
+    """What is wrong with an array that should be ``size`` finite numbers; empty if nothing is."""
+    if given.shape != (size,):
+        return f"an array of shape {given.shape}"
+    return "" if np.isfinite(given).all() else "values that are not finite"

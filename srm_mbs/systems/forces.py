@@ -17,6 +17,7 @@ from srm_mbs.errors import ControllerError
 from srm_mbs.force_element import ForceElement
 from srm_mbs.forces import Bushing, JointTorque, LimitSpring, SpringDamper, TorsionSpring, Wrench
 from srm_mbs.mechanism import Mechanism
+from srm_mbs.systems.controllers import unusable
 from srm_mbs.systems.force_evaluators import Evaluator, HeldAnchor, about_origin
 from srm_mbs.systems.joint_forces import (
     JointTorqueEvaluator,
@@ -45,10 +46,11 @@ class _UserForceEvaluator:
             raise ControllerError(
                 f"the force {self.name!r} raised {error!r} at t = {t:.6g} s"
             ) from error
-        if given.shape != (self.size,) or not np.isfinite(given).all():
+        trouble = unusable(given, self.size)
+        if trouble:
             raise ControllerError(
-                f"the force {self.name!r} returned shape {given.shape} or non-finite values at "
-                f"t = {t:.6g} s; it must return {self.size} finite numbers"
+                f"the force {self.name!r} returned {trouble} at t = {t:.6g} s; it must return "
+                f"{self.size} finite numbers"
             )
         if self.at is None:
             tau += given

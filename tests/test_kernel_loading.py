@@ -202,7 +202,7 @@ def test_without_kernel_runs_use_the_reference_and_the_kernel_cannot_be_asked_fo
     with pytest.raises(srm.InputError, match="it was not built") as caught:
         srm.simulate(mechanism, 0.1, backend="kernel")
     assert caught.value.element == "backend"
-    assert 'backend="auto"' in str(caught.value)
+    assert "Use the backend auto" in str(caught.value)
 
 
 @pytest.mark.parametrize("asks", [partial(srm.simulate, t_end=0.1), srm.Simulator])

@@ -222,8 +222,9 @@ def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: A
 def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[int, int]) -> None:
     before = page.viewport_size
     page.set_viewport_size({"width": size[0], "height": size[1]})
-    page.wait_for_function("viewer.renderer.domElement.width > 0")
-    page.wait_for_function(f"innerWidth === {size[0]} && pane.clientWidth === {size[0]}")
+    # The canvas follows in the handler of the window's event, a frame later or more.
+    for element in ("window.inner", "pane.client", "viewer.renderer.domElement.client"):
+        page.wait_for_function(f"{element}Width === {size[0]}")
     boxes = {
         name: page.locator(name).bounding_box()
         for name in ("#meshcat-pane canvas", "#bar", "#panel", "#time", "output", "#toggle")

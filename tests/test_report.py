@@ -168,9 +168,10 @@ def test_the_page_opens_from_disk_without_complaint_and_its_animation_plays(
         # Nothing is wider than the window, however narrow; tables scroll in their boxes.
         for width in (1200, 360):
             shown.set_viewport_size({"width": width, "height": 700})
+            shown.wait_for_function(f"innerWidth === {width}")
             assert shown.evaluate("document.documentElement.scrollWidth") <= width
         shown.emulate_media(media="print")
-        assert not shown.locator("iframe").is_visible()
+        shown.locator("iframe").wait_for(state="hidden")
         assert shown.locator("figure img").first.is_visible()
 
 

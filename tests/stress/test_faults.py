@@ -99,7 +99,7 @@ def test_a_controller_that_returns_no_number_ends_the_run_where_it_did(
     value: float, four_bar: srm.Mechanism
 ) -> None:
     solution = srm.simulate(four_bar, 2.0, controller=from_half_a_second([value, 0.0, 0.0]))
-    check_partial(solution, "the controller returned", "non-finite", "3 finite")
+    check_partial(solution, "the controller returned", "values that are not finite", "3 finite")
     assert 0.1 < solution.t[-1] <= 0.5
 
 

@@ -342,7 +342,7 @@ def three_balls(height: float, lower: float, **options: Any) -> srm.Solution:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+@pytest.mark.parametrize("rtol", [1e-6, pytest.param(1e-9, marks=pytest.mark.stress)])
 @pytest.mark.parametrize("lower", [0.0, 1e-13, 1e-10])
 def test_impacts_that_are_simultaneous_but_for_rounding_all_act(
     lower: float, rtol: float, backend: str

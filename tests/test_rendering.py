@@ -151,7 +151,7 @@ def test_a_picture_of_a_time_outside_a_saved_run_is_refused_by_its_option(tmp_pa
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+@pytest.mark.parametrize("suffix", [".gif", pytest.param(".mp4", marks=pytest.mark.stress)])
 def test_the_frames_of_a_film_from_the_command_line_show_the_bob_where_it_is(
     tmp_path: Path, suffix: str
 ) -> None:

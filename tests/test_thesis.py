@@ -46,6 +46,7 @@ def thinned(folder: Path) -> dict[str, Entry]:
     return {entry.key: entry for entry in entries}
 
 
+@pytest.mark.stress
 def test_every_table_and_figure_is_written_with_print_beside_ours(
     folder: Path, thinned: dict[str, Entry]
 ) -> None:
@@ -64,13 +65,17 @@ def test_every_table_and_figure_is_written_with_print_beside_ours(
             }
 
 
+@pytest.mark.stress
 def test_table_5_1_agrees_in_all_digits(thinned: dict[str, Entry]) -> None:
     table = thinned["table5.1"]
     assert len(table.printed) == 4
     assert table.ours == table.printed
 
 
-@pytest.mark.parametrize(("tableau", "m"), [("fe", 1), ("trap", 2), ("erk4", 4), ("dopr54", 5)])
+@pytest.mark.parametrize(
+    ("tableau", "m"),
+    [("fe", 1), ("trap", 2), ("erk4", 4), pytest.param("dopr54", 5, marks=pytest.mark.stress)],
+)
 def test_the_package_has_table_5_1_up_to_rounding(tableau: str, m: int) -> None:
     run = srm.solve_dae(
         problem_two(), (0.0, 1.0), START_TWO, method=srm.SRM(tableau, m, eps=0.005), step=0.001
@@ -82,6 +87,7 @@ def test_the_package_has_table_5_1_up_to_rounding(tableau: str, m: int) -> None:
     assert run.y[-1, 0] == pytest.approx(float(printed["y"]), abs=1e-13, rel=0)
 
 
+@pytest.mark.stress
 def test_observed_orders_are_those_of_theory(thinned: dict[str, Entry]) -> None:
     for key, order in (("table5.2", 2), ("table5.3", 3), ("table5.4", 4)):
         row = thinned[key].ours[f"m = {order}"]

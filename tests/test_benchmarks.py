@@ -22,6 +22,7 @@ from benchmarks.work_precision import (
     readme,
     records,
     reliability,
+    scaling,
     tables,
     threads,
     timing,
@@ -486,6 +487,43 @@ def test_cost_against_size_has_ours_beside_pinocchio() -> None:
             parts = names[names.index("of a run: Pinocchio") :][:4]
             assert sum(row[part] for part in parts) == pytest.approx(1.0)
     assert all(min(row["aba (us)"], row["run, per step (us)"]) > 0.0 for row in chains)
+
+
+@pytest.mark.skipif(srm.backend() != "kernel", reason="sizes that only the kernel is measured at")
+def test_cells_of_sizes_that_only_the_kernel_is_measured_at_are_empty(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(scaling, "LOOPS", (1, 2))
+    monkeypatch.setattr(scaling, "LOOPS_OF_ALL", 1)
+    monkeypatch.setattr(scaling, "LINKS", ())
+    # The numbers themselves do not matter here, and take long.
+    monkeypatch.setattr(scaling, "_run_cost", lambda *_: (1e3, 100, 10))
+    monkeypatch.setattr(scaling, "_inside", lambda *_: (1e3, 900.0))
+    monkeypatch.setattr(scaling, "per_call", lambda call, *_: (call(), 5.0)[1])
+    out = Results({}, {}, {})
+    measure_scaling(out, repeats=1, thin=False, say=quiet)
+    one, two = next(iter(out.scaling.values()))
+    assert list(one) == list(two)
+    empty = {key for key, value in two.items() if value is None}
+    assert empty == {
+        "Python backend, per evaluation (us)",
+        "of a Python run: Pinocchio",
+        "LAPACK",
+        "Python in evaluations",
+        "stepping in Python",
+        "constraintDynamics (us)",
+        "ours / constraintDynamics",
+    }
+    assert None not in one.values()
+    path = tmp_path / "results.json"
+    out.save(path)
+    loaded = records.load(path)
+    last = tables.text(loaded).rstrip().splitlines()[-1]
+    assert last.startswith("| 2 | 5 |")
+    assert last.count(" - ") == len(empty)
+    assert [picture.name for picture in plots.draw(loaded, tmp_path)] == [
+        "scaling_closed_loops.png"
+    ]
 
 
 def test_reliability_counts_right_branches_and_names_peers_that_are_missing(

@@ -10,6 +10,8 @@ over their evaluations or steps.  Where the time goes:
 * stepping: the time in the kernel that no evaluation accounts for;
 * Python around the kernel: the time of a run outside it.
 
+Above ``LOOPS_OF_ALL`` loops the kernel is measured alone, the other cells are empty.
+
 Evaluations in the kernel are measured at states of the run, since near singular configurations
 they cost more; the four parts add up to one and are differences of measured times, so that a small
 one may come out negative.
@@ -37,8 +39,15 @@ from srm_mbs.arrays import FloatArray
 from srm_mbs.compiled.run import CompiledRun
 from srm_mbs.compiled.twin import twin_of
 from srm_mbs.systems.multibody import make_system
+from srm_mbs.workspaces import workspace
 
-LOOPS = (1, 2, 5, 10, 20, 40, 80, 160)
+LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
+LOOPS_OF_ALL = 160
+"""Loops up to which ``constraintDynamics`` and whole runs of the Python backend are measured.
+
+For 320 Pinocchio's own workspace takes 17 GB and 77 s to make (it holds second derivatives, 4 nv^3
+numbers), more with its constraints; one evaluation of the Python backend takes 0.1 s.
+"""
 LINKS = (3, 6, 12, 24, 48, 96)
 LONGEST_LOAD = 120.0
 """CPU seconds: sizes whose load-time analysis would take longer are left out."""
@@ -63,7 +72,7 @@ def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
     """Microseconds of an evaluation, of Pinocchio in it, and of LAPACK in it."""
     system = make_system(mechanism)
     state = np.concatenate([mechanism.q0, mechanism.v0])
-    model, data = mechanism.model, mechanism.model.createData()
+    model, data = mechanism.model, workspace(mechanism.model)
     q, v = np.array(mechanism.q0), np.array(mechanism.v0)
     zero = np.zeros(model.nv)
 
@@ -151,7 +160,10 @@ def _run_cost(
     return 1e6 * cpu.least, stats.evaluations, max(stats.steps, 1)
 
 
-def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float | None]:
+def _ours(
+    mechanism: srm.Mechanism, repeats: int, whole_python: bool = True
+) -> dict[str, float | None]:
+    """The columns of ours; without ``whole_python`` those of Python runs are None."""
     probe = srm.simulate(mechanism, 0.5, rtol=RTOL)
     t_end = 0.5 * STEPS / max(probe.stats.steps, 1)
     found = parts(mechanism, repeats)
@@ -164,13 +176,15 @@ def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float | None]:
         "run, per evaluation (us)": auto,
         "run, per step (us)": cost / steps,
     }
+    python: float | None = None
     if srm.backend() != "kernel":
         python = auto
     else:
         whole, inside = _inside(mechanism, t_end, repeats)
         in_kernel, tree = kernel_evaluation(mechanism, t_end, repeats)
-        python_cost, python_evaluations, _ = _run_cost(mechanism, "python", t_end, repeats)
-        python = python_cost / python_evaluations
+        if whole_python:
+            python_cost, python_evaluations, _ = _run_cost(mechanism, "python", t_end, repeats)
+            python = python_cost / python_evaluations
         row |= {
             "evaluation in the kernel (us)": in_kernel,
             "of a run: Pinocchio": tree * evaluations / whole,
@@ -178,16 +192,22 @@ def _ours(mechanism: srm.Mechanism, repeats: int) -> dict[str, float | None]:
             "stepping": (inside - in_kernel * evaluations) / whole,
             "Python around the kernel": (whole - inside) / whole,
         }
-    within = min(evaluation, python)
-    return row | {
+    row |= {
         "Python backend, per evaluation (us)": python,
         "Pinocchio (us)": pinocchio,
         "LAPACK (us)": lapack_part,
-        "of a Python run: Pinocchio": pinocchio / python,
-        "LAPACK": lapack_part / python,
-        "Python in evaluations": (within - pinocchio - lapack_part) / python,
-        "stepping in Python": (python - within) / python,
     }
+    of_a_run = (
+        "of a Python run: Pinocchio",
+        "LAPACK",
+        "Python in evaluations",
+        "stepping in Python",
+    )
+    if python is None:
+        return row | dict.fromkeys(of_a_run)
+    within = min(evaluation, python)
+    shares = (pinocchio, lapack_part, within - pinocchio - lapack_part, python - within)
+    return row | {key: share / python for key, share in zip(of_a_run, shares)}
 
 
 def chain(links: int) -> srm.Mechanism:
@@ -224,16 +244,21 @@ def measure_scaling(
         if load * 8.0 > LONGEST_LOAD:
             say(f"scaling: N = {n} left out: the analysis at load would take too long")
             break
+        whole = n <= LOOPS_OF_ALL
+        if not whole and srm.backend() != "kernel":
+            say(f"scaling: N = {n} left out: the Python backend would take too much memory")
+            break
         load = timing.once(lambda problem=problem: problem.mechanism.structure)[0]
         row["load and analysis (s)"] = load
-        row |= _ours(problem.mechanism, repeats)
-        theirs = row["constraintDynamics (us)"] = _theirs(problem, repeats)
+        row |= _ours(problem.mechanism, repeats, whole)
         per_evaluation = row["run, per evaluation (us)"]
-        row["ours / constraintDynamics"] = per_evaluation / theirs
+        theirs = _theirs(problem, repeats) if whole else None
+        row["constraintDynamics (us)"] = theirs
+        row["ours / constraintDynamics"] = theirs and per_evaluation / theirs
         loops.append(row)
+        beside = f"{theirs:.1f} us" if theirs else "left out"
         say(
-            f"scaling: N = {n}: {per_evaluation:.1f} us per evaluation, "
-            f"constraintDynamics {theirs:.1f} us"
+            f"scaling: N = {n}: {per_evaluation:.1f} us per evaluation, constraintDynamics {beside}"
         )
     links: list[dict[str, Any]] = []
     results.scaling["Open chains, coordinates"] = links

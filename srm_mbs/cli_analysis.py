@@ -116,7 +116,7 @@ def equilibrium(
     found = srm_mbs.equilibrium(
         mechanism, positions, hold=names, search="nearest" if nearest else "stable"
     )
-    table(equilibrium_rows(found))
+    table(equilibrium_rows(mechanism, found))
     typer.echo()
     table(position_rows(mechanism, found.q), ("joint", "position"))
 

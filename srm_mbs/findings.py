@@ -14,7 +14,7 @@ from srm_mbs.analysis.linearisation import Linearisation
 from srm_mbs.analysis.modes import AssemblyMode
 from srm_mbs.arrays import FloatArray
 from srm_mbs.mechanism import Mechanism
-from srm_mbs.summary import position_text
+from srm_mbs.summary import force_text, position_text
 
 
 def _numbers(values: Iterable[float]) -> str:
@@ -38,7 +38,7 @@ def mode_rows(mechanism: Mechanism, modes: Sequence[AssemblyMode]) -> Iterator[t
         )
 
 
-def equilibrium_rows(found: Equilibrium) -> list[tuple[str, str]]:
+def equilibrium_rows(mechanism: Mechanism, found: Equilibrium) -> list[tuple[str, str]]:
     """Stability, frequencies, holding forces and reactions: (quantity, value)."""
     kind = "stable" if found.stable else "neutral" if found.neutral else "unstable"
     rows = [("equilibrium", kind + (", on a singular configuration" if found.singular else ""))]
@@ -52,7 +52,8 @@ def equilibrium_rows(found: Equilibrium) -> list[tuple[str, str]]:
             text = f"leaves with {np.sqrt(-value.real):.6g} 1/s"
         rows.append(("small motion", text))
     rows += [
-        (f"to hold {name}", f"{_numbers(force)} N m, N") for name, force in found.holding.items()
+        (f"to hold {name}", force_text(mechanism, name, force))
+        for name, force in found.holding.items()
     ]
     for name, wrench in found.reactions.items():
         rows.append((f"reaction {name}", f"{_numbers(wrench[:3])} N, {_numbers(wrench[3:])} N m"))

@@ -15,7 +15,7 @@ from srm_mbs.laws import Law
 
 
 def in_unit(unit: str, default: Any) -> Any:
-    """A field with a unit, for tables."""
+    """A field with a unit, for tables; "N m, N": that for angles, then that for lengths."""
     return field(default=default, metadata={"unit": unit})
 
 

@@ -262,8 +262,8 @@ class Bushing(ForceElement):
     has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
-    stiffness: Sequence[float] = in_unit("N/m, N m/rad", (0.0,) * 6)
-    damping: Sequence[float] = in_unit("N s/m, N m s/rad", (0.0,) * 6)
+    stiffness: Sequence[float] = in_unit("N m/rad, N/m", (0.0,) * 6)
+    damping: Sequence[float] = in_unit("N m s/rad, N s/m", (0.0,) * 6)
     name: str = ""
 
     def __post_init__(self) -> None:

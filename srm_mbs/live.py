@@ -13,10 +13,11 @@ import pinocchio as pin
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.drawing import draw_picture, import_meshcat, node_names
+from srm_mbs.errors import InputError
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.motion import JointMotion
 from srm_mbs.overlays import Overlays, Wanted
-from srm_mbs.playback import about_picture, close, serve, show, wait
+from srm_mbs.playback import REPLY_TIME, about_picture, answered, close, serve, show, wait
 from srm_mbs.readout import DRIFT, ENERGY, drift_unit
 from srm_mbs.scene import make_picture
 from srm_mbs.systems.driven import constraint_errors
@@ -35,7 +36,9 @@ OFTEN, SELDOM = 0.01, 0.04
 """Seconds between two calls below and above which they come after twice, or half, as many steps."""
 MOST = 4096
 PATIENCE = 2.0
-"""Seconds for the server to accept one command."""
+"""Seconds for the server to accept one state."""
+ANEW = "Use solution.play(), which starts a server, or solution.export_html(path), which needs none"
+"""Remedy where the server of a view is gone."""
 WIDER = 1.6
 """How much farther away the camera is than the start needs: where the motion goes is not known."""
 
@@ -89,16 +92,15 @@ class LiveView:
         self._mechanism = mechanism
         self._model, self._data = mechanism.model, workspace(mechanism.model)
         self._node = self.visualizer["/live"]
-        import zmq
-
-        # A server that has died must not stop the run.
-        self._lost = zmq.ZMQError
-        self.visualizer.window.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000.0 * PATIENCE))
         self._began = self._last = 0.0
         self.spent, self.shown, self.stride = 0.0, 0, 1
         # What a state costs is known before the run.
         began = time.perf_counter()
-        self.send(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
+        try:
+            self._send(0.0, np.concatenate([mechanism.q0, mechanism.v0]), REPLY_TIME)
+        except BaseException:
+            self.close()
+            raise
         self._cost = time.perf_counter() - began
         self.shown, self._energy = 0, math.nan
         show(self.visualizer, mechanism.name, open_browser=open_browser)
@@ -119,7 +121,7 @@ class LiveView:
             return
         try:
             self.send(t, state)
-        except self._lost:
+        except InputError:  # what has become of the page must not stop the run
             log.warning("the page no longer follows the run: its server does not answer")
             self.spent = math.inf
             return
@@ -128,7 +130,16 @@ class LiveView:
         self.spent += self._cost
 
     def send(self, t: float, state: FloatArray) -> None:
-        """Show the state (nq + nv,) at t (s)."""
+        """Show the state (nq + nv,) at t (s).
+
+        Raises
+        ------
+        InputError
+            If the server does not answer, or has stopped.
+        """
+        self._send(t, state, PATIENCE)
+
+    def _send(self, t: float, state: FloatArray, patience: float) -> None:
         q, v = np.split(state, [self._model.nq])
         pin.forwardKinematics(self._model, self._data, q)
         energy = self._system.energy(state)
@@ -139,7 +150,8 @@ class LiveView:
         head[:3, 0] = t, np.linalg.norm(g), energy - self._energy
         # One command for all, which the page takes apart: each waits for the server's answer.
         places = [self._data.oMi[joint].homogeneous for joint in self._joints]
-        self._node.set_transform(np.hstack([head, *places]))
+        with answered(self.visualizer.window, patience, ANEW):
+            self._node.set_transform(np.hstack([head, *places]))
         self.shown += 1
 
     def play(self, solution: Playable, **drawn: Any) -> None:
@@ -151,11 +163,17 @@ class LiveView:
             The run.
         drawn
             ``trace``, ``gaps`` and ``reactions`` of :func:`srm_mbs.playback.play`.
+
+        Raises
+        ------
+        InputError
+            If the server does not answer, or has stopped, or what is asked for cannot be drawn.
         """
         picture = make_picture(solution, 60.0, Wanted(**drawn))
         about = about_picture(solution, picture, panel=True)
-        self.visualizer["/about"].set_property("about", as_json(about))
-        draw_picture(self._meshcat, self.visualizer, picture)
+        with answered(self.visualizer.window, REPLY_TIME, ANEW):
+            self.visualizer["/about"].set_property("about", as_json(about))
+            draw_picture(self._meshcat, self.visualizer, picture)
 
     def wait(self) -> None:
         """Serve until Ctrl-C."""

@@ -12,7 +12,8 @@ import math
 import sys
 import time
 import webbrowser
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,7 +136,8 @@ def close(visualizer: Any) -> None:
     process.wait()
     for stream in (process.stdout, process.stderr):
         stream.close()
-    window.zmq_socket.close(linger=0)
+    if window.zmq_socket is not None:
+        window.zmq_socket.close(linger=0)
 
 
 @atexit.register
@@ -148,6 +150,32 @@ def _zmq() -> Any:
     import zmq
 
     return zmq
+
+
+@contextmanager
+def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[None]:
+    """While the server has ``seconds`` to accept each command, instead of for ever.
+
+    Raises
+    ------
+    InputError
+        If it does not, or has stopped.
+    """
+    if window.server_proc.poll() is not None:
+        raise InputError("meshcat's server has stopped", remedy=remedy)
+    zmq = _zmq()
+    try:
+        if window.zmq_socket is None:
+            window.connect_zmq()
+        window.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000.0 * seconds))
+        yield
+        window.zmq_socket.setsockopt(zmq.RCVTIMEO, -1)
+    except zmq.ZMQError as error:
+        if window.zmq_socket is not None:
+            # A socket that waits for an answer takes no other command.
+            window.zmq_socket.close(linger=0)
+            window.connect_zmq()
+        raise InputError(f"meshcat's server does not answer: {error}", remedy=remedy) from error
 
 
 def serve(meshcat: Any, page: str, picture: Picture) -> Any:
@@ -167,18 +195,13 @@ def serve(meshcat: Any, page: str, picture: Picture) -> Any:
     kind = meshcat.visualizer.ViewerWindow
     window = kind.__new__(kind)  # its constructor starts a server of its own, or leaves a socket
     window.server_proc, window.zmq_url, window.web_url = process, commands, address
-    window.connect_zmq()
+    window.zmq_socket = None
     visualizer = meshcat.Visualizer(window=window)
     # Kept until closed: an abandoned process and socket would warn when collected.
     _open_visualizers.append(visualizer)
     try:
-        # Without a limit, sending to a server that has died would wait for ever.
-        window.zmq_socket.setsockopt(_zmq().RCVTIMEO, int(1000.0 * REPLY_TIME))
-        draw_picture(meshcat, visualizer, picture)
-        window.zmq_socket.setsockopt(_zmq().RCVTIMEO, -1)
-    except _zmq().ZMQError as error:
-        close(visualizer)
-        raise InputError(f"meshcat's server does not answer: {error}", remedy=SERVERLESS) from error
+        with answered(window, REPLY_TIME):
+            draw_picture(meshcat, visualizer, picture)
     except BaseException:
         close(visualizer)
         raise

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from srm_mbs.loop_closure import LoopClosure
 from srm_mbs.mechanism import Mechanism
 from srm_mbs.solution import Solution
 from srm_mbs.systems.loops import closure_errors
-from srm_mbs.systems.units import row_angles
+from srm_mbs.systems.units import row_angles, turning_coordinates
 
 JOINT_TYPES = {
     **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
@@ -35,6 +37,8 @@ JOINT_TYPES = {
 """Pinocchio's joint types as URDF calls them."""
 MANY = 8
 """Numbers of a list from which only the ends are shown."""
+BUSHING = [False, False, False, True, True, True]
+"""Which of its six numbers belong to angles."""
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
@@ -112,6 +116,27 @@ def position_text(mechanism: Mechanism, name: str, q: FloatArray) -> str:
     return f"{_shown(position_of(mechanism, q, name)):.6g} {_unit(_kind(joint))}"
 
 
+def force_text(mechanism: Mechanism, name: str, force: FloatArray) -> str:
+    """The generalised force (n,) on the joint ``name``, with its units."""
+    return _in_units(force, _turning(mechanism, name), ["N m", "N"])
+
+
+def _turning(mechanism: Mechanism, name: str) -> list[bool]:
+    """Which degrees of freedom of the joint ``name`` are angles."""
+    joint = mechanism.joint(name)
+    own = slice(joint.idx_v, joint.idx_v + joint.nv)
+    turning: list[bool] = turning_coordinates(mechanism.model)[own].tolist()
+    return turning
+
+
+def _in_units(values: FloatArray, turning: list[bool], units: list[str]) -> str:
+    """Numbers (n,) of angles and of lengths, which have the two ``units``: a list of each."""
+    if len(turning) == 1:
+        return f"{values[0]:.6g} {units[not turning[0]]}"
+    parts = groupby(zip(turning, values.tolist()), itemgetter(0))
+    return ", ".join(f"{_vector(x for _, x in own)} {units[not turns]}" for turns, own in parts)
+
+
 def _shown(value: float) -> float:
     """``value`` without the rounding noise of assembly, which means zero."""
     return round(float(value), 12) + 0.0
@@ -180,15 +205,20 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
             elif key.name != "name":
                 if value is None:
                     continue
+                units = key.metadata.get("unit", "").split(", ")
                 text = f"{value:.6g}" if isinstance(value, float) else value
                 if key.name == "law":
                     laws = value if isinstance(value, tuple) else (value,)
                     text = ", ".join(dict.fromkeys(law.type for law in laws))
+                elif len(units) > 1:
+                    joint = getattr(force, "joint", None)
+                    turning = BUSHING if joint is None else _turning(mechanism, joint)
+                    text, units = _in_units(np.atleast_1d(value), turning, units), [""]
                 elif isinstance(value, tuple):
                     text = _vector(value)
                 elif callable(value):
                     text = getattr(value, "__name__", "of the user")
-                values.append(f"{key.name} {text} {key.metadata.get('unit', '')}".rstrip())
+                values.append(f"{key.name} {text} {units[0]}".rstrip())
         yield force.name, force.type, ", ".join(places), ", ".join(values)
 
 

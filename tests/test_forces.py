@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
+from srm_mbs.findings import equilibrium_rows
+from srm_mbs.summary import force_rows
 from srm_mbs.systems.forces import friction_time
 from srm_mbs.systems.multibody import make_system
 from tests.mechanisms import along_x, rod
@@ -920,6 +922,40 @@ def test_info_lists_the_forces(tmp_path: Path) -> None:
         "stiffness 40 N/m, damping 2 N s/m, rest_length 0.5 m"
     )
     (torque,) = [line for line in lines if line.startswith("torque_crank ")]
-    assert torque == "torque_crank torque crank torque 0.5 N m, N"
+    assert torque == "torque_crank torque crank torque 0.5 N m"
     (push,) = [line for line in lines if line.startswith("push ")]
     assert push.endswith("force [1, 2, 3] N, moment [0.1, 0.2, 0.3] N m, frame link")
+    (spring,) = [line for line in lines if line.startswith("torsion_spring_rocker ")]
+    assert spring.endswith("stiffness 3 N m/rad, damping 0.1 N m s/rad, rest_angle 1 rad")
+    (bushing,) = [line for line in lines if line.startswith("bushing_crank_coupler ")]
+    assert bushing.endswith(
+        "stiffness [50, 80, 20] N/m, [3, 9, 5] N m/rad, "
+        "damping [2, 0.7, 1.1] N s/m, [0.3, 0.8, 0.5] N m s/rad"
+    )
+
+
+def test_what_acts_on_a_joint_is_listed_in_the_units_of_its_coordinates() -> None:
+    model = pin.Model()
+    plane = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "plane")
+    slide = model.addJoint(plane, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    free = model.addJoint(slide, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    for joint in (plane, slide, free):
+        model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
+    acting = [
+        srm.JointTorque("plane", [1.0, 2.0, 3.0]),
+        srm.JointTorque("free", [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+        srm.TorsionSpring("slide", 7.0, 0.5, 0.2),
+        srm.JointTorque("slide", 2.0, law=srm.Sine(1.0, 1.0)),
+    ]
+    mechanism = srm.Mechanism(model, forces=acting)
+    assert [row[3] for row in force_rows(mechanism)] == [
+        "torque [1, 2] N, [3] N m",
+        "torque [1, 2, 3] N, [4, 5, 6] N m",
+        "stiffness 7 N/m, damping 0.5 N s/m, rest_angle 0.2 m",
+        "torque 2 N, law sine",
+    ]
+    held = srm.equilibrium(mechanism, hold=("plane", "slide", "free"))
+    rows = dict(equilibrium_rows(mechanism, held))
+    assert rows["to hold plane"].count(" N, [") == 1
+    assert rows["to hold plane"].endswith("] N m")
+    assert rows["to hold slide"] == f"{held.holding['slide'][0]:.6g} N"

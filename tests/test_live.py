@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import signal
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +16,8 @@ from typer.testing import CliRunner
 import srm_mbs as srm
 from srm_mbs.cli import app
 from srm_mbs.live import SHARE
+from srm_mbs.page_server import start_server
+from srm_mbs.playback import serve
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.multibody import make_system
 from tests.browsing import opened
@@ -181,3 +185,74 @@ def test_a_server_that_dies_ends_the_view_and_not_the_run(
             view(t, 0.0, state)
     assert view.shown == 0
     assert caplog.text.count("no longer follows the run") == 1
+
+
+def test_a_server_that_is_gone_is_an_input_error_with_another_way_to_see_the_run() -> None:
+    mechanism = srm.load("four_bar")
+    solution = srm.simulate(mechanism, 0.2)
+    with srm.LiveView(mechanism, open_browser=False) as view:
+        view.visualizer.window.server_proc.kill()
+        view.visualizer.window.server_proc.wait()
+        for use in (lambda: view.play(solution), lambda: view.send(0.2, solution.steps.states[-1])):
+            with pytest.raises(srm.InputError, match=r"has stopped. Use solution\.play\(\)"):
+                use()
+    with pytest.raises(srm.InputError, match="has stopped"):
+        view.play(solution)
+
+
+def test_a_server_that_answered_too_late_still_plays_the_run(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("srm_mbs.live.PATIENCE", 0.05)
+    mechanism = srm.load("four_bar")
+    solution = srm.simulate(mechanism, 0.2)
+    state = solution.steps.states[-1]
+    with srm.LiveView(mechanism, open_browser=False) as view:
+        process = view.visualizer.window.server_proc
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(srm.InputError, match="does not answer: "):
+            view.send(0.2, state)
+        view(0.0, 0.0, state)
+        monkeypatch.setattr(view, "_cost", 0.0)
+        view(0.2, 0.0, state)
+        assert caplog.text.count("no longer follows the run") == 1
+        process.send_signal(signal.SIGCONT)
+        view.play(solution)
+
+
+def test_a_view_whose_server_does_not_answer_stops_it_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    served = []
+
+    def stopped(*arguments: Any) -> Any:
+        served.append(serve(*arguments))
+        served[0].window.server_proc.send_signal(signal.SIGSTOP)
+        return served[0]
+
+    monkeypatch.setattr("srm_mbs.live.serve", stopped)
+    monkeypatch.setattr("srm_mbs.live.REPLY_TIME", 0.05)
+    with pytest.raises(srm.InputError, match="meshcat's server does not answer: "):
+        srm.LiveView(srm.load("four_bar"), open_browser=False)
+    assert served[0].window.server_proc.poll() is not None
+
+
+def test_a_socket_that_cannot_be_opened_is_an_input_error_and_leaves_no_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import zmq
+
+    started = []
+
+    def start(page: str) -> Any:
+        started.append(start_server(page))
+        return started[0]
+
+    def refuse(_: Any) -> None:
+        raise zmq.ZMQError(errno.EMFILE)
+
+    monkeypatch.setattr("srm_mbs.playback.start_server", start)
+    monkeypatch.setattr("meshcat.visualizer.ViewerWindow.connect_zmq", refuse)
+    with pytest.raises(srm.InputError, match="Too many open files"):
+        srm.LiveView(srm.load("four_bar"), open_browser=False)
+    assert started[0][0].poll() is not None

@@ -172,7 +172,7 @@ def simulate(
     """Simulate a mechanism and print a summary of the run.
 
     A run that fails, or is interrupted with Ctrl-C, keeps everything computed so far: the files
-    are written and the exit status is 1.
+    are written and the exit status is 1. Of an interrupted run singular passages are not counted.
     """
     from srm_mbs.summary import run_rows
 
@@ -216,7 +216,8 @@ def simulate(
             (video, partial(solution.export_video, **shown)),
         ]
     )
-    table([*run_rows(solution), *(("written", str(path)) for path in written)])
+    rows = run_rows(solution, passages=solution.status != "interrupted")
+    table([*rows, *(("written", str(path)) for path in written)])
     if balance:
         from srm_mbs.findings import balance_rows
 

@@ -39,7 +39,10 @@ def log_start(
 
 
 def log_end(name: str, solution: Solution | DaeSolution) -> None:
-    """Statistics, and the passages, which are looked for only if they are wanted."""
+    """Statistics, and the passages, which are looked for only if they are wanted.
+
+    Looking for thousands of them takes seconds: who pressed Ctrl-C has the solution before it.
+    """
     stats = solution.stats
     log.info(
         "%s: %s after %d steps (%d rejected, %d redone at singular configurations) and "
@@ -53,7 +56,7 @@ def log_end(name: str, solution: Solution | DaeSolution) -> None:
         stats.wall_time,
     )
     log.info("%s: %s", name, solution.message)
-    if log.isEnabledFor(logging.DEBUG):
+    if log.isEnabledFor(logging.DEBUG) and solution.status != "interrupted":
         _log_passages(name, getattr(solution, "crossings", ()))
 
 

@@ -42,8 +42,14 @@ BUSHING = [False, False, False, True, True, True]
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
-def run_rows(solution: Solution) -> list[tuple[str, str]]:
-    """What a run did: (quantity, value with unit)."""
+def run_rows(solution: Solution, *, passages: bool = True) -> list[tuple[str, str]]:
+    """What a run did: (quantity, value with unit).
+
+    Parameters
+    ----------
+    passages
+        Whether to count the singular passages, which is slow if there are thousands.
+    """
     stats = solution.stats
     energy = solution.energy - solution.energy[0]
     rows = [
@@ -60,7 +66,7 @@ def run_rows(solution: Solution) -> list[tuple[str, str]]:
         rows += [
             ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
             ("zone steps", f"{stats.zone_steps}"),
-            ("singular passages", f"{len(solution.crossings)}"),
+            *([("singular passages", f"{len(solution.crossings)}")] if passages else []),
             ("largest ||g||", f"{position:.2e} (m, rad)"),
             ("largest ||G v||", f"{rate:.2e} (m/s, rad/s)"),
         ]

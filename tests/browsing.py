@@ -11,9 +11,12 @@ import pinocchio as pin
 
 import srm_mbs as srm
 
+SMALL, LARGE = (300, 200), (900, 600)
+"""Windows (pixels): Chromium draws without a graphics card, a large one several times as long."""
+
 
 @contextlib.contextmanager
-def opened(browser: Any, address: str, size: tuple[int, int] = (900, 600)) -> Iterator[Any]:
+def opened(browser: Any, address: str, size: tuple[int, int] = SMALL) -> Iterator[Any]:
     """The loaded page; whatever it complains about, or asks the network for, is an error."""
     context = browser.new_context(viewport={"width": size[0], "height": size[1]})
     page = context.new_page()

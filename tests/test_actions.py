@@ -12,6 +12,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from tests.bundled import load
 
 G = 9.81
 BACKENDS = ("python", *(["kernel"] if kernel.core is not None else []))
@@ -172,7 +173,7 @@ def test_a_clutch_conserves_angular_momentum(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_closure_lets_go_and_the_mechanism_falls_on_freely(backend: str) -> None:
     """The slider-crank loses its pin: from there it is the open chain from that state."""
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     freed = mechanism.without_loop("pin")
     options: dict[str, Any] = {"rtol": 1e-10, "backend": backend}
     event = srm.Event(clock(0.8), action=lambda t, q, v: srm.Switch(freed))
@@ -191,7 +192,7 @@ def test_a_closure_lets_go_and_the_mechanism_falls_on_freely(backend: str) -> No
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_drive_lets_go(backend: str) -> None:
     """The crank turns at constant speed, passes a singular configuration, and is then free."""
-    free = srm.load("slider_crank")
+    free = load("slider_crank")
     speed = 4.0
     driven = srm.Mechanism(
         free.model,
@@ -222,7 +223,7 @@ def test_a_drive_lets_go(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("law", [srm.ConstantSpeed(speed=6.0), srm.Sine(amplitude=0.4, omega=9.0)])
 def test_a_drive_engages_where_it_finds_its_joint(law: Any, backend: str, tmp_path: Path) -> None:
-    free = srm.load("slider_crank_regular")
+    free = load("slider_crank_regular")
     driven = replace(free, drives=[srm.Drive(law, joint="crank")])
     event = srm.Event(clock(0.3), action=lambda t, q, v: srm.Switch(driven))
     run = srm.simulate(free, 0.8, events=event, backend=backend, rtol=1e-9)
@@ -245,7 +246,7 @@ def test_a_drive_engages_where_it_finds_its_joint(law: Any, backend: str, tmp_pa
 @pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-9])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_an_event_may_act_next_to_a_singular_configuration(backend: str, beside: float) -> None:
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     plain = srm.simulate(mechanism, 3.0, rtol=1e-11)
     at = plain.crossings[0].time + beside
     event = srm.Event(clock(at), action=lambda t, q, v: (q, v))
@@ -259,7 +260,7 @@ def test_an_event_may_act_next_to_a_singular_configuration(backend: str, beside:
 def test_a_state_from_which_no_run_can_start_ends_the_run_with_everything_kept(
     backend: str,
 ) -> None:
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     (passage, *_) = srm.simulate(mechanism, 2.0, rtol=1e-10).crossings
     stop = srm.Event(clock(passage.time), action=lambda t, q, v: (q, 0.0 * v))
     run = srm.simulate(mechanism, 2.0, rtol=1e-10, events=stop, backend=backend)
@@ -280,7 +281,7 @@ def test_ctrl_c_in_an_action_keeps_the_segments(ball: srm.Mechanism) -> None:
 
 def test_an_impact_in_a_loop_keeps_the_loop_and_loses_the_energy_it_should() -> None:
     """The crank hits a stop: with one degree of freedom the whole velocity turns, times e."""
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     e = 0.6
 
     def hit(t: float, q: Any, v: Any) -> Any:
@@ -467,13 +468,13 @@ def test_bad_events_and_loops_are_refused(ball: srm.Mechanism) -> None:
         ball.without_loop("x")
     with pytest.raises(srm.InputError, match="between 0 and 1"):
         srm.impact(ball, ball.q0, ball.v0, [1.0], 2.0)
-    pinned = srm.load("slider_crank")
+    pinned = load("slider_crank")
     with pytest.raises(srm.InputError, match="used twice"):
         pinned.with_loop(pinned.loops[0])
 
 
 def test_forces_of_a_drive_that_lets_go_are_those_of_its_time() -> None:
-    free = srm.load("slider_crank")
+    free = load("slider_crank")
     crank = srm.Drive(srm.ConstantSpeed(4.0), joint="crank")
     driven = srm.Mechanism(free.model, free.loops, drives=(crank,), q0=free.q0, v0=[4.0, -8.0])
     event = srm.Event(clock(0.3), action=lambda t, q, v: srm.Switch(driven.without_drive("crank")))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.arrays import FloatArray
 from srm_mbs.assembly import Assembly
+from tests.bundled import load
 from tests.mechanisms import along_x, floating_ring, rescaled, rod
 
-load = cache(srm.load)
 PI = np.pi
 CLOSED = 1e-12
 

@@ -40,6 +40,7 @@ from benchmarks.work_precision.skip import ITEMS, measure_unneeded
 from benchmarks.work_precision.trees import Equations
 from srm_mbs.cli import app
 from srm_mbs.systems.multibody import make_system
+from tests.bundled import problem as shared
 
 ROOT = Path(__file__).parent.parent
 
@@ -193,7 +194,7 @@ def test_failed_runs_count_as_wrong_and_leave_median_or_worst_open() -> None:
 
 @pytest.mark.parametrize("name", [name for name in PROBLEMS if not name.endswith("_40")])
 def test_the_equations_of_the_peers_are_ours(name: str) -> None:
-    problem = PROBLEMS[name]()
+    problem = shared(name)
     tree = problem.tree
     equations = Equations(tree)
     mechanism = problem.mechanism
@@ -227,7 +228,7 @@ def test_every_peer_simulates_the_spatial_robot(peer: str, error: float) -> None
     chosen = PEERS[peer]
     if chosen.missing():
         pytest.skip(f"{chosen.missing()} is not installed")
-    whole = PROBLEMS["walking_robot"]()
+    whole = shared("walking_robot")
     problem = replace(
         whole,
         t_end=0.1,
@@ -251,7 +252,7 @@ def test_peers_with_fixed_steps_simulate_planar_loops(peer: str, name: str) -> N
     chosen = PEERS[peer]
     if chosen.missing():
         pytest.skip(f"{chosen.missing()} is not installed")
-    whole = PROBLEMS[name]()
+    whole = shared(name)
     problem = replace(whole, t_end=whole.t_end / 10.0)  # every tenth sample is one of the whole
     setting = next(each for each in chosen.settings(problem) if each.substeps == 20)
     outcome = attempt(problem, chosen.prepare(problem), setting)
@@ -293,7 +294,7 @@ def test_times_are_those_of_the_calls() -> None:
 
 
 def test_a_repeat_that_takes_too_long_ends_the_sweep_and_not_the_benchmark() -> None:
-    problem, peer = PROBLEMS["slider_crank_regular"](), PEERS["ours"]
+    problem, peer = shared("slider_crank_regular"), PEERS["ours"]
     settings = peer.settings(problem)[:2]
     calls = iter(range(9))
 
@@ -382,7 +383,7 @@ def test_fewer_than_five_repeats_are_refused(
 
 
 def test_energy_is_compared_with_the_start() -> None:
-    problem = PROBLEMS["pendulum_chain"]()
+    problem = shared("pendulum_chain")
     for name in ("ours", "pinocchio_dop853"):
         peer = PEERS[name]
         setting = replace(peer.everyday(problem), value=1e-8)
@@ -410,7 +411,7 @@ def test_the_reference_of_the_squeezing_mechanism_ends_as_published() -> None:
             1.048080741042263,
         ]
     )
-    problem = PROBLEMS["squeezing_mechanism"]()
+    problem = shared("squeezing_mechanism")
     assert problem.reference.accuracy < 1e-11
     ours = problem.reference.observed[-1][:7]
     assert np.abs(ours - published[andrews.TREE_ORDER]).max() < 2e-9

@@ -9,12 +9,13 @@ import pytest
 
 import srm_mbs as srm
 from tests import reduced
+from tests.bundled import load
 
 
 def swinging_up_to(distance: float) -> srm.Mechanism:
     """The parallelogram from below, with the energy to come to rest ``distance`` (rad) short of
     its change point at crank angle 0."""
-    mechanism = srm.load("parallelogram")
+    mechanism = load("parallelogram")
     rate = np.sqrt(2.0 * 9.0 / 8.0 * reduced.G * (1.0 - np.sin(distance)))
     state = srm.assemble(
         mechanism,
@@ -32,7 +33,7 @@ def damped(seconds: float, rtol: float = 1e-8) -> srm.Solution:
     def brake(t: float, q: Any, v: Any) -> np.ndarray:
         return np.array([-4.0 * v[0], 0.0])
 
-    return srm.simulate(srm.load("slider_crank"), seconds, rtol=rtol, controller=brake)
+    return srm.simulate(load("slider_crank"), seconds, rtol=rtol, controller=brake)
 
 
 def test_a_motion_that_turns_back_well_before_a_change_point_is_no_bifurcation() -> None:
@@ -93,7 +94,7 @@ def test_a_braked_mechanism_still_swings_accurately_at_small_amplitudes() -> Non
 @pytest.mark.parametrize("step", [0.3, 0.5, 0.8])
 @pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
 def test_no_branch_is_switched_silently_by_long_fixed_steps(tableau: str, step: float) -> None:
-    solution = srm.simulate(srm.load("parallelogram"), 6.0, tableau=tableau, step=step)
+    solution = srm.simulate(load("parallelogram"), 6.0, tableau=tableau, step=step)
     switched = np.abs(solution.q[:, 0] - solution.q[:, 2]).max() > 0.05
     reported = (
         not solution.success
@@ -104,7 +105,7 @@ def test_no_branch_is_switched_silently_by_long_fixed_steps(tableau: str, step: 
 
 
 def test_a_step_that_would_switch_the_branch_is_redone() -> None:
-    solution = srm.simulate(srm.load("parallelogram"), 0.8, tableau="dop853", step=0.8)
+    solution = srm.simulate(load("parallelogram"), 0.8, tableau="dop853", step=0.8)
     assert solution.success
     assert len(solution.replaced) > 0
     assert np.abs(solution.q[:, 0] - solution.q[:, 2]).max() < 1e-2
@@ -112,8 +113,8 @@ def test_a_step_that_would_switch_the_branch_is_redone() -> None:
 
 def test_sweeps_that_cannot_pass_say_so_and_blame_no_missing_momentum() -> None:
     """So many short steps leave nothing but rounding next to a singular configuration."""
-    q, v = srm.simulate(srm.load("slider_crank"), 1.05, rtol=1e-12)(1.05)
-    mechanism = srm.load("slider_crank").with_state(q, v)
+    q, v = srm.simulate(load("slider_crank"), 1.05, rtol=1e-12)(1.05)
+    mechanism = load("slider_crank").with_state(q, v)
     solution = srm.simulate(mechanism, 1.1, t0=1.05, method="srm", rtol=1e-8)
     assert not solution.success
     assert solution.t[-1] == pytest.approx(1.07414, abs=1e-4)

@@ -6,25 +6,17 @@ KKT solve and Gauss collocation, accurate to 2e-11.
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from benchmarks.work_precision.problems import PROBLEMS
-from benchmarks.work_precision.problems.base import Problem
-
-
-@cache
-def problem() -> Problem:
-    return PROBLEMS["cassie"]()
+from tests.bundled import problem
 
 
 def error(**options: object) -> float:
     """Largest difference from the reference at the end."""
-    cassie = problem()
+    cassie = problem("cassie")
     run = srm.simulate(cassie.mechanism, cassie.t_end, **options)
     assert run.success, run.message
     end = cassie.observe(run.q[-1:], run.v[-1:])
@@ -32,7 +24,7 @@ def error(**options: object) -> float:
 
 
 def test_cassie_floats_with_twelve_rows_of_which_ten_are_independent() -> None:
-    mechanism = problem().mechanism
+    mechanism = problem("cassie").mechanism
     assert mechanism.model.names[1] == "root_joint"
     assert mechanism.model.nv == 28
     assert sum(loop.rows.count for loop in mechanism.loops) == 12
@@ -70,7 +62,9 @@ def test_cassie_floats_with_twelve_rows_of_which_ten_are_independent() -> None:
 def test_the_fall_of_cassie_converges_with_the_order_of_the_scheme(
     tableau: str, order: int, steps: int
 ) -> None:
-    coarse, fine = (error(tableau=tableau, step=problem().t_end / n) for n in (steps, 2 * steps))
+    coarse, fine = (
+        error(tableau=tableau, step=problem("cassie").t_end / n) for n in (steps, 2 * steps)
+    )
     assert 1e-9 < fine < 1e-5
     assert np.log2(coarse / fine) > order - 0.2
 

@@ -14,6 +14,7 @@ import srm_mbs as srm
 from srm_mbs.analysis.comparison import Comparison, compare
 from srm_mbs.analysis.error_estimate import observed_order, parted_at
 from srm_mbs.analysis.verdicts import Finding, error_findings
+from tests.bundled import load
 from tests.references import observed, reference
 
 
@@ -58,7 +59,7 @@ def test_the_estimated_error_is_the_true_one_within_a_factor_of_two(
     name: str, options: dict[str, Any]
 ) -> None:
     t_end = 5.0 if name.startswith("slider") else 3.0
-    solution = srm.simulate(srm.load(name), t_end, **options)
+    solution = srm.simulate(load(name), t_end, **options)
     certificate = srm.certify(solution)
     row = joint(certificate, solution.mechanism.joint_names[0])
     true = true_error(name, solution)
@@ -70,7 +71,7 @@ def test_the_estimated_error_is_the_true_one_within_a_factor_of_two(
 
 @pytest.mark.parametrize(("tableau", "order"), [("trap", 2), ("erk4", 4)])
 def test_at_fixed_steps_the_observed_order_is_that_of_the_scheme(tableau: str, order: int) -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0, step=0.01, tableau=tableau)
+    solution = srm.simulate(load("four_bar"), 1.0, step=0.01, tableau=tableau)
     certificate = srm.certify(solution)
     estimate = certificate.estimate
     assert estimate is not None
@@ -92,7 +93,7 @@ def test_the_order_is_told_from_errors_that_follow_a_power_exactly() -> None:
 
 
 def test_with_step_size_control_errors_fall_with_the_tolerance() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 3.0, rtol=1e-5, tableau="tvd32")
+    solution = srm.simulate(load("four_bar"), 3.0, rtol=1e-5, tableau="tvd32")
     certificate = srm.certify(solution)
     estimate = certificate.estimate
     assert estimate is not None
@@ -102,18 +103,18 @@ def test_with_step_size_control_errors_fall_with_the_tolerance() -> None:
 
 
 def test_the_second_run_takes_the_tolerance_that_is_given() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0, rtol=1e-6, atol=1e-7)
+    solution = srm.simulate(load("four_bar"), 1.0, rtol=1e-6, atol=1e-7)
     certificate = srm.certify(solution, rtol=1e-10)
     assert certificate.estimate is not None
     np.testing.assert_allclose(
         [t.setting for t in certificate.estimate.trials], [1e-6, 1e-8, 1e-10]
     )
-    again = srm.simulate(srm.load("four_bar"), 1.0, rtol=1e-10, atol=1e-11)
+    again = srm.simulate(load("four_bar"), 1.0, rtol=1e-10, atol=1e-11)
     assert certificate.estimate.trials[-1].steps == again.stats.steps
 
 
 def test_a_looser_second_run_gives_a_bound() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0, rtol=1e-10)
+    solution = srm.simulate(load("four_bar"), 1.0, rtol=1e-10)
     certificate = srm.certify(solution, rtol=1e-6)
     assert certificate.estimate is not None
     assert certificate.estimate.bound
@@ -122,7 +123,7 @@ def test_a_looser_second_run_gives_a_bound() -> None:
 
 
 def test_differences_at_round_off_have_no_order() -> None:
-    certificate = srm.certify(srm.simulate(srm.load("four_bar"), 0.5, rtol=1e-12))
+    certificate = srm.certify(srm.simulate(load("four_bar"), 0.5, rtol=1e-12))
     assert certificate.estimate is not None
     assert certificate.estimate.order is None
     assert certificate.grade == "good"
@@ -130,7 +131,7 @@ def test_differences_at_round_off_have_no_order() -> None:
 
 def falling(differences: tuple[float, ...], order: float | None) -> str:
     """Grade of how the error falls, for a run with these differences to the tightest."""
-    run = srm.simulate(srm.load("slider_crank"), 0.5)
+    run = srm.simulate(load("slider_crank"), 0.5)
     estimate = srm.certify(run).estimate
     assert estimate is not None
     trials = [replace(estimate.trials[0], difference=d) for d in (*differences, None)]
@@ -149,7 +150,7 @@ def test_differences_that_do_not_fall_are_bad_unless_they_are_rounding() -> None
 
 
 def test_a_joint_that_does_not_move_has_no_relative_error() -> None:
-    mechanism = srm.load("simple_pendulum")
+    mechanism = load("simple_pendulum")
     down = mechanism.with_state([-np.pi / 2], [0.0])
     row = joint(srm.certify(srm.simulate(down, 1.0)), mechanism.joint_names[0])
     assert row.relative_position is None or row.travel < 1e-12
@@ -170,7 +171,7 @@ def test_angles_of_continuous_joints_are_compared_with_their_turns() -> None:
 
 
 def test_a_chaotic_motion_is_told_apart_from_an_accurate_one() -> None:
-    certificate = srm.certify(srm.simulate(srm.load("pendulum_chain"), 15.0))
+    certificate = srm.certify(srm.simulate(load("pendulum_chain"), 15.0))
     found = finding(certificate, "estimated error")
     assert certificate.estimate is not None
     assert certificate.estimate.branch is None
@@ -184,7 +185,7 @@ def test_a_chaotic_motion_is_told_apart_from_an_accurate_one() -> None:
 
 @pytest.mark.parametrize("kind", ["branch", "chaos", "elsewhere"])
 def test_only_rates_that_differ_at_once_at_a_passage_are_another_branch(kind: str) -> None:
-    run = srm.simulate(srm.load("slider_crank"), 6.0)
+    run = srm.simulate(load("slider_crank"), 6.0)
     first, second = run.crossings[0].time, run.crossings[1].time
     t = np.linspace(0.0, 6.0, 1201)
     rates = np.where(t < (first if kind == "branch" else 0.5 * (first + second)), 1e-8, 1.0)
@@ -196,7 +197,7 @@ def test_only_rates_that_differ_at_once_at_a_passage_are_another_branch(kind: st
 
 
 def test_a_second_run_on_another_branch_is_named() -> None:
-    run = srm.simulate(srm.load("slider_crank"), 6.0)
+    run = srm.simulate(load("slider_crank"), 6.0)
     estimate = srm.certify(run).estimate
     assert estimate is not None
     assert estimate.branch is None
@@ -212,7 +213,7 @@ def test_a_run_that_failed_is_judged_up_to_where_it_came() -> None:
             raise ValueError("it broke")
         return [0.0, 0.0, 0.0]
 
-    solution = srm.simulate(srm.load("four_bar"), 3.0, controller=breaks)
+    solution = srm.simulate(load("four_bar"), 3.0, controller=breaks)
     assert not solution.success
     certificate = srm.certify(solution)
     assert certificate.grade == "poor"
@@ -230,7 +231,7 @@ def test_a_failure_that_a_tighter_run_does_not_have_is_one_of_the_setting() -> N
             raise ValueError("once")
         return [0.0, 0.0, 0.0]
 
-    solution = srm.simulate(srm.load("four_bar"), 1.0, controller=breaks_once)
+    solution = srm.simulate(load("four_bar"), 1.0, controller=breaks_once)
     certificate = srm.certify(solution)
     assert "went on where this one failed" in finding(certificate, "second run").text
 
@@ -239,7 +240,7 @@ def test_a_run_that_failed_at_its_start_has_a_certificate() -> None:
     def broken(t: float, q: Any, v: Any) -> list[float]:
         raise ValueError("never")
 
-    solution = srm.simulate(srm.load("four_bar"), 1.0, controller=broken)
+    solution = srm.simulate(load("four_bar"), 1.0, controller=broken)
     certificate = srm.certify(solution)
     assert certificate.estimate is None
     assert "no step" in finding(certificate, "estimated error").text
@@ -247,7 +248,7 @@ def test_a_run_that_failed_at_its_start_has_a_certificate() -> None:
 
 def test_sweeps_with_a_fixed_eps_are_said_to_share_its_error() -> None:
     method = srm.SRM("erk4", iterations=2, eps=0.01)
-    solution = srm.simulate(srm.load("slider_crank_regular"), 0.1, method=method, step=0.01)
+    solution = srm.simulate(load("slider_crank_regular"), 0.1, method=method, step=0.01)
     assert "eps = 0.01 s" in finding(srm.certify(solution), "regularisation").text
 
 
@@ -255,7 +256,7 @@ def test_sweeps_with_a_fixed_eps_are_said_to_share_its_error() -> None:
 
 
 def test_drift_and_energy_are_those_of_the_run() -> None:
-    solution = srm.simulate(srm.load("bricard"), 2.0)
+    solution = srm.simulate(load("bricard"), 2.0)
     certificate = srm.certify(solution, again=False)
     assert [row.unit for row in certificate.drift] == ["m", "rad"]
     whole = np.hypot(*(row.position for row in certificate.drift))
@@ -268,14 +269,14 @@ def test_drift_and_energy_are_those_of_the_run() -> None:
 
 def hanging_four_bar(rate: float = 0.0) -> srm.Mechanism:
     """The four-bar in its equilibrium, with a rate of its crank (rad/s)."""
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     state = srm.assemble(mechanism, srm.equilibrium(mechanism).q, v={"crank": rate})
     return mechanism.with_state(state.q, state.v)
 
 
 def held_four_bar() -> srm.Mechanism:
     """The four-bar, held by a drive that does not move."""
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     still = replace(mechanism, drives=(srm.Drive(srm.ConstantSpeed(0.0), "crank"),))
     return still.with_state(still.q0, np.zeros(3))
 
@@ -305,7 +306,7 @@ def test_the_energy_balance_of_a_tiny_motion_is_good_down_to_the_rounding_of_its
 def test_the_energy_is_judged_over_the_whole_run_whatever_times_are_asked_for(
     t_eval: list[float],
 ) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     whole = srm.certify(srm.simulate(mechanism, 0.5), again=False).energy
     found = srm.certify(srm.simulate(mechanism, 0.5, t_eval=t_eval), again=False).energy
     assert whole is not None
@@ -316,14 +317,14 @@ def test_the_energy_is_judged_over_the_whole_run_whatever_times_are_asked_for(
 
 
 def test_an_open_chain_has_no_drift() -> None:
-    certificate = srm.certify(srm.simulate(srm.load("pendulum_chain"), 0.5))
+    certificate = srm.certify(srm.simulate(load("pendulum_chain"), 0.5))
     assert certificate.drift == ()
     assert finding(certificate, "closed loops").grade == "good"
 
 
 def test_a_driven_mechanism_keeps_its_drives_as_well() -> None:
     mechanism = replace(
-        srm.load("slider_crank_regular"),
+        load("slider_crank_regular"),
         drives=[srm.Drive(srm.ConstantSpeed(speed=6.0), joint="crank")],
     )
     start = srm.assemble(mechanism)
@@ -339,7 +340,7 @@ def test_jumps_of_runs_with_event_actions_are_left_out_of_the_comparison() -> No
         return float(np.cos(q[0]))
 
     event = srm.Event(down, action=lambda t, q, v: (q, 0.8 * v))
-    solution = srm.simulate(srm.load("simple_pendulum"), 4.0, events=[event])
+    solution = srm.simulate(load("simple_pendulum"), 4.0, events=[event])
     assert len(solution.segments) > 2  # type: ignore[attr-defined]
     certificate = srm.certify(solution)
     assert finding(certificate, "estimated error").grade == "good"
@@ -368,7 +369,7 @@ def loaded(solution: srm.Solution, folder: Path) -> srm.Solution:
     ],
 )
 def test_a_run_from_disk_is_made_again_as_it_was(tmp_path: Path, options: dict[str, Any]) -> None:
-    solution = srm.simulate(srm.load("slider_crank_regular"), 0.2, **options)
+    solution = srm.simulate(load("slider_crank_regular"), 0.2, **options)
     here, there = srm.certify(solution), srm.certify(loaded(solution, tmp_path))
     assert there.estimate is not None
     assert here.estimate is not None
@@ -382,7 +383,7 @@ def test_a_run_that_an_event_ended_is_made_again_up_to_there(tmp_path: Path) -> 
         return float(np.cos(q[0]))
 
     upright.terminal = True  # type: ignore[attr-defined]
-    solution = srm.simulate(srm.load("slider_crank"), 5.0, events=upright)
+    solution = srm.simulate(load("slider_crank"), 5.0, events=upright)
     assert solution.status == "event"
     certificate = srm.certify(loaded(solution, tmp_path))
     assert finding(certificate, "end of the run").grade == "good"
@@ -393,7 +394,7 @@ def test_a_run_that_an_event_ended_is_made_again_up_to_there(tmp_path: Path) -> 
 
 def test_functions_that_a_saved_run_has_lost_are_named(tmp_path: Path) -> None:
     force = srm.UserForce(lambda t, q, v: -0.1 * v, name="brake")
-    mechanism = replace(srm.load("four_bar"), forces=[force])
+    mechanism = replace(load("four_bar"), forces=[force])
     solution = srm.simulate(mechanism, 0.5)
     assert srm.certify(solution).estimate is not None
     certificate = srm.certify(loaded(solution, tmp_path))
@@ -405,7 +406,7 @@ def test_functions_that_a_saved_run_has_lost_are_named(tmp_path: Path) -> None:
 
 def test_event_actions_that_a_saved_run_has_lost_are_named(tmp_path: Path) -> None:
     event = srm.Event(lambda t, q, v: float(np.cos(q[0])), action=lambda t, q, v: (q, 0.8 * v))
-    solution = srm.simulate(srm.load("simple_pendulum"), 2.0, events=[event])
+    solution = srm.simulate(load("simple_pendulum"), 2.0, events=[event])
     certificate = srm.certify(loaded(solution, tmp_path))
     assert "the actions of events" in finding(certificate, "estimated error").text
     assert finding(certificate, "energy balance").grade == "good"
@@ -425,18 +426,18 @@ def test_event_actions_that_a_saved_run_has_lost_are_named(tmp_path: Path) -> No
 def test_a_tolerance_that_tells_nothing_is_refused(
     options: dict[str, Any], rtol: float, words: str
 ) -> None:
-    solution = srm.simulate(srm.load("four_bar"), 0.1, **options)
+    solution = srm.simulate(load("four_bar"), 0.1, **options)
     with pytest.raises(srm.InputError, match=words):
         srm.certify(solution, rtol=rtol)
 
 
 def test_what_is_no_run_has_no_certificate() -> None:
     with pytest.raises(srm.InputError, match="Mechanism is not a run"):
-        srm.certify(srm.load("four_bar"))  # type: ignore[arg-type]
+        srm.certify(load("four_bar"))  # type: ignore[arg-type]
 
 
 def test_a_certificate_reads_as_sentences() -> None:
-    certificate = srm.certify(srm.simulate(srm.load("four_bar"), 0.5))
+    certificate = srm.certify(srm.simulate(load("four_bar"), 0.5))
     text = str(certificate)
     assert text.startswith("Accuracy of the run of four_bar\n")
     for found in certificate.findings:

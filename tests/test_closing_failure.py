@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from tests.bundled import load
 
 # Crank 1, coupler 2, rocker 1.5, ground 2.2: the rocker's range.
 LOWEST = np.pi - np.arccos((1.5**2 + 2.2**2 - 9.0) / (2.0 * 1.5 * 2.2))
@@ -13,7 +14,7 @@ HIGHEST = np.pi - np.arccos((1.5**2 + 2.2**2 - 1.0) / (2.0 * 1.5 * 2.2))
 
 
 def limited(name: str, **ranges: tuple[float, float]) -> srm.Mechanism:
-    bundled = srm.load(name)
+    bundled = load(name)
     model = bundled.model.copy()
     low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
     for joint, (least, largest) in ranges.items():
@@ -25,7 +26,7 @@ def limited(name: str, **ranges: tuple[float, float]) -> srm.Mechanism:
 
 @pytest.mark.parametrize(("asked", "nearest"), [(3.0, HIGHEST), (0.5, LOWEST)])
 def test_it_names_the_nearest_value_of_the_held_joint_that_closes(asked, nearest) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     with pytest.raises(srm.AssemblyError) as caught:
         srm.assemble(mechanism, {"rocker": asked})
     error = caught.value
@@ -43,7 +44,7 @@ def test_it_names_the_nearest_value_of_the_held_joint_that_closes(asked, nearest
 
 
 def test_of_two_contradicting_values_each_gets_the_one_that_fits_the_other() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     with pytest.raises(srm.AssemblyError) as caught:
         srm.assemble(mechanism, {"crank": 1.0, "rocker": 1.6})
     assert set(caught.value.nearest) == {"crank", "rocker"}
@@ -53,7 +54,7 @@ def test_of_two_contradicting_values_each_gets_the_one_that_fits_the_other() -> 
 
 
 def test_limits_choose_the_branch_within_them() -> None:
-    bundled = srm.load("four_bar")
+    bundled = load("four_bar")
     other = srm.assembly_modes(bundled, {"crank": 1.0}, starts=20)[1].q
     mechanism = limited("four_bar", rocker=(other[2] - 0.3, other[2] + 0.3))
     free = srm.assemble(mechanism, {"crank": 1.0})

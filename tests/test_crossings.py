@@ -13,6 +13,7 @@ import srm_mbs as srm
 from srm_mbs.stepping import crossings as crossings_module
 from srm_mbs.systems import structure
 from tests import reduced
+from tests.bundled import load
 from tests.mechanisms import (
     along_x,
     ball_dead_point,
@@ -33,7 +34,7 @@ SINGULAR_AT = {
 
 
 def run(name: str, t_end: float, tableau: str = "dop853", tol: float = 1e-8) -> srm.Solution:
-    return srm.simulate(srm.load(name), t_end, tableau=tableau, rtol=tol, atol=tol)
+    return srm.simulate(load(name), t_end, tableau=tableau, rtol=tol, atol=tol)
 
 
 def passages_of(solution: srm.Solution, name: str) -> np.ndarray:
@@ -82,7 +83,7 @@ def test_a_motion_that_turns_back_before_a_singular_configuration_passes_none() 
     """Its energy lifts the crank to 0.02 rad before the vertical: sigma falls to 0.06 and rises."""
     rate = np.sqrt(1.5 * reduced.G * np.sin(PI / 2.0 - 0.02))
     solution = srm.simulate(
-        srm.load("slider_crank"), 6.5, q0=[0.0, 0.0], v0=[rate, -2.0 * rate], rtol=1e-9
+        load("slider_crank"), 6.5, q0=[0.0, 0.0], v0=[rate, -2.0 * rate], rtol=1e-9
     )
     turning = solution(np.linspace(0.0, 6.5, 6501))[0][:, 0].max()
     assert PI / 2.0 - turning == pytest.approx(0.02, abs=1e-4)
@@ -93,7 +94,7 @@ def test_a_motion_that_turns_back_before_a_singular_configuration_passes_none() 
 @pytest.mark.parametrize("longer", [1e-3, 1e-5])
 def test_a_linkage_that_is_only_almost_singular_passes_nothing(longer: float) -> None:
     """With a rod longer than the crank the slider-crank turns without a singular configuration."""
-    base = srm.load("slider_crank_whirl")
+    base = load("slider_crank_whirl")
     (loop,) = base.loops
     tip = srm.Anchor("rod", xyz=(2.0 + longer, 0.0, 0.0))
     mechanism = srm.Mechanism(
@@ -113,7 +114,7 @@ def test_regular_motions_list_none_at_the_coarsest_tolerance(name: str) -> None:
 
 
 def test_a_start_on_a_singular_configuration_is_no_passage() -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 0.5, q0=[1.5 * PI, -3.0 * PI], v0=[1.0, -2.0])
+    solution = srm.simulate(load("slider_crank"), 0.5, q0=[1.5 * PI, -3.0 * PI], v0=[1.0, -2.0])
     assert solution.crossings == ()
 
 
@@ -165,12 +166,12 @@ def test_how_the_stages_were_kept_away_is_recorded() -> None:
     assert "a priori" in {crossing.placement for crossing in placed.crossings}
     assert np.sum(placed.steps.placements == 1) <= placed.stats.placements
     # fixed steps that end on the singular configuration
-    mechanism = srm.load("slider_crank_whirl")
+    mechanism = load("slider_crank_whirl")
     step = run("slider_crank_whirl", 1.0, tol=1e-11).crossings[0].time / 50.0
     hit = srm.simulate(mechanism, 70.0 * step, step=step, placement="off")
     assert [crossing.placement for crossing in hit.crossings] == ["zone"]
     assert hit.stats.zone_steps > 0
-    untouched = srm.simulate(srm.load("slider_crank_whirl"), 4.0, placement="off", rtol=1e-6)
+    untouched = srm.simulate(load("slider_crank_whirl"), 4.0, placement="off", rtol=1e-6)
     assert {crossing.placement for crossing in untouched.crossings} <= {"", "zone"}
 
 
@@ -213,7 +214,7 @@ def test_passages_of_balls_and_free_bases_keep_their_branch(start: Any) -> None:
 def test_a_passage_at_the_very_end_of_a_run_is_listed_and_left_open() -> None:
     whole = run("slider_crank", 2.0, tol=1e-9)
     t = whole.crossings[0].time
-    cut = srm.simulate(srm.load("slider_crank"), t + 1e-3, rtol=1e-9, atol=1e-9)
+    cut = srm.simulate(load("slider_crank"), t + 1e-3, rtol=1e-9, atol=1e-9)
     (crossing,) = cut.crossings
     assert crossing.time == pytest.approx(t, abs=1e-6)
     assert crossing.left_on is None
@@ -253,7 +254,7 @@ def test_what_is_expensive_is_computed_when_it_is_read(monkeypatch: pytest.Monke
 def slender_slider_crank(thickness: float, twist: float = 0.0) -> srm.Mechanism:
     """slider_crank with ball joints, which closures hold as hinges, and rods of that ratio of axial
     to transverse inertia; the hinges' frames are turned by ``twist`` (rad) about their axis."""
-    base = srm.load("slider_crank")
+    base = load("slider_crank")
     model = pin.Model()
     model.name = "slender_slider_crank"
     model.gravity.linear = base.model.gravity.linear
@@ -284,7 +285,7 @@ def test_slender_bodies_held_by_closures_pass_like_hinges_in_the_tree(
     thickness: float, twist: float, rtol: float
 ) -> None:
     """Rows that turn a rod about its axis are 1/sqrt(thickness) as large as those beside them."""
-    expected = srm.simulate(srm.load("slider_crank"), 10.0, rtol=1e-12)
+    expected = srm.simulate(load("slider_crank"), 10.0, rtol=1e-12)
     solution = srm.simulate(slender_slider_crank(thickness, twist), 10.0, rtol=rtol)
     found = solution.crossings
     assert [c.time for c in found] == pytest.approx([c.time for c in expected.crossings], abs=1e-4)
@@ -316,7 +317,7 @@ def test_hinges_of_two_points_next_to_each_other_pass_like_hinges(
     apart: float, rtol: float, tmp_path: Path
 ) -> None:
     """What holds them against turning is small everywhere; passages must be seen from afar."""
-    expected = srm.simulate(srm.load("slider_crank"), 6.0, rtol=1e-12)
+    expected = srm.simulate(load("slider_crank"), 6.0, rtol=1e-12)
     mechanism = slider_crank_of_points(apart)
     assert mechanism.structure.rank == 11
     assert mechanism.structure.sigma_ref > 0.1

@@ -10,12 +10,13 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs import kernel
+from tests.bundled import load
 from tests.mechanisms import floating_ring
 
 
 @pytest.mark.parametrize(("tableau", "bound"), [("dopr54", 1e-5), ("dop853", 1e-6)])
 def test_dense_output_is_as_accurate_as_the_steps(tableau: str, bound: float) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     t = np.linspace(0.0, 2.0, 777)
     fine = srm.simulate(mechanism, 2.0, rtol=1e-12, atol=1e-12, t_eval=t)
     coarse = srm.simulate(mechanism, 2.0, rtol=1e-8, atol=1e-8, tableau=tableau)
@@ -26,7 +27,7 @@ def test_dense_output_is_as_accurate_as_the_steps(tableau: str, bound: float) ->
 
 @pytest.mark.parametrize("tableau", ["fe", "trap", "heun", "tvd32", "erk4", "dopr54", "dop853"])
 def test_the_interpolant_joins_the_corrected_states(tableau: str) -> None:
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     solution = srm.simulate(mechanism, 2.0, tableau=tableau, step=0.02)
     nodes = solution.steps.times
     q, v = solution(nodes)
@@ -39,7 +40,7 @@ def test_the_interpolant_joins_the_corrected_states(tableau: str) -> None:
 
 
 def test_the_interpolant_is_a_motion_its_rates_are_its_derivative() -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 4.0, rtol=1e-9)
+    solution = srm.simulate(load("slider_crank"), 4.0, rtol=1e-9)
     t = np.linspace(0.1, 3.9, 200)
     (q_after, _), (q_before, _) = solution(t + 1e-5), solution(t - 1e-5)
     assert np.abs((q_after - q_before) / 2e-5 - solution(t)[1]).max() < 1e-6
@@ -47,7 +48,7 @@ def test_the_interpolant_is_a_motion_its_rates_are_its_derivative() -> None:
 
 def test_closures_hold_between_the_steps_within_the_tolerance() -> None:
     solution = srm.simulate(
-        srm.load("four_bar"), 3.0, rtol=1e-8, atol=1e-8, t_eval=np.linspace(0.0, 3.0, 1501)
+        load("four_bar"), 3.0, rtol=1e-8, atol=1e-8, t_eval=np.linspace(0.0, 3.0, 1501)
     )
     assert solution.drift[:, 0].max() < 1e-8
     assert solution.drift[:, 1].max() < 1e-6
@@ -66,7 +67,7 @@ def test_dense_output_on_lie_groups_stays_on_the_manifold_and_is_accurate() -> N
 
 
 def test_a_scalar_time_gives_vectors_and_times_may_come_in_any_order() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0)
+    solution = srm.simulate(load("four_bar"), 1.0)
     q, v = solution(0.3)
     assert q.shape == v.shape == (3,)
     t = np.array([0.9, 0.1, 0.5, 0.1])
@@ -78,13 +79,13 @@ def test_a_scalar_time_gives_vectors_and_times_may_come_in_any_order() -> None:
 
 @pytest.mark.parametrize("t", [-0.1, 1.1, np.nan])
 def test_times_outside_the_run_are_refused(t: float) -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0)
+    solution = srm.simulate(load("four_bar"), 1.0)
     with pytest.raises(ValueError, match="the run covers t = 0 to 1"):
         solution(t)
 
 
 def test_extra_stages_are_evaluated_only_when_dense_output_is_read() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 1.0)
     spent = solution.stats.evaluations
     assert solution._system.evaluations == spent
@@ -95,7 +96,7 @@ def test_extra_stages_are_evaluated_only_when_dense_output_is_read() -> None:
 
 
 def test_dense_output_inside_the_zone_uses_the_prediction_of_the_run() -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 1.3, rtol=1e-12, max_step=5e-4)
+    solution = srm.simulate(load("slider_crank"), 1.3, rtol=1e-12, max_step=5e-4)
     assert solution.stats.zone_steps > 0
     centre = solution.crossings[0].time
     q, _ = solution(np.linspace(centre - 1e-3, centre + 1e-3, 201))
@@ -138,7 +139,7 @@ def test_turns_are_counted_within_steps_in_which_the_rate_changes_by_many_turns(
 
 def beside_a_slider_crank(joint: Any, rates: list[float]) -> srm.Mechanism:
     """The slider-crank, and a wheel that turns freely and evenly beside it."""
-    base = srm.load("slider_crank")
+    base = load("slider_crank")
     model = base.model.copy()
     wheel = model.addJoint(0, joint, pin.SE3.Identity(), "wheel")
     even = pin.Inertia(1.0, np.zeros(3), 0.1 * np.eye(3))

@@ -16,6 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
+from tests.bundled import load
 from tests.mechanisms import along_x, ball_dead_point, rod
 
 BACKENDS = ["python", "kernel"] if srm.backend() == "kernel" else ["python"]
@@ -32,14 +33,14 @@ def slid(angle: float, law: str = "slider") -> srm.Mechanism:
         drive = srm.Drive(srm.ConstantSpeed(OMEGA), "crank")
     q = np.array([angle, -2.0 * angle, 4.0 * np.cos(angle)])
     v = OMEGA * np.array([1.0, -2.0, -4.0 * np.sin(angle)])
-    return replace(srm.load("slider_crank_slider"), drives=(drive,), q0=q, v0=v)
+    return replace(load("slider_crank_slider"), drives=(drive,), q0=q, v0=v)
 
 
 def towards_the_dead_point(short: float) -> srm.Mechanism:
     """The slider goes from 3 m to ``short`` (m) of 4 m, where the bars are in line, and back."""
     law = srm.Sine(0.5, omega=2.0, phase=-0.5 * np.pi, offset=3.5 - short)
     drive = srm.Drive(law, "slider", absolute=True)
-    mechanism = replace(srm.load("slider_crank_slider"), drives=(drive,))
+    mechanism = replace(load("slider_crank_slider"), drives=(drive,))
     state = srm.assemble(mechanism, [-0.8, 1.6, 3.0 - short])
     return mechanism.with_state(state.q, state.v)
 
@@ -200,7 +201,7 @@ def test_without_speed_or_off_the_branches_a_driven_start_is_refused() -> None:
 @pytest.mark.parametrize("name", ["n_four_bar_2", "parallelogram", "spatial_dead_point", "ball"])
 def test_a_run_from_a_singular_passage_goes_on_like_the_one_that_came_through(name: str) -> None:
     """Nullity two, redundant rows, far from any symmetry, nq != nv."""
-    mechanism = ball_dead_point() if name == "ball" else srm.load(name)
+    mechanism = ball_dead_point() if name == "ball" else load(name)
     crank = mechanism.joint_names[0]
     speed = float(mechanism.v0[0]) or 1.0
     mechanism = replace(mechanism, drives=(srm.Drive(srm.ConstantSpeed(speed), crank),))

@@ -13,6 +13,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.systems.multibody import make_system
+from tests.bundled import load
 from tests.convergence import observed_order
 from tests.lockstep import compare
 from tests.mechanisms import along_x, rod
@@ -106,7 +107,7 @@ def test_an_arm_moved_with_minimum_jerk_needs_the_torques_of_inverse_dynamics(
 
 
 def slider_crank(speed: float = 2.0) -> srm.Mechanism:
-    mechanism = srm.load("slider_crank_regular")
+    mechanism = load("slider_crank_regular")
     return driven(mechanism, srm.Drive(srm.ConstantSpeed(speed), "crank"))
 
 
@@ -179,20 +180,20 @@ def test_a_table_is_followed(backend: str) -> None:
 CASES: dict[str, Callable[[], srm.Mechanism]] = {
     "slider-crank": slider_crank,
     "five-bar, one crank": lambda: driven(
-        srm.load("five_bar"), srm.Drive(srm.Sine(0.3, frequency_hz=0.4, phase=0.2), "crank_left")
+        load("five_bar"), srm.Drive(srm.Sine(0.3, frequency_hz=0.4, phase=0.2), "crank_left")
     ),
     "spatial four-bar": lambda: driven(
-        srm.load("spatial_four_bar"), srm.Drive(srm.ConstantSpeed(3.0), "crank")
+        load("spatial_four_bar"), srm.Drive(srm.ConstantSpeed(3.0), "crank")
     ),
     "a point of a chain": lambda: driven(
-        srm.load("pendulum_chain"),
+        load("pendulum_chain"),
         srm.Drive(
             srm.Sine(0.1, omega=2.0),
             a=srm.Anchor("link_2", xyz=(0.1, 0.0, 0.0)),
             b=srm.Anchor("world"),
             axis=(0.0, 0.0, 1.0),
         ),
-        q=srm.load("pendulum_chain").q0 + 0.3,
+        q=load("pendulum_chain").q0 + 0.3,
     ),
 }
 
@@ -248,7 +249,7 @@ def test_sweeps_converge_on_driven_mechanisms(method: srm.SRM) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_driven_crank_leads_through_the_dead_points_of_equal_bars(backend: str) -> None:
     """slider_crank has r = l: at pi/2 + k pi the closure and the drive lose rank together."""
-    mechanism = driven(srm.load("slider_crank"), srm.Drive(srm.ConstantSpeed(2.0), "crank"))
+    mechanism = driven(load("slider_crank"), srm.Drive(srm.ConstantSpeed(2.0), "crank"))
     assert mechanism.degrees_of_freedom == 0
     solution = srm.simulate(mechanism, 20.0, rtol=1e-8, backend=backend)
     assert solution.success, solution.message
@@ -263,7 +264,7 @@ def test_a_driven_crank_leads_through_the_dead_points_of_equal_bars(backend: str
 
 
 def test_a_slider_driven_beyond_its_dead_point_ends_with_what_it_reached() -> None:
-    mechanism = replace(srm.load("slider_crank_slider"), drives=())
+    mechanism = replace(load("slider_crank_slider"), drives=())
     slider = next(n for n in mechanism.joint_names if "slide" in n)
     mechanism = driven(mechanism, srm.Drive(srm.ConstantSpeed(1.0), slider))
     solution = srm.simulate(mechanism, 10.0, rtol=1e-6)
@@ -278,7 +279,7 @@ def test_a_slider_driven_beyond_its_dead_point_ends_with_what_it_reached() -> No
 
 
 def test_drives_take_degrees_of_freedom_and_none_may_be_left() -> None:
-    free = srm.load("five_bar")
+    free = load("five_bar")
     one = CASES["five-bar, one crank"]()
     both = driven(
         free,
@@ -293,7 +294,7 @@ def test_drives_take_degrees_of_freedom_and_none_may_be_left() -> None:
 
 def parallel_cranks() -> tuple[srm.Mechanism, list[str]]:
     """The parallelogram, and its two joints on the ground."""
-    mechanism = srm.load("parallelogram")
+    mechanism = load("parallelogram")
     model = mechanism.model
     return mechanism, [
         name for name in mechanism.joint_names if not model.parents[model.getJointId(name)]
@@ -442,7 +443,7 @@ guess = {{ rod = -1.0 }}
 
 
 def written(folder: Path, drive: str, more: str = "") -> Path:
-    urdf = srm.load("slider_crank").source.urdf_path  # type: ignore[union-attr]
+    urdf = load("slider_crank").source.urdf_path  # type: ignore[union-attr]
     path = folder / "driven.toml"
     path.write_text(
         TEXT.format(urdf=Path(urdf).resolve()).replace("[[loop]]", more + "[[loop]]") + drive
@@ -593,7 +594,7 @@ def test_an_absolute_distance_places_the_start() -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_simulator_follows_the_drives_also_after_a_reset(backend: str) -> None:
     mechanism = driven(
-        srm.load("five_bar"), srm.Drive(srm.MinimumJerk(2.3, 0.6, start=0.1), "crank_left")
+        load("five_bar"), srm.Drive(srm.MinimumJerk(2.3, 0.6, start=0.1), "crank_left")
     )
     whole = srm.simulate(mechanism, 1.0, rtol=1e-9)
     simulator = srm.Simulator(mechanism, rtol=1e-9, backend=backend)
@@ -626,7 +627,7 @@ def test_info_and_tables_show_what_is_driven(tmp_path: Path) -> None:
 
 
 def test_a_delta_robot_moves_from_rest_to_rest_with_the_torques_of_inverse_dynamics() -> None:
-    robot = srm.load("delta_robot")
+    robot = load("delta_robot")
     arms = ["arm_1", "arm_2", "arm_3"]
     starts = [robot.q0[robot.joint(name).idx_q] for name in arms]
     drives = [

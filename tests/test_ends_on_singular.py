@@ -9,6 +9,7 @@ import pytest
 
 import srm_mbs as srm
 from tests import reduced
+from tests.bundled import load
 from tests.lockstep import compare
 
 PERIOD = 4.29657624142677449
@@ -18,7 +19,7 @@ BESIDE = (-1e-3, -1e-4, -1e-5, -1e-6, -1e-8, -1e-12, 0.0, 1e-9, 1e-6, 1e-4)
 
 def motion(name: str) -> tuple[reduced.Field, list[float], float]:
     """Reduced equations of a bundled mechanism, its start, and the crank's angle from theirs."""
-    mechanism = srm.load(name)
+    mechanism = load(name)
     crank = 0 if name.startswith("n_four_bar") else mechanism.joint("crank").idx_q
     start = [float(mechanism.q0[crank]), float(mechanism.v0[0])]
     if name == "slider_crank":
@@ -34,7 +35,7 @@ def motion(name: str) -> tuple[reduced.Field, list[float], float]:
 def near_first_passage(name: str) -> tuple[float, list[float]]:
     """A time (s) just before the first singular configuration, and angle and rate of the crank."""
     field, start, _ = motion(name)
-    t = srm.simulate(srm.load(name), 2.0, rtol=1e-8).crossings[0].time - 5e-3
+    t = srm.simulate(load(name), 2.0, rtol=1e-8).crossings[0].time - 5e-3
     return t, reduced.integrate(field, start, t).tolist()
 
 
@@ -59,7 +60,7 @@ def error_of_a_run_to_the_first_passage(
     field, _, off = motion(name)
     before, state = near_first_passage(name)
     t_end = first_passage(name) + beside
-    solution = srm.simulate(srm.load(name), t_end, tableau=tableau, rtol=tol, atol=tol)
+    solution = srm.simulate(load(name), t_end, tableau=tableau, rtol=tol, atol=tol)
     assert solution.success
     theta, omega = reduced.integrate(field, state, t_end - before)
     crank = 0 if off == 0.0 else solution.mechanism.joint("crank").idx_q
@@ -73,7 +74,7 @@ def error_of_a_run_to_the_first_passage(
 @pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-6, 1e-3])
 def test_a_run_may_end_on_a_singular_configuration(tableau: str, tol: float, beside: float) -> None:
     t_end = PERIOD / 4.0 + beside
-    solution = srm.simulate(srm.load("slider_crank"), t_end, tableau=tableau, rtol=tol, atol=tol)
+    solution = srm.simulate(load("slider_crank"), t_end, tableau=tableau, rtol=tol, atol=tol)
     assert solution.success
     assert solution.stats.steps < 60
     theta, omega = reduced.integrate(reduced.slider_crank(), [7.0 * np.pi / 4.0, 0.0], t_end)
@@ -118,7 +119,7 @@ def test_runs_of_lower_order_end_next_to_singular_configurations(name: str, tol:
 def test_the_kernel_prepares_for_such_an_end_as_the_reference_does(
     name: str, beside: float
 ) -> None:
-    comparison = compare(srm.load(name), first_passage(name) + beside, rtol=1e-8)
+    comparison = compare(load(name), first_passage(name) + beside, rtol=1e-8)
     assert comparison.arrivals == 1
     assert not comparison.verdicts
     assert comparison.h < 1e-9
@@ -139,7 +140,7 @@ def test_nothing_is_evaluated_behind_an_end_next_to_a_singular_configuration(
         return np.zeros(2)
 
     solution = srm.simulate(
-        srm.load("slider_crank"), t_end, rtol=1e-8, controller=controller, backend=backend
+        load("slider_crank"), t_end, rtol=1e-8, controller=controller, backend=backend
     )
     assert solution.success
     assert solution.t[-1] == t_end
@@ -151,7 +152,7 @@ def test_a_breakpoint_next_to_a_singular_configuration_costs_no_accuracy(backend
     field, start, _ = motion("slider_crank")
     passage = first_passage("slider_crank")
     solution = srm.simulate(
-        srm.load("slider_crank"),
+        load("slider_crank"),
         1.5 * passage,
         rtol=1e-10,
         atol=1e-10,
@@ -166,7 +167,7 @@ def test_a_breakpoint_next_to_a_singular_configuration_costs_no_accuracy(backend
 @pytest.mark.parametrize("tableau", ["erk4", "dopr54", "dop853"])
 def test_a_grid_point_on_a_singular_configuration_is_stepped_over(tableau: str) -> None:
     step = PERIOD / 160.0
-    solution = srm.simulate(srm.load("slider_crank"), PERIOD / 2.0, step=step, tableau=tableau)
+    solution = srm.simulate(load("slider_crank"), PERIOD / 2.0, step=step, tableau=tableau)
     assert solution.success
     assert solution.stats.steps <= 82
     assert solution.steps.sigmas.min() > 1e-3

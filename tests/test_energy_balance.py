@@ -12,13 +12,14 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs.analysis import energy_balance
+from tests.bundled import load
 from tests.mechanisms import rod
 from tests.reduced import G
 
 
 def changed(name: str, damping=None, friction=None, forces=()) -> srm.Mechanism:
     """A bundled mechanism with joint damping, joint friction or force elements."""
-    bundled = srm.load(name)
+    bundled = load(name)
     model = bundled.model.copy()
     if damping is not None:
         model.damping = np.array(damping)
@@ -55,7 +56,7 @@ ELEMENTS: dict[str, srm.ForceElement] = {
 
 
 def closing(name: str, longest: float) -> float:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     t_end = min(mechanism.defaults.t_end or 1.0, longest)
     balance = srm.simulate(mechanism, t_end, rtol=1e-10).energy_balance
     assert balance.scale > 1e-3
@@ -219,7 +220,7 @@ def test_impacts_take_what_restitution_says() -> None:
 
 
 def test_a_loaded_run_with_a_controller_says_why_it_has_none(tmp_path: Path) -> None:
-    solution = srm.simulate(srm.load("slider_crank_regular"), 0.1, controller=push)
+    solution = srm.simulate(load("slider_crank_regular"), 0.1, controller=push)
     solution.save(tmp_path / "run.npz")
     loaded = srm.load_solution(tmp_path / "run.npz")
     with pytest.raises(srm.InputError, match="energy balance of a loaded run with a controller"):

@@ -11,15 +11,16 @@ from scipy.optimize import minimize_scalar
 
 import srm_mbs as srm
 from srm_mbs.systems.loops import LoopKinematics
+from tests.bundled import load
 from tests.mechanisms import rod
 from tests.reduced import G
 
-SPRING = srm.load("squeezing_mechanism").forces[1]
+SPRING = load("squeezing_mechanism").forces[1]
 
 
 def loaded_squeezer(wind: float = 0.05) -> srm.Mechanism:
     """The squeezing mechanism with a torsion spring in place of its motor."""
-    bundled = srm.load("squeezing_mechanism")
+    bundled = load("squeezing_mechanism")
     forces = (SPRING, srm.TorsionSpring("beta", wind, 0.0, 0.0))
     return srm.Mechanism(bundled.model, bundled.loops, q0=bundled.q0, forces=forces)
 
@@ -86,8 +87,8 @@ def test_a_pendulum_hangs_and_stands() -> None:
 @pytest.mark.parametrize(
     ("mechanism", "joint"),
     [
-        (srm.load("four_bar"), "crank"),
-        (srm.load("slider_crank_regular"), "crank"),
+        (load("four_bar"), "crank"),
+        (load("slider_crank_regular"), "crank"),
         (loaded_squeezer(), "beta"),
     ],
     ids=["four_bar", "slider_crank", "squeezer"],
@@ -109,7 +110,7 @@ def test_a_loop_rests_where_its_potential_energy_is_least(mechanism, joint: str)
 
 
 def test_multipliers_balance_gravity() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     found = srm.equilibrium(mechanism)
     model, data = mechanism.model, mechanism.model.createData()
     weight = pin.computeGeneralizedGravity(model, data, found.q)
@@ -124,13 +125,13 @@ def test_multipliers_balance_gravity() -> None:
 
 
 def test_held_joints_need_the_slope_of_the_potential() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     energy = potential(mechanism, "crank", mechanism.q0)
     held = srm.equilibrium(mechanism, hold="crank")
     np.testing.assert_allclose(held.q, mechanism.q0, atol=1e-13)
     np.testing.assert_allclose(held.holding["crank"], slope(energy, 1.0), rtol=1e-9)
     # one of two: the rest moves to where it balances, and the torque is still dV/dq there
-    five = srm.load("five_bar")
+    five = load("five_bar")
     found = srm.equilibrium(five, hold=["crank_left"])
     assert abs(found.q - five.q0).max() > 0.1
     assert found.stable
@@ -146,7 +147,7 @@ def test_held_joints_need_the_slope_of_the_potential() -> None:
 
 def test_an_equilibrium_on_a_singular_configuration_is_reported() -> None:
     """Crank and rod of equal length hang one on the other, the slider below the pivot."""
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     for search in ("stable", "nearest"):
         found = srm.equilibrium(mechanism, search=search)
         assert found.singular
@@ -157,7 +158,7 @@ def test_an_equilibrium_on_a_singular_configuration_is_reported() -> None:
 
 
 def test_motions_that_nothing_resists_are_neutral() -> None:
-    found = srm.equilibrium(srm.load("spatial_four_bar"))  # its coupler can spin
+    found = srm.equilibrium(load("spatial_four_bar"))  # its coupler can spin
     assert found.neutral
     assert not found.stable
     np.testing.assert_allclose(found.eigenvalues[0], 0.0, atol=1e-10)
@@ -178,7 +179,7 @@ def test_a_torque_on_a_wheel_that_nothing_resists_has_no_equilibrium() -> None:
 
 
 def test_where_there_is_no_equilibrium_it_says_so() -> None:
-    bundled = srm.load("four_bar")
+    bundled = load("four_bar")
     forces = [srm.JointTorque("crank", 500.0)]
     mechanism = srm.Mechanism(bundled.model, bundled.loops, q0=bundled.q0, forces=forces)
     for search in ("stable", "nearest"):
@@ -188,4 +189,4 @@ def test_where_there_is_no_equilibrium_it_says_so() -> None:
     with pytest.raises(srm.InputError, match="search = 'best'"):
         srm.equilibrium(bundled, search="best")
     with pytest.raises(srm.InputError, match="starts on a singular configuration"):
-        srm.equilibrium(srm.load("slider_crank"), [0.5 * np.pi, np.pi])
+        srm.equilibrium(load("slider_crank"), [0.5 * np.pi, np.pi])

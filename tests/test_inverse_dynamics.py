@@ -9,12 +9,13 @@ from scipy.linalg import null_space
 
 import srm_mbs as srm
 from srm_mbs.systems.loops import LoopKinematics
+from tests.bundled import load
 from tests.mechanisms import floating_ring
 
 
 def driven(name: str, names: list[str], t_end: float = 1.0, **options):
     """A bundled mechanism, a run of it with torques on the joints ``names``, and these."""
-    mechanism = srm.load(name)
+    mechanism = load(name)
     columns = [mechanism.joint(joint).idx_v for joint in names]
 
     def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -119,7 +120,7 @@ def test_a_free_motion_of_ball_joints_needs_nothing() -> None:
 
 def test_a_prescribed_crank_turns_uniformly() -> None:
     """theta = 2 t on the slider-crank whose reduced equation is known."""
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     w, times = 2.0, np.linspace(0.0, 0.5, 6)
 
     def motion(t: float):
@@ -167,7 +168,7 @@ def test_motions_that_cannot_be_are_refused() -> None:
         srm.inverse_dynamics(mechanism, run, "crank", weights=[1.0, 2.0])
     with pytest.raises(srm.InputError, match="there is no joint 'wheel'"):
         srm.inverse_dynamics(mechanism, run, "wheel")
-    singular = srm.load("slider_crank")
+    singular = load("slider_crank")
     fold = srm.assemble(singular, {"crank": 0.5 * np.pi}).q
     rest = np.zeros((1, 2))
     with pytest.raises(srm.InputError, match="stands on a singular configuration"):

@@ -23,6 +23,7 @@ from srm_mbs.preparation import absolute_tolerance
 from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.stepping.stepsize import initial_step
 from srm_mbs.systems.multibody import make_system
+from tests.bundled import load
 from tests.lockstep import Comparison, compare
 from tests.mechanisms import floating_ring
 
@@ -65,7 +66,7 @@ def test_every_attempt_of_the_reference_is_repeated(
     name: str, t_end: float, tableau: str, rtol: float
 ) -> None:
     thin = name == "spatial_dead_point"
-    agree(compare(srm.load(name), t_end, rtol=rtol, tableau=tableau), thin)
+    agree(compare(load(name), t_end, rtol=rtol, tableau=tableau), thin)
 
 
 @pytest.mark.parametrize("placement", ["automatic", "off"])
@@ -73,13 +74,13 @@ def test_every_attempt_of_the_reference_is_repeated(
 def test_fixed_steps_are_repeated(tableau: str, placement: str) -> None:
     """Over grid points and stages on a singular configuration; placement "off" enters the zone."""
     found = compare(
-        srm.load("slider_crank"), 1.5, rtol=1e-6, tableau=tableau, step=0.01, placement=placement
+        load("slider_crank"), 1.5, rtol=1e-6, tableau=tableau, step=0.01, placement=placement
     )
     agree(found)
 
 
 def test_steps_in_the_zone_are_repeated() -> None:
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     crossing = srm.simulate(mechanism, 2.0, rtol=1e-10, backend="python").crossings[0].time
     found = compare(mechanism, 2.0, rtol=1e-6, step=crossing / 64.0, placement="off")
     assert found.zones > 0
@@ -88,7 +89,7 @@ def test_steps_in_the_zone_are_repeated() -> None:
 
 def test_a_finite_eps_is_repeated() -> None:
     for eps in (1e-3, "h", "h^(2/3)"):
-        agree(compare(srm.load("four_bar"), 0.5, rtol=1e-6, eps=eps, step=0.005, tableau="erk4"))
+        agree(compare(load("four_bar"), 0.5, rtol=1e-6, eps=eps, step=0.005, tableau="erk4"))
 
 
 def test_free_and_ball_joints_are_repeated() -> None:
@@ -103,7 +104,7 @@ def random_state(mechanism: srm.Mechanism, rng: np.random.Generator) -> np.ndarr
 
 @pytest.mark.parametrize("name", [name for name, _ in MODELS])
 def test_the_terms_of_a_stage_agree_anywhere(name: str) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     system = make_system(mechanism)
     twin = twin_of(system)
     rng = np.random.default_rng(5)
@@ -134,7 +135,7 @@ def both(mechanism: srm.Mechanism, t_end: float, **options: Any) -> tuple[srm.So
 
 def test_whole_runs_and_their_dense_output_agree() -> None:
     for name, t_end in MODELS:
-        python, compiled = both(srm.load(name), t_end, rtol=1e-8)
+        python, compiled = both(load(name), t_end, rtol=1e-8)
         t = np.linspace(0.0, t_end, 101)
         unit = python.mechanism.structure.units.coordinate.max()
         assert np.abs(python(t)[0] - compiled(t)[0]).max() < 1e-7 * unit
@@ -146,7 +147,7 @@ def test_whole_runs_and_their_dense_output_agree() -> None:
 def test_dense_output_of_the_same_steps_agrees_to_rounding() -> None:
     """Regular steps, and steps next to singular configurations (Hermite interpolation)."""
     for name, t_end in MODELS:
-        mechanism = srm.load(name)
+        mechanism = load(name)
         solution = srm.simulate(mechanism, t_end, rtol=1e-7, backend="kernel")
         system = make_system(mechanism)
         t = np.linspace(0.0, t_end, 137)
@@ -158,7 +159,7 @@ def test_dense_output_of_the_same_steps_agrees_to_rounding() -> None:
 
 
 def test_force_elements_friction_damping_and_a_controller_act_alike() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     model = mechanism.model.copy()
     model.damping[:] = 0.05
     model.friction[:] = 0.02
@@ -193,7 +194,7 @@ def test_events_end_runs_alike() -> None:
         return float(np.sin(q[0]))
 
     upright.terminal = 3  # type: ignore[attr-defined]
-    python, compiled = both(srm.load("four_bar"), 10.0, rtol=1e-9, events=upright)
+    python, compiled = both(load("four_bar"), 10.0, rtol=1e-9, events=upright)
     assert python.t_events is not None
     assert compiled.t_events is not None
     assert compiled.status == python.status == "event"
@@ -204,7 +205,7 @@ def test_events_end_runs_alike() -> None:
 def test_ticks_tell_every_step() -> None:
     seen: list[float] = []
     solution = srm.simulate(
-        srm.load("four_bar"), 1.0, backend="kernel", progress=lambda t, h, x: seen.append(t)
+        load("four_bar"), 1.0, backend="kernel", progress=lambda t, h, x: seen.append(t)
     )
     assert seen == solution.steps.times[1:].tolist()
 
@@ -219,7 +220,7 @@ def failing(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def test_failures_keep_what_was_computed_and_say_the_same() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     for options in (
         {"controller": failing},
         {"controller": lambda t, q, v: np.full(len(v), np.nan if t > 0.3 else 0.0)},
@@ -238,13 +239,13 @@ def test_an_interrupt_in_a_controller_keeps_the_run() -> None:
             raise KeyboardInterrupt
         return np.zeros_like(v)
 
-    solution = srm.simulate(srm.load("four_bar"), 5.0, backend="kernel", controller=interrupting)
+    solution = srm.simulate(load("four_bar"), 5.0, backend="kernel", controller=interrupting)
     assert solution.status == "interrupted"
     assert 0.3 < solution.t[-1] <= 0.5
 
 
 def test_runs_in_threads_do_not_disturb_each_other() -> None:
-    mechanism = srm.load("slider_crank_whirl")
+    mechanism = load("slider_crank_whirl")
     alone = srm.simulate(mechanism, 5.0, rtol=1e-9, backend="kernel").q[-1]
     ends: list[np.ndarray] = []
 
@@ -279,7 +280,7 @@ def test_the_interpreter_is_free_while_the_kernel_runs(monkeypatch: pytest.Monke
             during[0] += counted[0] - before
 
     monkeypatch.setattr(CompiledRun, "advance", watched)
-    mechanism = srm.load("spatial_dead_point")
+    mechanism = load("spatial_dead_point")
     thread = threading.Thread(target=count)
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1000.0)  # s: who holds the lock is not asked for it
@@ -304,7 +305,7 @@ def test_a_run_whose_controller_leads_back_to_it_is_collected() -> None:
             return np.zeros_like(v)
 
     plant = Plant()
-    plant.solution = srm.simulate(srm.load("four_bar"), 0.2, backend="kernel", controller=plant)
+    plant.solution = srm.simulate(load("four_bar"), 0.2, backend="kernel", controller=plant)
     plant.solution(0.1)
     alive = weakref.ref(plant)
     del plant
@@ -315,17 +316,17 @@ def test_a_run_whose_controller_leads_back_to_it_is_collected() -> None:
 def test_the_backend_is_named_and_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SRM_MBS_BACKEND", "python")
     assert srm.backend() == "python"
-    assert srm.simulate(srm.load("four_bar"), 0.1).settings.backend == "python"
+    assert srm.simulate(load("four_bar"), 0.1).settings.backend == "python"
     monkeypatch.delenv("SRM_MBS_BACKEND")
     assert srm.backend() == "kernel"
-    assert srm.simulate(srm.load("four_bar"), 0.1).settings.backend == "kernel"
-    assert srm.simulate(srm.load("four_bar"), 0.1, backend="python").settings.backend == "python"
-    assert srm.simulate(srm.load("four_bar"), 0.1, method="srm").settings.backend == "python"
+    assert srm.simulate(load("four_bar"), 0.1).settings.backend == "kernel"
+    assert srm.simulate(load("four_bar"), 0.1, backend="python").settings.backend == "python"
+    assert srm.simulate(load("four_bar"), 0.1, method="srm").settings.backend == "python"
 
 
 @pytest.mark.parametrize("name", [name for name, _ in MODELS])
 def test_the_first_step_agrees(name: str) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     system = make_system(mechanism)
     method = srm.PSRM()
     rng = np.random.default_rng(3)

@@ -12,6 +12,7 @@ from scipy.optimize import fsolve
 
 import srm_mbs as srm
 from srm_mbs.systems.loops import closure_errors
+from tests.bundled import load
 from tests.mechanisms import along_x, floating_slider_crank, rod
 from tests.reduced import G, index_one, n_four_bar, regular_slider_crank
 
@@ -113,7 +114,7 @@ def test_a_spinning_top_has_the_derivatives_of_eulers_equations() -> None:
     ],
 )
 def test_a_moving_loop_has_the_derivatives_of_its_reduced_model(name: str, field) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     crank = mechanism.joint_names[0]
     found = srm.linearise(mechanism, coordinates=crank)
     state = np.array([mechanism.q0[0], mechanism.v0[0]])
@@ -132,7 +133,7 @@ def test_the_differences_have_order_six() -> None:
 
 
 def test_inputs_push_as_torques_of_a_controller_do() -> None:
-    mechanism = srm.load("five_bar")
+    mechanism = load("five_bar")
     found = srm.linearise(mechanism, inputs=["crank_left", "crank_right"])
     for k, name in enumerate(found.inputs):
         torque = np.zeros(mechanism.model.nv)
@@ -142,7 +143,7 @@ def test_inputs_push_as_torques_of_a_controller_do() -> None:
 
 
 def test_a_controller_closes_the_loop() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     still = srm.equilibrium(mechanism, search="nearest").q
     plant = srm.linearise(mechanism, still, inputs="crank", coordinates="crank")
     assert plant.eigenvalues.real.max() > 1.0
@@ -164,7 +165,7 @@ def test_friction_damps_with_its_slope_at_rest() -> None:
 
 
 def test_mode_shapes_are_closed_motions_that_can_be_played(tmp_path: Path) -> None:
-    mechanism = srm.load("five_bar")
+    mechanism = load("five_bar")
     found = srm.linearise(mechanism, srm.equilibrium(mechanism).q)
     motion = found.mode_shape(2, amplitude=0.4)
     g, _ = closure_errors(mechanism.model, mechanism.loops, motion.q, np.zeros((121, 4)))
@@ -184,7 +185,7 @@ def test_mode_shapes_are_closed_motions_that_can_be_played(tmp_path: Path) -> No
 
 
 def test_what_cannot_be_linearised_is_refused() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     with pytest.raises(srm.InputError, match="not consistent"):
         srm.linearise(mechanism, mechanism.q0 + 0.1)
     with pytest.raises(srm.InputError, match="not consistent"):
@@ -197,7 +198,7 @@ def test_what_cannot_be_linearised_is_refused() -> None:
     singular = floating_slider_crank()
     with pytest.raises(srm.InputError, match="it is singular"):
         srm.linearise(singular, singular.q0)
-    reach = srm.linearise(srm.load("five_bar"))
+    reach = srm.linearise(load("five_bar"))
     with pytest.raises(srm.InputError, match="amplitude of 3"):
         reach.mode_shape(0, amplitude=3.0)
     for step in (0.0, -1e-3, np.nan, "small"):

@@ -21,6 +21,7 @@ from srm_mbs.playback import serve
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.systems.multibody import make_system
 from tests.browsing import opened
+from tests.bundled import load
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +44,7 @@ SETTLE = """async () => {
 
 @pytest.mark.browser
 def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 1.5)
     data = mechanism.model.createData()
     with (
@@ -70,7 +71,7 @@ def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
 
 @pytest.mark.browser
 def test_the_live_panel_has_the_drift_and_the_energy_since_the_first_step(browser: Any) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 1.5, rtol=1e-4)
     read = solution.at([0.1, 1.1])
     # Off the closures, as far as none of the run is: the digits are those of the error.
@@ -101,7 +102,7 @@ def test_the_live_panel_has_the_drift_and_the_energy_since_the_first_step(browse
 
 @pytest.mark.parametrize("backend", ["auto", "python"])
 def test_a_run_that_is_watched_is_the_same_and_takes_hardly_longer(backend: str) -> None:
-    mechanism = srm.load("jansen_walker")
+    mechanism = load("jansen_walker")
     compiled = srm.backend() == "kernel" and backend == "auto"
     t_end = 20.0 if compiled else 1.0
     alone = srm.simulate(mechanism, t_end, backend=backend)
@@ -129,7 +130,7 @@ def test_a_run_that_is_watched_is_the_same_and_takes_hardly_longer(backend: str)
 def test_states_are_shown_as_often_as_the_share_of_the_time_allows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     state = np.concatenate([mechanism.q0, mechanism.v0])
     now = 100.0
     shown = []
@@ -173,7 +174,7 @@ def test_a_server_that_dies_ends_the_view_and_not_the_run(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("srm_mbs.live.PATIENCE", 0.2)
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     state = np.concatenate([mechanism.q0, mechanism.v0])
     with srm.LiveView(mechanism, open_browser=False) as view:
         view(0.0, 0.0, state)
@@ -188,7 +189,7 @@ def test_a_server_that_dies_ends_the_view_and_not_the_run(
 
 
 def test_a_server_that_is_gone_is_an_input_error_with_another_way_to_see_the_run() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 0.2)
     with srm.LiveView(mechanism, open_browser=False) as view:
         view.visualizer.window.server_proc.kill()
@@ -204,7 +205,7 @@ def test_a_server_that_answered_too_late_still_plays_the_run(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("srm_mbs.live.PATIENCE", 0.05)
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 0.2)
     state = solution.steps.states[-1]
     with srm.LiveView(mechanism, open_browser=False) as view:
@@ -233,7 +234,7 @@ def test_a_view_whose_server_does_not_answer_stops_it_and_says_so(
     monkeypatch.setattr("srm_mbs.live.serve", stopped)
     monkeypatch.setattr("srm_mbs.live.REPLY_TIME", 0.05)
     with pytest.raises(srm.InputError, match="meshcat's server does not answer: "):
-        srm.LiveView(srm.load("four_bar"), open_browser=False)
+        srm.LiveView(load("four_bar"), open_browser=False)
     assert served[0].window.server_proc.poll() is not None
 
 
@@ -254,5 +255,5 @@ def test_a_socket_that_cannot_be_opened_is_an_input_error_and_leaves_no_server(
     monkeypatch.setattr("srm_mbs.playback.start_server", start)
     monkeypatch.setattr("meshcat.visualizer.ViewerWindow.connect_zmq", refuse)
     with pytest.raises(srm.InputError, match="Too many open files"):
-        srm.LiveView(srm.load("four_bar"), open_browser=False)
+        srm.LiveView(load("four_bar"), open_browser=False)
     assert started[0][0].poll() is not None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from tests.bundled import load
 
 BACKENDS = ["python", pytest.param("auto", id="whatever is there")]
 SPEEDS = np.linspace(0.8, 2.0, 4)
@@ -30,7 +31,7 @@ def agree_on_every_passage(run: srm.Solution, reference: srm.Solution) -> None:
 def test_every_passage_stays_on_its_branch(
     name: str, t_end: float, passages: int, error: float, backend: str
 ) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     reference = srm.simulate(mechanism, t_end, rtol=1e-10)
     assert len(reference.crossings) == passages
     t = np.linspace(0.0, t_end, 101)
@@ -46,7 +47,7 @@ def test_every_passage_stays_on_its_branch(
     ["slider_crank_whirl", "parallelogram", "n_four_bar_1", "spatial_dead_point"],
 )
 def test_start_speeds_do_not_matter(name: str) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     for factor in SPEEDS:
         start = {"v0": factor * mechanism.v0}
         reference = srm.simulate(mechanism, 6.0, rtol=1e-9, **start)
@@ -57,7 +58,7 @@ def test_start_speeds_do_not_matter(name: str) -> None:
 @pytest.mark.parametrize("name", ["n_four_bar_1", "parallelogram"])
 @pytest.mark.parametrize("tableau", ["dopr54", "tvd32"])
 def test_lower_orders_pass_at_1e_3(name: str, tableau: str) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     reference = srm.simulate(mechanism, 6.0, rtol=1e-9)
     run = srm.simulate(mechanism, 6.0, rtol=1e-3, tableau=tableau)
     agree_on_every_passage(run, reference)

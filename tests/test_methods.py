@@ -13,6 +13,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.methods.regularisation import parse_eps, real_stability_limit
 from tests import reduced
+from tests.bundled import load
 from tests.convergence import observed_order, turning
 
 COARSE = (2e-2, 1e-2, 5e-3)
@@ -75,7 +76,7 @@ def test_exact_sweeps_pass_singular_configurations_and_follow_the_tolerance(
     method: srm.PSRM, bounds: tuple[float, float]
 ) -> None:
     for tol, bound in zip((1e-5, 1e-7), bounds):
-        solution = srm.simulate(srm.load("slider_crank"), 5.0, method=method, rtol=tol, atol=tol)
+        solution = srm.simulate(load("slider_crank"), 5.0, method=method, rtol=tol, atol=tol)
         assert solution.success, solution.message
         assert len(solution.crossings) == 2
         assert crank_error(solution, 5.0) < bound
@@ -85,7 +86,7 @@ def test_exact_sweeps_pass_singular_configurations_and_follow_the_tolerance(
     "method", [srm.SRM("tvd32", 3), srm.SRM("tvd32", 3, restart=True, carry=True)], ids=str
 )
 def test_srm_passes_singular_configurations_with_the_step_of_the_thesis(method: srm.SRM) -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 2.0, method=method, step=5e-3)
+    solution = srm.simulate(load("slider_crank"), 2.0, method=method, step=5e-3)
     assert solution.success
     assert crank_error(solution, 2.0) < 1e-3
     assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < 1e-3
@@ -110,7 +111,7 @@ def test_adaptive_sweeps_pass_a_singular_configuration_and_follow_the_tolerance(
 ) -> None:
     """Nothing is singular about the step size there: at 1e-5 SRM used to stall at the passage."""
     for tol, bound in zip((1e-4, 1e-5), bounds):
-        solution = srm.simulate(srm.load("slider_crank"), 1.6, method=method, rtol=tol, atol=tol)
+        solution = srm.simulate(load("slider_crank"), 1.6, method=method, rtol=tol, atol=tol)
         assert solution.success, solution.message
         assert len(solution.crossings) == 1
         assert crank_error(solution, 1.6) < bound
@@ -136,7 +137,7 @@ def test_adaptive_sweeps_meet_no_impasse_where_the_thesis_control_does(
 ) -> None:
     """Its estimate compared two sweeps' trajectories and stalled near t = 34.5."""
     for tol, bound in zip((1e-4, 1e-5), bounds):
-        solution = srm.simulate(srm.load("slider_crank"), 40.0, method=method, rtol=tol, atol=tol)
+        solution = srm.simulate(load("slider_crank"), 40.0, method=method, rtol=tol, atol=tol)
         assert solution.success, solution.message
         assert crank_error(solution, 40.0) < bound
         assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < bound
@@ -161,7 +162,7 @@ def test_orders_hold_through_spatial_dead_points(
 ) -> None:
     """Curved branches: a stage evaluated off them would see a null space turned by its error over
     its distance, which does not fall with the step."""
-    mechanism = srm.load("spatial_dead_point")
+    mechanism = load("spatial_dead_point")
     reference = srm.simulate(mechanism, 1.5, rtol=1e-12, atol=1e-12)
     assert len(reference.crossings) == 2
     errors = []
@@ -180,7 +181,7 @@ def test_a_mechanism_that_turns_in_many_short_steps_is_reported(
     monkeypatch.setattr("srm_mbs.methods.branch.NEAR", 0.0)
     monkeypatch.setattr("srm_mbs.methods.iterated.LASTS", 0.0)
     method = srm.PSRM("dopr54", correction="sweep", interpolation="linear")
-    solution = srm.simulate(srm.load("slider_crank"), 1.5, method=method, rtol=1e-4, atol=1e-4)
+    solution = srm.simulate(load("slider_crank"), 1.5, method=method, rtol=1e-4, atol=1e-4)
     assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() > 0.1
     assert "the velocity turned" in solution.message
 
@@ -192,9 +193,7 @@ LINEAR = srm.PSRM("dopr54", correction="sweep", interpolation="linear")
 def test_constraint_errors_of_restarted_sweeps_stay_near_the_tolerance(tol: float) -> None:
     """They last for about eps, many steps: what a step adds says little about what is left.
     Counted as it is, it left closure rates of 90 and 123 tolerances; some 7 remain."""
-    solution = srm.simulate(
-        srm.load("slider_crank_regular"), 3.0, method=LINEAR, rtol=tol, atol=tol
-    )
+    solution = srm.simulate(load("slider_crank_regular"), 3.0, method=LINEAR, rtol=tol, atol=tol)
     assert solution.success
     assert solution.drift[:, 1].max() < 12.0 * tol
 
@@ -205,8 +204,8 @@ def test_two_sweeps_with_linear_interpolation_pass_singular_configurations(
     tol: float, error: float
 ) -> None:
     """To t = 70, 33 passages: they stopped in the 24th with steps of 1e-11 s."""
-    solution = srm.simulate(srm.load("slider_crank"), 70.0, method=LINEAR, rtol=tol)
-    reference = srm.simulate(srm.load("slider_crank"), 70.0, rtol=1e-11)
+    solution = srm.simulate(load("slider_crank"), 70.0, method=LINEAR, rtol=tol)
+    reference = srm.simulate(load("slider_crank"), 70.0, rtol=1e-11)
     assert solution.success
     assert "turned" not in solution.message
     assert len(solution.crossings) == len(reference.crossings)
@@ -217,7 +216,7 @@ def test_two_sweeps_with_linear_interpolation_pass_singular_configurations(
 
 def test_a_run_says_how_far_sweeps_with_own_histories_are_off_the_closures() -> None:
     """A floor of order eps^m: no step mends it, so the run goes on and says so."""
-    four_bar = srm.load("four_bar")
+    four_bar = load("four_bar")
     own = srm.simulate(four_bar, 1.0, method=srm.SRM("tvd32", 3, eps=0.01), rtol=1e-4, atol=1e-4)
     assert own.success
     assert "off the constraints by up to" in own.message
@@ -292,7 +291,7 @@ def test_sweeps_evaluate_the_extra_stages_of_dense_output_in_the_step() -> None:
 
 def test_a_run_with_sweeps_is_saved_with_its_dense_output(tmp_path: Any) -> None:
     method = srm.PSRM("dop853", correction="fused")
-    solution = srm.simulate(srm.load("four_bar"), 0.3, method=method)
+    solution = srm.simulate(load("four_bar"), 0.3, method=method)
     solution.save(tmp_path / "run.npz")
     again = srm.load_solution(tmp_path / "run.npz")
     assert np.array_equal(again(0.123)[0], solution(0.123)[0])
@@ -359,7 +358,7 @@ def test_srm_refuses_what_makes_no_sense(options: dict[str, Any], words: str) ->
 
 
 def test_open_chains_run_with_any_method() -> None:
-    chain = srm.load("pendulum_chain")
+    chain = load("pendulum_chain")
     reference = srm.simulate(chain, 0.5, rtol=1e-9)
     for method in (srm.SRM("erk4"), srm.PSRM("erk4", correction="sweep")):
         solution = srm.simulate(chain, 0.5, method=method, step=5e-3)

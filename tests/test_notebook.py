@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from tests.browsing import bodies_in, opened
+from tests.browsing import LARGE, bodies_in, opened
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOK = ROOT / "examples" / "slider_crank_notebook.ipynb"
@@ -83,7 +83,7 @@ def test_the_view_in_the_notebook_shows_the_bodies_where_forward_kinematics_puts
     solution = srm.simulate(srm.load("slider_crank"), 10.0, rtol=1e-8)
     model = solution.mechanism.model
     data = model.createData()
-    with opened(browser, page.as_uri()) as shown:
+    with opened(browser, page.as_uri(), LARGE) as shown:
         view = shown.frames[1]
         box = shown.locator("iframe").bounding_box()
         for t in (0.0, 2.5, 10.0):

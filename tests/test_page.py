@@ -23,6 +23,7 @@ from srm_mbs.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
 from srm_mbs.systems.driven import constraint_errors
 from srm_mbs.web_page import make_page
 from tests.browsing import opened
+from tests.bundled import load
 from tests.mechanisms import floating_ring
 from tests.pacing import assert_pace
 
@@ -40,7 +41,7 @@ def place(solution: srm.Solution, t: float, anchor: srm.Anchor) -> Any:
 
 @pytest.fixture(scope="module")
 def slider_crank() -> srm.Solution:
-    return srm.simulate(srm.load("slider_crank"), 8.0)
+    return srm.simulate(load("slider_crank"), 8.0)
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +254,7 @@ def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[
 def test_panel_and_slider_tell_the_time_of_the_run_with_the_digits_that_it_needs(
     browser: Any, tmp_path: Path, span: tuple[float, float], panel: str, clock: str
 ) -> None:
-    solution = srm.simulate(srm.load("slider_crank"), span[1], t0=span[0])
+    solution = srm.simulate(load("slider_crank"), span[1], t0=span[0])
     solution.export_html(tmp_path / "page.html")
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         page.evaluate("seek(0.25 * viewer.animator.duration)")
@@ -318,7 +319,7 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
     browser: Any,
     tmp_path: Path,
 ) -> None:
-    solution = srm.simulate(srm.load("stewart_platform"), 1.0)
+    solution = srm.simulate(load("stewart_platform"), 1.0)
     solution.export_html(tmp_path / "page.html", fps=64.0, reactions=True)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         for t in (0.0, 0.515625, 1.0):
@@ -348,7 +349,7 @@ def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
     browser: Any,
     tmp_path: Path,
 ) -> None:
-    solution = srm.simulate(srm.load("spatial_four_bar"), 1.0, rtol=1e-4)
+    solution = srm.simulate(load("spatial_four_bar"), 1.0, rtol=1e-4)
     solution.export_html(tmp_path / "page.html", fps=64.0, gaps=True)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         words = page.locator("#notes").inner_text()
@@ -362,7 +363,7 @@ def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
 @pytest.fixture(scope="module")
 def let_go_and_tied() -> srm.Solution:
     """The slider-crank, whose pin lets go at 0.5 s and which a rope ties at 0.9 s."""
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     mechanism = srm.Mechanism(mechanism.model, mechanism.loops, mechanism.q0, mechanism.v0)
     freed = mechanism.without_loop("pin")
     post, end = srm.Anchor("world", xyz=(0.0, 0.0, -5.0)), srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
@@ -444,7 +445,7 @@ def test_a_motion_that_was_not_simulated_has_its_time_only(
     browser: Any,
     tmp_path: Path,
 ) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     run = srm.simulate(mechanism, 1.0)
     srm.JointMotion(mechanism, run.t, run.q).export_html(tmp_path / "page.html", fps=20.0)
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
@@ -454,7 +455,7 @@ def test_a_motion_that_was_not_simulated_has_its_time_only(
 
 @pytest.mark.parametrize("name", ["slider_crank", "spatial_four_bar", "bricard", "delta_robot"])
 def test_gaps_are_as_large_as_the_errors_of_the_rows_of_length(name: str) -> None:
-    solution = srm.simulate(srm.load(name), 0.3)
+    solution = srm.simulate(load(name), 0.3)
     q = np.array([solution.mechanism.model.nq * [0.0]]) + solution.q[-1]
     q[0, -1] += 0.03  # opened: rounding would show nothing
     opened_loops = srm.JointMotion(solution.mechanism, np.zeros(1), q)
@@ -501,7 +502,7 @@ def test_what_cannot_be_traced_is_an_input_error(
 def test_reactions_and_gaps_of_an_open_chain_and_reactions_of_a_prescribed_motion_are_refused(
     tmp_path: Path, slider_crank: srm.Solution
 ) -> None:
-    pendulum = srm.simulate(srm.load("simple_pendulum"), 0.1)
+    pendulum = srm.simulate(load("simple_pendulum"), 0.1)
     for what in ("reactions", "gaps"):
         with pytest.raises(srm.InputError, match=f"no closures with {what}"):
             pendulum.export_html(tmp_path / "page.html", **{what: True})
@@ -573,11 +574,11 @@ def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera
 
 def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
     for name, t_end, named in [("n_four_bar_2", 2.0, True), ("n_four_bar_13", 2.0, False)]:
-        solution = srm.simulate(srm.load(name), t_end)
+        solution = srm.simulate(load(name), t_end)
         about = read_out(solution, np.linspace(0.0, t_end, 5))
         assert len(about["passages"]) == len(solution.crossings) > 0
         assert all((": " in passage["text"]) == named for passage in about["passages"])
-    solution = srm.simulate(srm.load("slider_crank"), 240.0)
+    solution = srm.simulate(load("slider_crank"), 240.0)
     assert len(solution.crossings) > 100
     texts = [passage["text"] for passage in read_out(solution, np.linspace(0, 240, 5))["passages"]]
     assert not any(": " in text for text in texts)

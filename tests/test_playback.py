@@ -19,6 +19,7 @@ from srm_mbs.playback import close, export_html, play
 from srm_mbs.scene import choose_view, sample_motion
 from srm_mbs.visuals import Box, Cylinder, Mesh, Sphere, visuals_of
 from tests.browsing import bodies_in, opened, placements
+from tests.bundled import load
 from tests.pacing import assert_pace
 
 MEGABYTE = 1e6
@@ -113,7 +114,7 @@ def arm(folder: Path, description: str = "", tip: str = '<sphere radius="0.03"/>
 
 def bare(name: str) -> srm.Mechanism:
     """A bundled mechanism without its pictures."""
-    loaded = srm.load(name)
+    loaded = load(name)
     return srm.Mechanism(loaded.model, loaded.loops, loaded.q0, loaded.v0, name=name)
 
 
@@ -123,12 +124,12 @@ def moving(mechanism: srm.Mechanism) -> tuple[int, ...]:
 
 @pytest.fixture(scope="module")
 def slider_crank() -> srm.Solution:
-    return srm.simulate(srm.load("slider_crank"), 100.0)
+    return srm.simulate(load("slider_crank"), 100.0)
 
 
 @pytest.fixture(scope="module")
 def spatial_four_bar() -> srm.Solution:
-    return srm.simulate(srm.load("spatial_four_bar"), 2.0)
+    return srm.simulate(load("spatial_four_bar"), 2.0)
 
 
 # Key frames
@@ -152,7 +153,7 @@ def test_key_frames_equal_the_forward_kinematics_of_the_dense_output(
 
 
 def test_key_frames_are_uniform_and_reach_from_the_start_to_the_end_of_the_run() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.03)
+    solution = srm.simulate(load("four_bar"), 1.03)
     motion = sample_motion(solution, moving(solution.mechanism), 60.0)
     assert motion.times[0] == 0.0
     assert motion.times[-1] == 1.03
@@ -168,7 +169,7 @@ def test_a_run_of_whole_frames_gets_exactly_those(slider_crank: srm.Solution) ->
 
 
 def test_quaternions_turn_the_short_way_between_key_frames(slider_crank: srm.Solution) -> None:
-    mechanism = srm.load("slider_crank_whirl")
+    mechanism = load("slider_crank_whirl")
     for solution in (slider_crank, srm.simulate(mechanism, 5.0)):
         quaternions = sample_motion(solution, (1, 2), 60.0).quaternions
         assert np.all(np.sum(quaternions[1:] * quaternions[:-1], axis=2) > 0.9)
@@ -195,7 +196,7 @@ def halfway(motion: scene.Motion) -> tuple[Any, Any, Any]:
 
 
 def test_bodies_of_a_short_fast_run_are_seen_in_their_places_between_key_frames() -> None:
-    solution = srm.simulate(srm.load("squeezing_mechanism"), 0.03)  # two turns of the crank
+    solution = srm.simulate(load("squeezing_mechanism"), 0.03)  # two turns of the crank
     joints = moving(solution.mechanism)
     motion = sample_motion(solution, joints, 60.0)
     size = np.ptp(motion.positions.reshape(-1, 3), axis=0).max()
@@ -224,7 +225,7 @@ def test_a_wheel_of_whole_turns_between_frames_does_not_stand_still() -> None:
 
 
 def test_a_time_that_is_asked_for_is_a_key_frame_and_the_others_stay() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0)
+    solution = srm.simulate(load("four_bar"), 1.0)
     motion = sample_motion(solution, (1, 2, 3), 10.0, extra=[0.123, 0.5, 1.0])
     plain = sample_motion(solution, (1, 2, 3), 10.0)
     assert set(motion.times) == {*plain.times, 0.123}
@@ -357,7 +358,7 @@ def screen(view: scene.View, points: Any) -> Any:
 
 
 def test_planar_mechanisms_are_seen_from_minus_y_with_z_up() -> None:
-    view = choose_view(srm.load("four_bar"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0]]))
+    view = choose_view(load("four_bar"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0]]))
     assert np.allclose(view.axes, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     assert np.allclose(view.target, [1.0, 0.0, 0.5])
 
@@ -371,7 +372,7 @@ def test_mechanisms_planar_in_x_y_are_seen_from_above() -> None:
 
 
 def test_spatial_mechanisms_are_seen_from_three_quarters_with_z_up() -> None:
-    view = choose_view(srm.load("spatial_four_bar"), np.zeros((1, 3)))
+    view = choose_view(load("spatial_four_bar"), np.zeros((1, 3)))
     assert np.all(np.abs(view.axes[2]) > 0.3)
     assert view.axes[0, 2] == pytest.approx(0.0, abs=1e-12)
     assert view.axes[1, 2] > 0.0
@@ -379,7 +380,7 @@ def test_spatial_mechanisms_are_seen_from_three_quarters_with_z_up() -> None:
 
 @pytest.mark.parametrize("name", ["four_bar", "spatial_four_bar", "pendulum_chain"])
 def test_the_whole_motion_fits_in_the_window_and_fills_it(name: str) -> None:
-    solution = srm.simulate(srm.load(name), 3.0)
+    solution = srm.simulate(load(name), 3.0)
     visuals = visuals_of(solution.mechanism)
     points = []
     for q in solution(np.linspace(0.0, 3.0, 200))[0]:
@@ -394,7 +395,7 @@ def test_the_whole_motion_fits_in_the_window_and_fills_it(name: str) -> None:
 
 @pytest.mark.parametrize("size", [1e-6, 1e-3, 1e6])
 def test_the_camera_stands_as_near_to_a_small_mechanism_as_its_size_asks_for(size: float) -> None:
-    mechanism, points = srm.load("four_bar"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0]])
+    mechanism, points = load("four_bar"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0]])
     near, usual = choose_view(mechanism, size * points), choose_view(mechanism, points)
     assert near.distance / size == pytest.approx(usual.distance)
 
@@ -412,7 +413,7 @@ def test_the_page_of_a_long_run_is_one_file_below_five_megabytes(
 
 
 def test_the_page_of_many_bodies_is_below_five_megabytes(tmp_path: Path) -> None:
-    solution = srm.simulate(srm.load("n_four_bar_40"), 10.0)
+    solution = srm.simulate(load("n_four_bar_40"), 10.0)
     export_html(solution, tmp_path / "page.html")
     assert (tmp_path / "page.html").stat().st_size < 5.0 * MEGABYTE
 
@@ -454,7 +455,7 @@ def test_a_server_that_does_not_start_is_an_input_error(
 
 
 def test_a_run_that_fails_at_once_is_shown_as_it_stood(tmp_path: Path) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 1.0, controller=lambda t, q, v: np.full(3, np.nan))
     assert len(solution.t) == 1
     export_html(solution, tmp_path / "page.html")
@@ -504,10 +505,10 @@ def test_play_serves_until_it_is_interrupted_and_leaves_nothing_behind(
 @pytest.fixture(scope="module")
 def exported(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, Any]]:
     """A page of the slider-crank, and its run of whole 1/64 s, exact in single precision."""
-    solution = srm.simulate(srm.load("slider_crank"), 8.0)
+    solution = srm.simulate(load("slider_crank"), 8.0)
     path = tmp_path_factory.mktemp("page") / "page.html"
     export_html(solution, path, fps=64.0)
-    with opened(browser, path.as_uri()) as page:
+    with opened(browser, path.as_uri(), (600, 400)) as page:
         yield page, solution
 
 
@@ -524,11 +525,11 @@ def test_scrubbing_puts_every_body_where_forward_kinematics_does(exported: Any) 
 
 @pytest.mark.browser
 def test_only_bodies_that_move_have_key_frames(browser: Any, tmp_path: Path) -> None:
-    mechanism = srm.load("pendulum_chain")
+    mechanism = load("pendulum_chain")
     q = np.tile(mechanism.q0, (9, 1))
     q[:, mechanism.joint(mechanism.joint_names[-1]).idx_q] += np.linspace(0.0, 0.5, 9)
     srm.JointMotion(mechanism, np.linspace(0.0, 1.0, 9), q).export_html(tmp_path / "page.html")
-    with opened(browser, (tmp_path / "page.html").as_uri(), (300, 200)) as page:
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         moved = page.evaluate("animator.actions.map(a => a.getRoot().name)")
         keys = page.evaluate("animator.actions.map(a => a._clip.tracks.map(t => t.times.length))")
     assert moved == [mechanism.joint_names[-1]]
@@ -637,7 +638,7 @@ def test_the_picture_shows_the_coloured_bodies_on_a_light_background(exported: A
 def test_a_page_without_motion_shows_the_mechanism_and_no_slider(
     browser: Any, tmp_path: Path
 ) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 1.0, controller=lambda t, q, v: np.full(3, np.nan))
     export_html(solution, tmp_path / "page.html")
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:

@@ -16,6 +16,7 @@ import srm_mbs as srm
 from srm_mbs.plotting import KINDS, phase, sampling, state, style
 from srm_mbs.plotting.components import rotation_vectors
 from srm_mbs.solution import Solution
+from tests.bundled import load
 from tests.daes import START_TWO, problem_two, solution_two
 from tests.mechanisms import floating_ring
 from tests.test_cli import error_line, run
@@ -24,17 +25,17 @@ from tests.test_plots import fails_at, legend, line, marked_times, titles
 
 @pytest.fixture(scope="module")
 def slider_crank() -> Solution:
-    return srm.simulate(srm.load("slider_crank"), 3.0)
+    return srm.simulate(load("slider_crank"), 3.0)
 
 
 @pytest.fixture(scope="module")
 def stewart() -> Solution:
-    return srm.simulate(srm.load("stewart_platform"), 0.2)
+    return srm.simulate(load("stewart_platform"), 0.2)
 
 
 @pytest.fixture(scope="module")
 def walker() -> Solution:
-    return srm.simulate(srm.load("jansen_walker"), 0.1)
+    return srm.simulate(load("jansen_walker"), 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def ring() -> Solution:
 
 @pytest.fixture(scope="module")
 def driven() -> Solution:
-    free = srm.load("slider_crank")
+    free = load("slider_crank")
     crank = srm.Drive(srm.ConstantSpeed(4.0), joint="crank")
     mechanism = srm.Mechanism(free.model, free.loops, drives=(crank,), q0=free.q0, v0=[4.0, -8.0])
     return srm.simulate(mechanism, 0.6)
@@ -53,7 +54,7 @@ def driven() -> Solution:
 @pytest.fixture(scope="module")
 def let_go() -> Solution:
     """A four-bar whose pin lets go at 0.8 s."""
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     freed = mechanism.without_loop("pin")
     event = srm.Event(lambda t, q, v: t - 0.8, action=lambda t, q, v: srm.Switch(freed))
     return srm.simulate(mechanism, 1.2, events=[event])
@@ -78,7 +79,7 @@ def test_every_kind_of_every_bundled_mechanism_is_drawn_without_warnings(
     monkeypatch.setattr(sampling, "LEAST", 16)
     monkeypatch.setattr(state, "MOST_ROWS", 2)
     monkeypatch.setattr(phase, "MOST_PORTRAITS", 1)
-    solution = srm.simulate(srm.load(name), 0.01)
+    solution = srm.simulate(load(name), 0.01)
     for kind in KINDS:
         if kind == "reactions" and not solution.mechanism.constrained:
             continue
@@ -92,7 +93,7 @@ def test_every_kind_of_every_bundled_mechanism_is_drawn_without_warnings(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_unfinished_runs_are_drawn_as_far_as_they_went(kind: str) -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 2.0, controller=fails_at(0.5))
+    solution = srm.simulate(load("slider_crank"), 2.0, controller=fails_at(0.5))
     assert solution.status == "failed"
     figure = solution.plot(kind=kind)
     assert f"failed at t = {solution.t[-1]:.6g} s" in figure.get_suptitle()
@@ -140,7 +141,7 @@ def test_options_that_cannot_be_are_refused(
 
 
 def test_names_with_dollars_and_underscores_are_drawn_as_they_are() -> None:
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     model = mechanism.model.copy()
     model.names[1], model.names[2] = "_a$b", "c$d"
     loop = srm.LoopClosure("point_on_line", *mechanism.loops[0].anchors, (1.0, 0.0, 0.0), name="_$")
@@ -171,7 +172,7 @@ def test_the_state_of_joints_is_that_of_the_run_with_units(slider_crank: Solutio
 
 
 def test_prismatic_joints_are_in_metres() -> None:
-    solution = srm.simulate(srm.load("stewart_platform"), 0.2)
+    solution = srm.simulate(load("stewart_platform"), 0.2)
     axes = solution.plot(kind="state", joints=["leg_2"]).axes
     assert [each.get_ylabel() for each in axes] == ["leg_2\n(m)", "(m/s)"]
 
@@ -217,7 +218,7 @@ def test_the_state_of_a_large_mechanism_says_what_it_leaves_out(stewart: Solutio
 
 
 def test_what_does_not_move_is_a_straight_line_between_round_ticks() -> None:
-    mechanism = srm.load("parallelogram")
+    mechanism = load("parallelogram")
     model = mechanism.model.copy()
     model.gravity = pin.Motion.Zero()
     still = srm.Mechanism(model, mechanism.loops, q0=mechanism.q0)
@@ -227,7 +228,7 @@ def test_what_does_not_move_is_a_straight_line_between_round_ticks() -> None:
 
 
 def test_a_jump_has_both_its_values() -> None:
-    mechanism = srm.load("simple_pendulum")
+    mechanism = load("simple_pendulum")
     kick = srm.Event(lambda t, q, v: t - 0.5, action=lambda t, q, v: (q, v + 3.0))
     solution = srm.simulate(mechanism, 1.0, events=[kick])
     before, after = solution.v[solution.t == 0.5][:, 0]
@@ -269,7 +270,7 @@ def test_what_does_no_work_worth_mentioning_is_in_a_note(let_go: Solution) -> No
 
 
 def test_many_works_are_summed_and_none_is_lost() -> None:
-    base = srm.load("pendulum_chain")
+    base = load("pendulum_chain")
     forces = [
         srm.JointTorque(name, 0.1 * (i + 1), name=f"{name}_{i}")
         for i in range(5)
@@ -306,14 +307,14 @@ def test_reactions_are_the_norms_of_forces_and_moments(driven: Solution) -> None
 
 
 def test_pins_have_no_moments_and_name_what_equilibrium_does_not_determine() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 0.2)
+    solution = srm.simulate(load("four_bar"), 0.2)
     figure = solution.plot(kind="reactions")
     assert titles(figure) == ["(a) forces in the closures"]
     assert "Equilibrium does not determine pin.y: values of least norm." in note(figure)
 
 
 def test_rows_of_one_unit_share_a_panel() -> None:
-    base = srm.load("four_bar")
+    base = load("four_bar")
     hinge = srm.LoopClosure("revolute", *base.loops[0].anchors, (0.0, 1.0, 0.0), name="hinge")
     mechanism = srm.Mechanism(base.model, (hinge,), q0=base.q0, v0=base.v0)
     solution = srm.simulate(mechanism, 0.1)
@@ -328,7 +329,7 @@ def test_rows_of_one_unit_share_a_panel() -> None:
 
 
 def test_couplings_are_drawn_by_the_force_on_their_first_joints() -> None:
-    solution = srm.simulate(srm.load("differential"), 0.2)
+    solution = srm.simulate(load("differential"), 0.2)
     (axes,) = solution.plot(kind="reactions").axes
     t, values = drawn(axes)
     assert legend(axes)[0].replace("\n", " ") == "final_drive, on pinion"
@@ -349,10 +350,10 @@ def test_the_smaller_of_many_reactions_are_named_below(walker: Solution) -> None
 
 
 def test_peaks_beside_singular_passages_are_cut_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 10.0)
+    solution = srm.simulate(load("slider_crank"), 10.0)
     peaked = {name: own.copy() for name, own in solution.reactions.items()}
     peaked["pin"][3, :3] *= 1e4
-    figure = srm.simulate(srm.load("slider_crank"), 10.0).plot(kind="reactions")
+    figure = srm.simulate(load("slider_crank"), 10.0).plot(kind="reactions")
     assert "cut" not in titles(figure)[0]
     monkeypatch.setattr(Solution, "reactions", property(lambda _: peaked))
     monkeypatch.setattr(sampling, "SMOOTH", 1)
@@ -365,13 +366,13 @@ def test_peaks_beside_singular_passages_are_cut_and_said(monkeypatch: pytest.Mon
 
 
 def test_an_open_chain_has_no_reactions_and_says_what_it_has() -> None:
-    solution = srm.simulate(srm.load("pendulum_chain"), 0.1)
+    solution = srm.simulate(load("pendulum_chain"), 0.1)
     with pytest.raises(srm.InputError, match=r'neither closures nor drives.*"state"'):
         solution.plot(kind="reactions")
 
 
 def test_a_run_that_failed_at_its_start_has_no_reactions() -> None:
-    solution = srm.simulate(srm.load("slider_crank"), 1.0, controller=fails_at(0.0))
+    solution = srm.simulate(load("slider_crank"), 1.0, controller=fails_at(0.0))
     with pytest.raises(srm.InputError, match="no power"):
         solution.plot(kind="reactions")
 
@@ -398,7 +399,7 @@ def test_all_kinds_of_steps_have_marks_of_their_own(slider_crank: Solution) -> N
 
 
 def test_rejected_steps_have_error_estimates_above_one() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 2.0)
+    solution = srm.simulate(load("four_bar"), 2.0)
     errors = solution.plot(kind="sigma").axes[2]
     rejected = line(errors, "rejected")
     assert len(rejected.get_ydata()) == solution.stats.rejected > 0
@@ -409,7 +410,7 @@ def test_rejected_steps_have_error_estimates_above_one() -> None:
 def test_steps_in_the_zone_are_marked() -> None:
     quarter = 4.29657624142677449 / 4.0  # a grid point is singular
     options: dict[str, Any] = {"tableau": "dopr54", "placement": "off"}
-    solution = srm.simulate(srm.load("slider_crank"), 2.0, step=quarter / 20, **options)
+    solution = srm.simulate(load("slider_crank"), 2.0, step=quarter / 20, **options)
     assert len(solution.steps.zones) == solution.stats.zone_steps > 0
     figure = solution.plot(kind="sigma")
     assert len(figure.axes) == 2  # fixed steps have no error estimate
@@ -476,13 +477,13 @@ def test_paths_by_default_are_those_of_different_points_that_move(let_go: Soluti
     (axes,) = let_go.plot(kind="path").axes
     assert legend(axes) == ["1 coupler", "2 closure pin", "start", "end"]
     assert [text.get_text() for text in axes.texts] == ["1", "2"]  # for print in grey
-    pendulum = srm.simulate(srm.load("simple_pendulum"), 0.5)
+    pendulum = srm.simulate(load("simple_pendulum"), 0.5)
     (axes,) = pendulum.plot(kind="path").axes
     assert legend(axes)[0].replace("\n", " ") == "centre of mass behind pendulum"
 
 
 def test_a_run_in_which_no_named_point_moves_has_no_picture_of_paths() -> None:
-    failed = srm.simulate(srm.load("four_bar"), 1.0, step=1.0)
+    failed = srm.simulate(load("four_bar"), 1.0, step=1.0)
     assert len(failed.t) == 1
     with pytest.raises(srm.InputError, match="none of the points moves from t = 0 to 0 s"):
         failed.plot(kind="path", points=[srm.Anchor("coupler")])
@@ -514,7 +515,7 @@ def test_marks_upon_each_other_are_drawn_once_and_the_extremes_always() -> None:
 def test_a_long_run_is_drawn_with_few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "COLUMNS", 20)
     monkeypatch.setattr(sampling, "ROWS", 20)
-    solution = srm.simulate(srm.load("slider_crank"), 40.0)
+    solution = srm.simulate(load("slider_crank"), 40.0)
     for kind in ("run", "state", "sigma", "balance"):
         for axes in solution.plot(kind=kind).axes:
             for one in axes.lines:
@@ -623,7 +624,7 @@ def test_a_dae_that_fails_at_its_start_is_drawn() -> None:
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("runs") / "crank.npz"
-    srm.simulate(srm.load("slider_crank"), 0.3).save(path)
+    srm.simulate(load("slider_crank"), 0.3).save(path)
     return path
 
 
@@ -668,7 +669,7 @@ def test_the_help_of_the_command_plot_lists_the_kinds() -> None:
 
 def test_a_loaded_run_with_a_controller_is_drawn_but_for_what_needs_it(tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
-    mechanism = srm.load("slider_crank")
+    mechanism = load("slider_crank")
     srm.simulate(mechanism, 0.2, controller=lambda t, q, v: [np.sin(t), 0.0]).save(path)
     solution = srm.load_solution(path)
     for kind in KINDS:
@@ -682,7 +683,7 @@ def test_a_loaded_run_with_a_controller_is_drawn_but_for_what_needs_it(tmp_path:
 def test_runaway_states_are_drawn_without_warnings() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run's own, of overflow
-        solution = srm.simulate(srm.load("four_bar"), 100.0, step=0.3)
+        solution = srm.simulate(load("four_bar"), 100.0, step=0.3)
     assert not solution.success
     for kind in KINDS:
         figure = solution.plot(kind=kind)

@@ -18,21 +18,22 @@ from matplotlib.lines import Line2D
 import srm_mbs as srm
 from srm_mbs.plotting import panels, run
 from srm_mbs.solution import Solution
+from tests.bundled import load
 
 
 @pytest.fixture(scope="module")
 def slider_crank() -> Solution:
-    return srm.simulate(srm.load("slider_crank"), 5.0, rtol=1e-8)
+    return srm.simulate(load("slider_crank"), 5.0, rtol=1e-8)
 
 
 @pytest.fixture(scope="module")
 def four_bar() -> Solution:
-    return srm.simulate(srm.load("four_bar"), 2.0)
+    return srm.simulate(load("four_bar"), 2.0)
 
 
 @pytest.fixture(scope="module")
 def pendulum_chain() -> Solution:
-    return srm.simulate(srm.load("pendulum_chain"), 1.0)
+    return srm.simulate(load("pendulum_chain"), 1.0)
 
 
 def line(axes: Axes, label: str) -> Line2D:
@@ -75,7 +76,7 @@ def test_title_names_mechanism_method_tableau_and_tolerance(slider_crank: Soluti
 
 
 def test_title_of_a_run_with_fixed_steps_gives_the_step() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 0.1, step=0.01)
+    solution = srm.simulate(load("four_bar"), 0.1, step=0.01)
     assert "fixed step 0.01 s" in solution.plot().get_suptitle()
 
 
@@ -92,7 +93,7 @@ def test_drift_that_is_zero_is_drawn_at_the_floor_of_the_logarithmic_axis(
 
 
 def test_closures_with_alignment_rows_have_drift_in_radians_too() -> None:
-    base = srm.load("four_bar")
+    base = load("four_bar")
     pin = base.loops[0]
     hinge = srm.LoopClosure("revolute", pin.a, pin.b, (0.0, 1.0, 0.0))
     mechanism = srm.Mechanism(base.model, (hinge,), q0=base.q0, v0=base.v0)
@@ -111,7 +112,7 @@ def test_energy_panel_shows_the_change_in_the_power_of_ten_of_its_label(four_bar
 
 
 def test_energy_panel_says_since_when_if_the_first_time_is_not_the_start() -> None:
-    solution = srm.simulate(srm.load("four_bar"), 0.5, t_eval=[0.25, 0.5])
+    solution = srm.simulate(load("four_bar"), 0.5, t_eval=[0.25, 0.5])
     assert titles(solution.plot())[1] == "(b) total energy relative to t = 0.25 s"
 
 
@@ -163,7 +164,7 @@ def test_accepted_steps_are_dots_and_those_that_did_not_stand_are_crosses(
 def test_steps_redone_because_of_a_singular_configuration_have_marks_of_their_own() -> None:
     quarter = 4.29657624142677449 / 4.0  # a grid point is singular
     solution = srm.simulate(
-        srm.load("slider_crank"), 2.0, step=quarter / 20, tableau="dopr54", placement="halved"
+        load("slider_crank"), 2.0, step=quarter / 20, tableau="dopr54", placement="halved"
     )
     axes = solution.plot().axes[3]
     redone = line(axes, "redone")
@@ -175,7 +176,7 @@ def test_steps_redone_because_of_a_singular_configuration_have_marks_of_their_ow
 
 @pytest.mark.parametrize("step", [None, 0.01])
 def test_step_sizes_have_labelled_ticks_also_within_one_decade(step: float | None) -> None:
-    solution = srm.simulate(srm.load("pendulum_chain"), 1.0, step=step)
+    solution = srm.simulate(load("pendulum_chain"), 1.0, step=step)
     axes = solution.plot().axes[-1]
     axes.figure.draw_without_rendering()
     low, high = axes.get_ylim()
@@ -236,7 +237,7 @@ def fails_at(time: float) -> Any:
 def test_unfinished_runs_are_drawn_as_far_as_they_went(
     tmp_path: Path, name: str, time: float, some_steps: bool
 ) -> None:
-    solution = srm.simulate(srm.load(name), 2.0, controller=fails_at(time))
+    solution = srm.simulate(load(name), 2.0, controller=fails_at(time))
     assert (solution.status, solution.stats.steps > 0) == ("failed", some_steps)
     path = tmp_path / "run.png"
     figure = solution.plot(path)
@@ -247,7 +248,7 @@ def test_unfinished_runs_are_drawn_as_far_as_they_went(
 def test_runaway_states_are_drawn_without_warnings(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run's own, of overflow
-        solution = srm.simulate(srm.load("four_bar"), 100.0, step=0.3)
+        solution = srm.simulate(load("four_bar"), 100.0, step=0.3)
     assert not solution.success
     solution.plot(tmp_path / "run.png")
 

@@ -6,7 +6,7 @@ import gc
 import tracemalloc
 from collections.abc import Callable
 from fractions import Fraction
-from functools import cache, partial
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,6 +22,7 @@ from srm_mbs.systems.base import Zone
 from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.systems.projection import PIVOT_ZERO, Projection, cholesky, pivoted_qr
+from tests.bundled import load
 from tests.mechanisms import CLOSED_MODELS, INDEPENDENT_MODELS, rod
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
@@ -29,7 +30,6 @@ assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 SIZES = ((1, 1), (2, 1), (5, 3), (6, 6), (12, 4), (30, 20))
 G = 9.81
 
-load = cache(srm.load)
 
 every_size = pytest.mark.parametrize("size", SIZES, ids=str)
 every_closed_model = pytest.mark.parametrize("name", CLOSED_MODELS)

@@ -16,13 +16,13 @@ from srm_mbs.systems.forces import ForceKinematics
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.multibody import ClosedSystem, make_system
 from srm_mbs.systems.reactions import reactions_at
+from tests.bundled import load
 from tests.mechanisms import ANCHORED_MODELS, CLOSED_MODELS, along_x, floating_ring, rod
 from tests.test_structure import BRICARD_RATES, bricard
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
 G = 9.81
-load = cache(srm.load)
 every_closed_model = pytest.mark.parametrize("name", CLOSED_MODELS)
 every_anchored_model = pytest.mark.parametrize("name", ANCHORED_MODELS)
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,14 +38,26 @@ def run() -> srm.Solution:
     return srm.simulate(srm.load("simple_pendulum"), 1.5)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _needs_chromium() -> None:
-    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    try:
-        with rendering.browser():
-            pass
-    except srm.InputError as error:
-        pytest.skip(str(error))
+class Lent:
+    """A browser that whoever closes it has not got to himself."""
+
+    def __init__(self, browser: Any) -> None:
+        self._browser = browser
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._browser, name)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(autouse=True)
+def one_browser(browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chromium is launched as it always is, for the fixture, and only lent to each picture."""
+    path = browser.browser_type.executable_path
+    chromium = SimpleNamespace(executable_path=path, launch=lambda **options: Lent(browser))
+    playwright = nullcontext(SimpleNamespace(chromium=chromium))
+    monkeypatch.setattr("playwright.sync_api.sync_playwright", lambda: playwright)
 
 
 def pixels(path: Path) -> Any:
@@ -204,8 +218,10 @@ def test_a_film_of_no_length_is_an_input_error(tmp_path: Path, options: dict[str
 def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: Path) -> None:
     saved, first, second = (str(tmp_path / name) for name in ("run.npz", "a.png", "b.png"))
     options = ["--t-end", "1.5", "--out", saved, "--image", first, "--at", "0.4"]
-    done = CliRunner().invoke(app, ["simulate", "simple_pendulum", *options])
-    assert done.exit_code == 0, done.output
+    # In a process of its own, which launches its browser.
+    command = [sys.executable, "-m", "srm_mbs.cli", "simulate", "simple_pendulum", *options]
+    alone = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert alone.returncode == 0, alone.stderr
     done = CliRunner().invoke(app, ["play", saved, "--image", second, "--at", "0.4"])
     assert done.exit_code == 0, done.output
     a, b = (pixels(Path(name)) for name in (first, second))

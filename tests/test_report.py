@@ -25,7 +25,8 @@ from srm_mbs.report_sections import pictures_section
 from srm_mbs.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.still import still_picture
 from srm_mbs.visuals import ANCHOR_COLOUR
-from tests.browsing import opened
+from tests.browsing import LARGE, opened
+from tests.bundled import load
 
 VOID = {"meta", "link", "img", "br", "input", "hr"}
 MEGABYTES = 1_000_000
@@ -81,7 +82,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def run() -> srm.Solution:
-    return srm.simulate(srm.load("slider_crank"), 4.0)
+    return srm.simulate(load("slider_crank"), 4.0)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def test_the_certificate_in_the_page_is_that_of_the_run(
 def test_the_page_opens_from_disk_without_complaint_and_its_animation_plays(
     browser: Any, path: Path
 ) -> None:
-    with opened(browser, path.as_uri()) as shown:
+    with opened(browser, path.as_uri(), LARGE) as shown:
         inner = shown.frames[-1]
         assert inner.evaluate("animator.duration") == pytest.approx(4.0)
         before = inner.evaluate("animator.time")
@@ -192,7 +193,7 @@ def test_a_run_that_failed_has_a_page_that_says_so() -> None:
             raise ValueError("it <broke>")
         return [0.0]
 
-    failed = srm.simulate(srm.load("simple_pendulum"), 1.0, controller=breaks)
+    failed = srm.simulate(load("simple_pendulum"), 1.0, controller=breaks)
     assert not failed.success
     page = Page(report_page(failed, srm.certify(failed), animation=False, pictures=()))
     assert "it <broke>" in page.text
@@ -206,7 +207,7 @@ def test_a_run_that_failed_at_its_start_has_a_page() -> None:
     def broken(t: float, q: Any, v: Any) -> list[float]:
         raise ValueError("never")
 
-    failed = srm.simulate(srm.load("four_bar"), 1.0, controller=broken)
+    failed = srm.simulate(load("four_bar"), 1.0, controller=broken)
     page = Page(report_page(failed, srm.certify(failed), animation=False, pictures=()))
     assert "failed at its start" in page.text
 
@@ -225,7 +226,7 @@ def test_the_page_of_many_loops_leaves_out_what_takes_minutes_and_says_so() -> N
 
 def test_a_run_with_event_actions_and_drives_has_a_page() -> None:
     drive = srm.Drive(srm.ConstantSpeed(speed=6.0), joint="crank")
-    mechanism = replace(srm.load("slider_crank_regular"), drives=[drive])
+    mechanism = replace(load("slider_crank_regular"), drives=[drive])
     start = srm.assemble(mechanism)
     event = srm.Event(lambda t, q, v: t - 0.2, action=lambda t, q, v: None)
     driven = srm.simulate(mechanism, 0.4, q0=start.q, v0=start.v, events=[event])
@@ -243,7 +244,7 @@ def test_tables_of_nothing_are_left_out() -> None:
 
 
 def test_the_still_picture_shows_a_sphere_as_large_as_the_camera_sees_it(tmp_path: Path) -> None:
-    run = srm.simulate(srm.load("simple_pendulum"), 0.1)
+    run = srm.simulate(load("simple_pendulum"), 0.1)
     picture = Image.open(io.BytesIO(still_picture(run, 0.0))).convert("RGB")
     pixels = np.asarray(picture, dtype=float)
     assert picture.width == 900
@@ -342,7 +343,7 @@ def test_a_spring_around_a_rod_is_the_coil_of_the_page_and_leaves_the_rod_in_sig
 
 
 def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_still_picture() -> None:
-    pendulum = srm.load("simple_pendulum").model
+    pendulum = load("simple_pendulum").model
     model = pin.Model()
     track = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "track")
     model.appendBodyToJoint(track, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
@@ -355,7 +356,7 @@ def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_still_picture() -
 
 @pytest.mark.parametrize("t", [0.0, 0.5])
 def test_the_bob_stands_in_the_still_picture_where_kinematics_puts_it(t: float) -> None:
-    run = srm.simulate(srm.load("simple_pendulum"), 1.0)
+    run = srm.simulate(load("simple_pendulum"), 1.0)
     _, columns = np.nonzero(coloured(seen(run, t), (0.902, 0.624, 0.0)))
     angle = run(t)[0][0]
     bob = np.array([math.cos(angle), 0.0, math.sin(angle)])
@@ -368,7 +369,7 @@ def test_the_bob_stands_in_the_still_picture_where_kinematics_puts_it(t: float) 
 
 
 def test_what_an_event_takes_away_is_missing_from_then_on() -> None:
-    loaded = srm.load("slider_crank")
+    loaded = load("slider_crank")
     # Without visuals: bars, and a ball at each anchor of a closure.
     mechanism = srm.Mechanism(loaded.model, loaded.loops, loaded.q0, loaded.v0)
     freed = mechanism.without_loop("pin")
@@ -424,21 +425,21 @@ def test_pictures_that_reports_do_not_have_are_refused(run: srm.Solution, tmp_pa
 
 
 def test_a_picture_that_a_loaded_run_has_not_is_named_in_the_page(tmp_path: Path) -> None:
-    controlled = srm.simulate(srm.load("four_bar"), 0.1, controller=lambda t, q, v: 0.0 * v)
+    controlled = srm.simulate(load("four_bar"), 0.1, controller=lambda t, q, v: 0.0 * v)
     controlled.save(tmp_path / "run.npz")
     section = pictures_section(srm.load_solution(tmp_path / "run.npz"), ["reactions"])
     assert "Not drawn: the reactions of a loaded run with a controller" in section
 
 
 def test_pictures_of_closures_are_left_out_for_an_open_chain() -> None:
-    pendulum = srm.simulate(srm.load("simple_pendulum"), 0.1)
+    pendulum = srm.simulate(load("simple_pendulum"), 0.1)
     assert "<p>" not in pictures_section(pendulum, ["reactions", "sigma"])
 
 
 @pytest.mark.stress
 @pytest.mark.parametrize("name", srm.bundled_models())
 def test_every_bundled_mechanism_has_a_page_below_five_megabytes(name: str, tmp_path: Path) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     run = srm.simulate(mechanism, min(2.0, mechanism.defaults.t_end or 2.0))
     run.report(tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size < 5 * MEGABYTES

@@ -20,6 +20,7 @@ from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.pivoting import RowAlgebra, coordinate_parents, row_algebra, trees
 from srm_mbs.systems.projection import cholesky, pivoted_qr, unwhiten, whiten
 from srm_mbs.workspaces import workspace
+from tests.bundled import load
 from tests.mechanisms import floating_ring, floating_slider_crank
 
 NAMES = srm.bundled_models()
@@ -252,7 +253,7 @@ def same_decisions(a: srm.Mechanism, b: srm.Mechanism, sigma: float) -> None:
 @pytest.mark.parametrize("name", [*NAMES, *CHAINS])
 def test_pivots_decide_as_singular_values_do(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ranks, redundant rows, row scales and mobility of every bundled mechanism."""
-    found = srm.load(name)
+    found = load(name)
     assert found.mobility
     monkeypatch.setattr(walking, "row_algebra", lambda *_: BySingularValues())
     same_decisions(found, srm.load(name), TURNED if name == "bricard" else 1e-12)
@@ -264,7 +265,7 @@ def test_the_kernel_decides_as_the_reference_does(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As for mechanisms with many coordinates: its algebra, and its workspaces."""
-    found = srm.load(name)
+    found = load(name)
     assert found.mobility
     for module, fewest in ((pivoting, 0), (workspaces, 0), (ranks, 2)):  # ARPACK needs three
         monkeypatch.setattr(module, "LARGE", fewest)
@@ -276,9 +277,9 @@ def test_the_kernel_decides_as_the_reference_does(
 MODELS: dict[str, Callable[[], srm.Mechanism]] = {
     "floating ring": floating_ring,
     "floating slider-crank": floating_slider_crank,
-    "stewart_platform": lambda: srm.load("stewart_platform"),
-    "jansen_walker": lambda: srm.load("jansen_walker"),
-    "spatial_four_bar": lambda: srm.load("spatial_four_bar"),
+    "stewart_platform": lambda: load("stewart_platform"),
+    "jansen_walker": lambda: load("jansen_walker"),
+    "spatial_four_bar": lambda: load("spatial_four_bar"),
 }
 
 
@@ -324,5 +325,5 @@ def test_only_models_have_workspaces() -> None:
 
 
 def test_a_small_model_has_a_workspace_for_every_algorithm() -> None:
-    model = srm.load("four_bar").model
+    model = load("four_bar").model
     assert workspace(model).Minv.shape == (3, 3)

@@ -12,6 +12,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.systems.multibody import make_system
 from tests import maximal, reduced
+from tests.bundled import load
 from tests.mechanisms import rescaled
 from tests.references import observed, reference
 
@@ -30,7 +31,7 @@ def relative_times(solution: srm.Solution, scale: dict[str, float]) -> np.ndarra
 def test_rescaling_without_rounding_repeats_every_step(
     name: str, tableau: str, scale: dict[str, float]
 ) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     plain = srm.simulate(mechanism, 5.0, rtol=1e-7, tableau=tableau)
     time = scale.get("time", 1.0)
     scaled = srm.simulate(rescaled(mechanism, **scale), 5.0 * time, rtol=1e-7, tableau=tableau)
@@ -43,7 +44,7 @@ def test_rescaling_without_rounding_repeats_every_step(
 def test_rescaling_with_rounding_takes_the_same_steps_on_regular_mechanisms(
     name: str, scale: dict[str, float]
 ) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     plain = srm.simulate(mechanism, 5.0, rtol=1e-7)
     time = scale.get("time", 1.0)
     scaled = srm.simulate(rescaled(mechanism, **scale), 5.0 * time, rtol=1e-7)
@@ -54,7 +55,7 @@ def test_rescaling_with_rounding_takes_the_same_steps_on_regular_mechanisms(
 @pytest.mark.parametrize("scale", ROUNDED, ids=str)
 def test_singular_passages_are_the_same_in_other_units(scale: dict[str, float]) -> None:
     """Rounding next to a singular configuration changes single steps, not what happens."""
-    mechanism = srm.load("slider_crank_slider")
+    mechanism = load("slider_crank_slider")
     time = scale.get("time", 1.0)
     scaled = srm.simulate(rescaled(mechanism, **scale), 20.0 * time, rtol=1e-7)
     plain = srm.simulate(mechanism, 20.0, rtol=1e-7)
@@ -69,7 +70,7 @@ def test_a_mechanism_driven_by_forces_takes_the_same_steps_in_other_units(
     scale: dict[str, float],
 ) -> None:
     """Without gravity and at rest the unit of rates comes from the forces."""
-    mechanism = srm.load("squeezing_mechanism")
+    mechanism = load("squeezing_mechanism")
     plain = srm.simulate(mechanism, 0.01, rtol=1e-7)
     time = scale.get("time", 1.0)
     scaled = srm.simulate(rescaled(mechanism, **scale), 0.01 * time, rtol=1e-7)
@@ -86,7 +87,7 @@ def times_of(solution: srm.Solution) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["slider_crank", "spatial_dead_point", "n_four_bar_2"])
 def test_units_change_neither_passages_nor_errors(name: str) -> None:
-    mechanism = srm.load(name)
+    mechanism = load(name)
     plain = srm.simulate(mechanism, 3.0, rtol=1e-8)
     t, exact = reference(name, 3.0, 30)
     error = np.abs(observed(name, plain, t) - exact).max()
@@ -112,7 +113,7 @@ def _observed_in_units(name: str, solution: srm.Solution, t: np.ndarray, time: f
 
 def slider_of(mass: float) -> srm.Mechanism:
     """slider_crank_slider with another mass (kg) of the slider."""
-    base = srm.load("slider_crank_slider")
+    base = load("slider_crank_slider")
     model = base.model.copy()
     slider = model.getJointId("slider")
     inertia = model.inertias[slider]
@@ -125,7 +126,7 @@ def slider_of(mass: float) -> srm.Mechanism:
 def screwed(pitch: float) -> srm.Mechanism:
     """slider_crank_slider with its slider of 0.5 kg on a screw of ``pitch`` (m/rad): its coordinate
     is an angle, as behind a reduction gear."""
-    base = srm.load("slider_crank_slider")
+    base = load("slider_crank_slider")
     model = pin.Model()
     model.gravity.linear = base.model.gravity.linear
     unit = np.ones(base.model.nv)
@@ -186,7 +187,7 @@ def test_the_mass_of_the_slider_changes_no_branch(exponent: int) -> None:
 @pytest.mark.parametrize("pitch", [1e-3, 0.1, 100.0])
 def test_a_gear_ratio_changes_no_passage(pitch: float) -> None:
     """Steps may be shorter: a screw counts in radians, of which many make a length."""
-    plain = srm.simulate(srm.load("slider_crank_slider"), 5.0, rtol=1e-8)
+    plain = srm.simulate(load("slider_crank_slider"), 5.0, rtol=1e-8)
     geared = srm.simulate(screwed(pitch), 5.0, rtol=1e-8)
     assert geared.success
     assert times_of(geared) == pytest.approx(times_of(plain), abs=1e-7)
@@ -209,7 +210,7 @@ def test_maximal_coordinates_pass_as_a_tree_does(name: str, joints: str) -> None
     make, field, start = CASES[name]
     t_end = 3.0
     t = np.linspace(0.0, t_end, 31)[1:]
-    tree = srm.simulate(srm.load(name), t_end, rtol=1e-8)
+    tree = srm.simulate(load(name), t_end, rtol=1e-8)
     solution = srm.simulate(make(joints), t_end, rtol=1e-8)
     assert solution.success
     assert solution.mechanism.degrees_of_freedom == 1
@@ -223,7 +224,7 @@ def test_maximal_coordinates_pass_as_a_tree_does(name: str, joints: str) -> None
 @pytest.mark.parametrize("name", CASES)
 def test_sigma_has_the_same_size_in_maximal_coordinates(name: str, joints: str) -> None:
     make, _, _ = CASES[name]
-    system, tree = make_system(make(joints)), make_system(srm.load(name))
+    system, tree = make_system(make(joints)), make_system(load(name))
     ratios = []
     for angle in np.arange(0.1, 2.0 * np.pi, 0.4):
         apart = make(joints, angle)

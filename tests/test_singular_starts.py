@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,10 @@ from srm_mbs.systems.branch_limit import branch_limit
 from srm_mbs.systems.closure_geometry import ClosureGeometry
 from srm_mbs.systems.singular import SingularConfiguration, analyse_singular, nearest_singular
 from tests import reduced
+from tests.bundled import load
 from tests.mechanisms import ball_dead_point, distance, floating_slider_crank
 
 PI = np.pi
-
-
-@cache
-def load(name: str) -> Mechanism:
-    return srm.load(name)
 
 
 def parallel(n: int, rate: float) -> list[float]:

@@ -12,6 +12,7 @@ import srm_mbs as srm
 from srm_mbs.methods.base import Memory
 from srm_mbs.stepping.singular_times import AHEAD, CLEARANCE, AvoidTimes
 from srm_mbs.stepping.stepsize import FixedStep
+from tests.bundled import load
 
 PERIOD = 4.29657624142677449
 PASSAGES = PERIOD / 4.0 + PERIOD / 2.0 * np.arange(5)
@@ -20,7 +21,7 @@ PASSAGES = PERIOD / 4.0 + PERIOD / 2.0 * np.arange(5)
 
 @pytest.fixture(scope="module")
 def slider_crank() -> srm.Mechanism:
-    return srm.load("slider_crank")
+    return load("slider_crank")
 
 
 def clearance(t: np.ndarray, scheme: srm.ButcherTableau, times: np.ndarray) -> float:
@@ -64,7 +65,7 @@ def test_given_times_alone_take_a_run_through_singular_configurations_exactly(
 
 @pytest.mark.parametrize("tableau", ["fe", "trap", "heun", "tvd32", "erk4", "dopr54", "dop853"])
 def test_fixed_steps_are_split_at_given_times_and_return_to_the_grid(tableau: str) -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     times = np.array([0.1, 0.125, 0.2033, 0.35, 0.475])
     solution = srm.simulate(
         mechanism, 0.5, tableau=tableau, step=0.05, singular_times=times, placement="off"
@@ -82,7 +83,7 @@ def test_fixed_steps_are_split_at_given_times_and_return_to_the_grid(tableau: st
 def test_times_on_an_open_chain_are_avoided_as_well() -> None:
     """A force that jumps at known times is no singular configuration, but wants the same."""
     times = np.array([0.3, 0.6])
-    solution = srm.simulate(srm.load("pendulum_chain"), 1.0, singular_times=times)
+    solution = srm.simulate(load("pendulum_chain"), 1.0, singular_times=times)
     assert clearance(solution.t, solution.scheme, times) >= CLEARANCE * (1 - 1e-6)
 
 
@@ -192,7 +193,7 @@ def test_no_placement_leaves_fixed_steps_alone(slider_crank: srm.Mechanism) -> N
 
 
 def test_times_outside_the_run_are_ignored_and_equal_ones_count_once() -> None:
-    mechanism = srm.load("four_bar")
+    mechanism = load("four_bar")
     given = srm.simulate(mechanism, 1.0, singular_times=(-3.0, 0.5, 0.5, 7.0))
     assert given.settings.singular_times == (0.5,)
     plain = srm.simulate(mechanism, 1.0)
@@ -217,4 +218,4 @@ def test_times_outside_the_run_are_ignored_and_equal_ones_count_once() -> None:
 )
 def test_bad_options_are_refused_before_any_stepping(options: dict[str, Any], words: str) -> None:
     with pytest.raises(srm.InputError, match=words):
-        srm.simulate(srm.load("four_bar"), 1.0, **options)
+        srm.simulate(load("four_bar"), 1.0, **options)

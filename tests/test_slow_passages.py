@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from tests import reduced, tangency
+from tests.bundled import load
 
 TOP = np.pi / 2.0
 """Crank angle of slider_crank at its upper singular configuration, an unstable equilibrium."""
@@ -21,7 +22,7 @@ TABLEAUS = pytest.mark.parametrize("tableau", ["dop853", "dopr54"])
 
 def slider_crank(angle: float, rate: float) -> srm.Mechanism:
     """slider_crank on its moving branch, where rod = -2 crank."""
-    return srm.load("slider_crank").with_state(
+    return load("slider_crank").with_state(
         np.array([angle, -2.0 * angle]), np.array([rate, -2.0 * rate])
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,11 +17,11 @@ from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.systems.structure import Structure, analyse
 from srm_mbs.systems.walking import Walker
+from tests.bundled import load
 from tests.mechanisms import along_x, floating_ring, rescaled, rod
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
-load = cache(srm.load)
 
 Z_AXIS = (0.0, 0.0, 1.0)
 
@@ -500,7 +500,7 @@ def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(structure, "BLUNT", 0.0)
-    mechanism = load.__wrapped__(name)
+    mechanism = srm.load(name)
     model, units = mechanism.model, mechanism.structure.units
     rows = LoopKinematics(model, mechanism.loops)
     data = model.createData()

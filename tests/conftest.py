@@ -30,3 +30,10 @@ def browser() -> Iterator[Any]:
             yield launched
     except srm.InputError as error:
         pytest.skip(str(error))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Modules of stress tests alone take seconds to import, and by default none of them is run."""
+    if collection_path.name == "stress" and config.option.markexpr == "not stress":
+        return True
+    return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pinocchio as pin
@@ -129,6 +130,7 @@ def floating_slider_crank(
     return srm.Mechanism(model, (loop,), q0=q, v0=v)
 
 
+@cache
 def slider_crank_of_points(apart: float) -> srm.Mechanism:
     """slider_crank of two free bodies, whose hinges are two points each, ``apart`` (m) from each
     other on the axis; so are those of the tip on its plane."""

@@ -28,6 +28,12 @@ def slider_crank() -> srm.Mechanism:
     return srm.load("slider_crank")
 
 
+@pytest.fixture(scope="module")
+def smooth(slider_crank: srm.Mechanism) -> srm.Solution:
+    """Through one singular configuration, without breakpoints."""
+    return srm.simulate(slider_crank, 2.0, rtol=1e-12)
+
+
 def torque(t: float, q: Any, v: Any) -> np.ndarray:
     """A smooth torque on the crank that changes its sign at every jump."""
     return np.array([(2.0 + np.sin(3.0 * t)) * (1.0 if int(t / PERIOD) % 2 else -1.0), 0.0])
@@ -167,9 +173,12 @@ def test_every_attempt_between_breakpoints_is_repeated(
 @pytest.mark.parametrize("step", [None, 0.01])
 @pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-7, 1e-4, -1e-3, 0.01])
 def test_a_breakpoint_next_to_a_singular_configuration_changes_nothing(
-    slider_crank: srm.Mechanism, beside: float, step: float | None, backend: str
+    slider_crank: srm.Mechanism,
+    smooth: srm.Solution,
+    beside: float,
+    step: float | None,
+    backend: str,
 ) -> None:
-    smooth = srm.simulate(slider_crank, 2.0, rtol=1e-12)
     (passage,) = smooth.crossings
     time = passage.time + beside
     options: dict[str, Any] = {"rtol": 1e-9, "step": step, "backend": backend}

@@ -101,8 +101,8 @@ def test_the_bob_is_where_forward_kinematics_puts_it(tmp_path: Path, t: float) -
 @pytest.mark.browser
 def test_a_picture_shows_the_end_by_default_and_no_controls(tmp_path: Path) -> None:
     solution = run()
-    solution.export_image(tmp_path / "a.png")
-    solution.export_image(tmp_path / "b.png", t=1.5)
+    solution.export_image(tmp_path / "a.png", size=(450, 300))
+    solution.export_image(tmp_path / "b.png", t=1.5, size=(450, 300))
     a, b = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
     np.testing.assert_allclose(a, b, atol=0.02)
     assert np.ptp(a[-40:], axis=(0, 1)).max() < 0.1, "the background only"
@@ -245,7 +245,7 @@ def test_without_playwright_it_says_what_to_install(
 
 def test_a_folder_that_is_not_there_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(srm.InputError, match="cannot be written"):
-        run().export_image(tmp_path / "nowhere" / "a.png")
+        run().export_image(tmp_path / "nowhere" / "a.png", size=(60, 40))
 
 
 @pytest.mark.browser

@@ -36,9 +36,8 @@ class DaeSolution(Stepped):
     x : (n, nx), y : (n, ny)
         States and multipliers there.  y is that of the last sweep; for the split form, which has
         no sweep, the exact one at x.
-    status, message, success
-        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``; when and why;
-        whether it is one of the first two.
+    status, message
+        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``; when and why.
     t_events, x_events
         For each event in turn the times (k,) and states (k, nx) of its occurrences; None if no
         events were given.
@@ -73,7 +72,6 @@ class DaeSolution(Stepped):
         self.settings = settings
         self.status = status
         self.message = message
-        self.success = status in ("finished", "event")
         self.t_events: list[FloatArray] | None = None
         self.x_events: list[FloatArray] | None = None
         if events is not None:
@@ -165,7 +163,7 @@ class DaeSolution(Stepped):
         """
         from srm_mbs.plotting import plot_dae
 
-        return plot_dae(self, None if path is None else Path(path), kind)
+        return plot_dae(self, path, kind)
 
     def to_csv(self, path: str | Path) -> None:
         """Write t, x and y as a table of comma-separated values, one row per time ``t``.

@@ -50,7 +50,6 @@ class SegmentedSolution(Solution):
         self.mechanism = first.mechanism
         self.scheme, self.settings = first.scheme, first.settings
         self.status, self.message = status, message
-        self.success = status in ("finished", "event")
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
         self.stats = _added([segment.stats for segment in self.segments])

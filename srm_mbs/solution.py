@@ -44,9 +44,8 @@ class Solution(Stepped, Shown):
         ``t_eval``, or the ends of the accepted steps, the start first and a terminal event last.
     q : (n, nq), v : (n, nv)
         Configurations and velocities there.
-    status, message, success
-        ``finished``, ``event``, ``failed`` or ``interrupted``; when and why; whether the end, or
-        a terminal event, was reached.
+    status, message
+        ``finished``, ``event``, ``failed`` or ``interrupted``; when and why.
     stats
         :class:`Statistics`.
     settings
@@ -85,7 +84,6 @@ class Solution(Stepped, Shown):
         self.attempts = attempts
         self.status = status
         self.message = message
-        self.success = status in ("finished", "event")
         self.stats = stats
         self.settings = settings
         self._system = system
@@ -380,7 +378,7 @@ class Solution(Stepped, Shown):
         """
         from srm_mbs.plotting import plot_solution
 
-        return plot_solution(self, None if path is None else Path(path), kind, **options)
+        return plot_solution(self, path, kind, **options)
 
     def report(self, path: str | Path, **options: Any) -> None:
         """Write one page about the run; see :func:`srm_mbs.report.write_report`."""

@@ -90,24 +90,24 @@ def check_options(
 
 
 def plot_solution(
-    solution: Solution, path: Path | None = None, kind: str = "run", **options: Any
+    solution: Solution, path: str | Path | None = None, kind: str = "run", **options: Any
 ) -> Figure:
     """A picture of a run; see :meth:`srm_mbs.Solution.plot`."""
     check_options(kind, options)
     return _drawn(partial(KINDS[kind].draw, solution, **options), path)
 
 
-def plot_dae(solution: DaeSolution, path: Path | None = None, kind: str = "run") -> Figure:
+def plot_dae(solution: DaeSolution, path: str | Path | None = None, kind: str = "run") -> Figure:
     """A picture of a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
     check_options(kind, kinds=DAE_KINDS)
     return _drawn(partial(DAE_KINDS[kind].draw, solution), path)
 
 
-def _drawn(draw: Callable[[], Figure], path: Path | None) -> Figure:
+def _drawn(draw: Callable[[], Figure], path: str | Path | None) -> Figure:
     """The figure, saved if a path is given; its suffix is checked before."""
-    if path is not None:
-        check_suffix(path)
+    if path is None:
+        return draw()
+    check_suffix(Path(path))
     figure = draw()
-    if path is not None:
-        save(figure, path)
+    save(figure, Path(path))
     return figure

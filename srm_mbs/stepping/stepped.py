@@ -18,10 +18,18 @@ class Stepped:
         The accepted steps.
     attempts
         The attempted ones: structured array with t, h and verdict.
+    status
+        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``.
     """
 
     steps: StepData
     attempts: NDArray[np.void]
+    status: str
+
+    @property
+    def success(self) -> bool:
+        """Whether the end, or a terminal event, was reached."""
+        return self.status in ("finished", "event")
 
     @property
     def span(self) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from srm_mbs.solution import Solution
 from srm_mbs.stepping.dense import DenseOutput
 from srm_mbs.stepping.events import EventWatch
 from srm_mbs.stepping.loop import RunRecord
-from srm_mbs.stepping.remarks import drift, restarts, turns
+from srm_mbs.stepping.remarks import drift, passings, restarts, turns
 from srm_mbs.stepping.singular_times import Placing, suspected
 from srm_mbs.stepping.stepsize import Verdict
 from srm_mbs.systems.multibody import ClosedSystem, OpenSystem
@@ -80,6 +80,7 @@ def collected(
         message=record.message
         + turns(suspects, "the velocity turned", MENDED)
         + restarts(record.steps)
+        + passings(record.steps)
         + drift(record.steps, norm)
         + _limits_left(mechanism, dense)
         + _driven_too_far(mechanism, record),

@@ -31,7 +31,7 @@ from srm_mbs.stepping.dense import step_data
 from srm_mbs.stepping.events import EventWatch, prepare_events
 from srm_mbs.stepping.loop import DAE, RunRecord, Tick, integrate
 from srm_mbs.stepping.rate_guard import RateGuard
-from srm_mbs.stepping.remarks import drift, restarts, turns
+from srm_mbs.stepping.remarks import drift, passings, restarts, turns
 from srm_mbs.stepping.singular_times import Placing, placed, suspected
 from srm_mbs.stepping.stepsize import Verdict, initial_step
 from srm_mbs.stepping.sweep_stability import instability
@@ -309,6 +309,7 @@ def solve_dae(
         message=record.message
         + ("" if with_sweeps else turns(turned, "x' turned", MENDED))
         + restarts(record.steps)
+        + passings(record.steps)
         + drift(record.steps, norm),
         stats=stats,
     )

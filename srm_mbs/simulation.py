@@ -105,8 +105,8 @@ def simulate(
         ``"tvd32"`` for srm.
     rtol
         Relative tolerance: at most 1e-2 for the split PSRM with dop853, 1e-3 with another tableau,
-        1e-4 for sweeps; at least 2.2e-13 with closures or drives, 2.2e-14 without (1000 and 100
-        times the machine epsilon): below, rounding decides.  Others are replaced with a warning.
+        1e-4 for sweeps; at least 1e-12 with closures or drives (1e-11 with tvd32), 2.2e-14 without:
+        below, rounding decides.  Others are replaced with a warning.
     atol
         Absolute tolerance: a number, (nv,) or (2 nv,).  By default rtol times the unit of each
         coordinate: 1 rad, the scene diagonal for lengths, and those times the mechanism's
@@ -185,7 +185,9 @@ def simulate(
     placement = checked_placement(placement)
     avoided = checked_singular_times(singular_times, t0, t_end)
     method = mechanism_method(method, tableau)
-    rtol = checked_rtol(rtol, loosest_rtol(method), tightest_rtol(mechanism.constrained))
+    rtol = checked_rtol(
+        rtol, loosest_rtol(method), tightest_rtol(method.scheme, mechanism.constrained)
+    )
     times = checked_times(t_eval, t0, t_end)
     samples = checked_samples(sample_time, controller, t0, t_end)
     kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(t0, t_end)])

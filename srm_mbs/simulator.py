@@ -88,7 +88,9 @@ class Simulator:
             if value is not None:
                 positive(value, what, " of seconds")
         checked = mechanism_method(method, tableau)
-        rtol = checked_rtol(rtol, loosest_rtol(checked), tightest_rtol(mechanism.constrained))
+        rtol = checked_rtol(
+            rtol, loosest_rtol(checked), tightest_rtol(checked.scheme, mechanism.constrained)
+        )
         check_embedded(checked.scheme, step)
         check_consistent(mechanism)
         self._mechanism = mechanism

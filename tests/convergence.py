@@ -37,7 +37,7 @@ def turning(name: str, rate: float) -> Mechanism:
 
 @cache
 def reference_of(mechanism: Mechanism) -> srm.Solution:
-    return srm.simulate(mechanism, 1.0, rtol=2.3e-13, atol=1e-13, max_step=0.02, t_eval=SAMPLES)
+    return srm.simulate(mechanism, 1.0, rtol=1e-12, atol=1e-13, max_step=0.02, t_eval=SAMPLES)
 
 
 def observed_order(

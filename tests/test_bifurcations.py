@@ -109,17 +109,3 @@ def test_a_step_that_would_switch_the_branch_is_redone() -> None:
     assert solution.success
     assert len(solution.replaced) > 0
     assert np.abs(solution.q[:, 0] - solution.q[:, 2]).max() < 1e-2
-
-
-def test_sweeps_that_cannot_pass_say_so_and_blame_no_missing_momentum() -> None:
-    """So many short steps leave nothing but rounding next to a singular configuration."""
-    q, v = srm.simulate(load("slider_crank"), 1.05, rtol=1e-12)(1.05)
-    mechanism = load("slider_crank").with_state(q, v)
-    solution = srm.simulate(mechanism, 1.1, t0=1.05, method="srm", rtol=1e-8)
-    assert not solution.success
-    assert solution.t[-1] == pytest.approx(1.07414, abs=1e-4)
-    assert solution.bifurcations == ()
-    assert "rounding grows as steps get shorter" in solution.message
-    assert "Try a larger rtol, PSRM in its split form" in solution.message
-    assert "momentum" not in solution.message
-    assert srm.simulate(mechanism, 1.1, t0=1.05, rtol=1e-8).success

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.stepping import arriving
 from tests import reduced
 from tests.bundled import load
 from tests.lockstep import compare
@@ -175,3 +176,17 @@ def test_a_grid_point_on_a_singular_configuration_is_stepped_over(tableau: str) 
     grid = step * np.arange(81)
     off = np.abs(solution.t[:, None] - grid).min(axis=1) > 1e-12
     assert off.sum() <= 2
+
+
+def test_a_search_ahead_of_an_end_that_leaves_all_numbers_is_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It contracts, or diverges; NumPy raises for singular values of NaN."""
+
+    def diverges(*_: object, **__: object) -> None:
+        np.linalg.svd(np.full((2, 2), np.nan))
+
+    monkeypatch.setattr(arriving, "block_of", diverges)
+    t = first_passage("slider_crank")
+    solution = srm.simulate(srm.load("slider_crank"), t, rtol=1e-8)
+    assert solution.success

@@ -363,3 +363,33 @@ def test_open_chains_run_with_any_method() -> None:
     for method in (srm.SRM("erk4"), srm.PSRM("erk4", correction="sweep")):
         solution = srm.simulate(chain, 0.5, method=method, step=5e-3)
         assert np.abs(solution.q[-1] - reference.q[-1]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("method", "rtol", "bound"),
+    [
+        ("srm", 1e-8, 5e-9),
+        (srm.SRM("dopr54", restart=True, carry=True), 1e-8, 1e-10),
+        (srm.PSRM("tvd32", prediction="simple"), 1e-8, 5e-9),
+        (srm.PSRM("tvd32", correction="sweep"), 1e-11, 5e-11),
+        (srm.PSRM("tvd32", correction="fused"), 1e-11, 5e-11),
+        (srm.SRM("tvd32", eps=1e-4), 1e-8, 5e-9),
+    ],
+    ids=["SRM", "SRM dopr54", "simple", "exact", "fused", "own histories"],
+)
+@pytest.mark.parametrize("name", ["slider_crank", "n_four_bar_2"])
+def test_passages_that_rounding_closes_to_sweeps_are_made_by_the_split_form(
+    method: Any, rtol: float, bound: float, name: str
+) -> None:
+    """The error of sweeps is a power of eps, about a step: their steps are too short to cross."""
+    t = {"slider_crank": 1.0741, "n_four_bar_2": 0.7143}[name]
+    mechanism = load(name)
+    before = srm.simulate(mechanism, t - 0.03, rtol=1e-12)
+    start = mechanism.with_state(before.q[-1], before.v[-1])
+    times = {"t0": t - 0.03, "t_eval": [t + 0.03]}
+    exact = srm.simulate(start, t + 0.03, rtol=1e-12, **times)
+    solution = srm.simulate(start, t + 0.03, method=method, rtol=rtol, **times)
+    assert solution.success, solution.message
+    assert len(solution.crossings) == 1
+    assert np.abs(solution.q[-1] - exact.q[-1]).max() < bound
+    assert "are of the split PSRM" in solution.message

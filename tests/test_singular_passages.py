@@ -173,3 +173,28 @@ def test_fixed_steps_are_placed_and_return_to_the_grid() -> None:
     assert np.abs(solution.t[:, None] - grid).min(axis=0).max() < 1e-12
     theta, omega = reduced.integrate(reduced.slider_crank(), [7 * np.pi / 4, 0.0], 5.0)
     assert error_at_end(solution, theta, omega) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("name", "t"),
+    [
+        ("parallelogram", 0.3477),
+        ("n_four_bar_2", 0.7143),
+        ("n_four_bar_5", 0.7187),
+        ("spatial_dead_point", 0.7106),
+    ],
+)
+@pytest.mark.parametrize("rtol", [1e-10, 1e-11])
+def test_short_steps_of_low_order_pass_and_keep_to_the_tolerance(
+    name: str, t: float, rtol: float
+) -> None:
+    """Rounding counts the more the shorter the steps that cross."""
+    mechanism = load(name)
+    before = srm.simulate(mechanism, t - 0.02, rtol=1e-12)
+    start = mechanism.with_state(before.q[-1], before.v[-1])
+    options = {"t0": t - 0.02, "t_eval": [t + 0.02]}
+    exact = srm.simulate(start, t + 0.02, rtol=1e-12, **options)
+    solution = srm.simulate(start, t + 0.02, rtol=rtol, tableau="tvd32", **options)
+    assert solution.success
+    assert len(solution.crossings) == 1
+    assert np.abs(solution.q[-1] - exact.q[-1]).max() < 5.0 * rtol

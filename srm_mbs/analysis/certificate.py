@@ -82,7 +82,7 @@ def certify(
     """Estimate how accurate a run is.
 
     It is made again twice: at a tenth and a hundredth of its tolerance (no tighter than rounding
-    allows, 2.2e-13), or
+    allows, 1e-12), or
     with half and a quarter of its fixed step.  With dop853 this takes some three times as long as
     the run, with fixed steps six times.  Functions of the user are called again.
 

@@ -18,13 +18,11 @@ from srm_mbs.analysis.comparison import Comparison, JointDifference, compare, sa
 from srm_mbs.analysis.second_run import second_run
 from srm_mbs.errors import InputError
 from srm_mbs.methods.psrm import PSRM
-from srm_mbs.options import TIGHTEST_OF_CLOSURES, positive
+from srm_mbs.options import positive, tightest_rtol
 from srm_mbs.solution import Solution
 
 TIGHTER = 1e-2
 """Tolerance of the tightest run over that of the run."""
-TIGHTEST = float(TIGHTEST_OF_CLOSURES)
-"""No tighter tolerance is taken unasked: rounding is left."""
 APART = 3.0
 """Factor between two tolerances from which one between them is of use."""
 ROUNDING = 1e-12
@@ -127,14 +125,16 @@ def checked_settings(solution: Solution, rtol: float | None) -> list[float]:
                 remedy="Leave rtol out: it is made again with half and a quarter of the step",
             )
         return [settings.step / 2.0, settings.step / 4.0]
-    other = max(TIGHTER * settings.rtol, TIGHTEST) if rtol is None else positive(rtol, "rtol")
-    if rtol is None and settings.rtol < APART * TIGHTEST:
+    # No tighter tolerance is taken unasked: rounding is left.
+    tightest = tightest_rtol(solution.scheme, True)
+    other = max(TIGHTER * settings.rtol, tightest) if rtol is None else positive(rtol, "rtol")
+    if rtol is None and settings.rtol < APART * tightest:
         other = APART * settings.rtol  # none is tighter: it gives a bound
     if abs(math.log(other / settings.rtol)) < math.log(1.5):
         raise InputError(
             f"rtol = {other:g} is that of the run: two runs alike tell nothing",
             element="rtol",
-            remedy=f"Give for example rtol={max(TIGHTER * settings.rtol, TIGHTEST):g}",
+            remedy=f"Give for example rtol={max(TIGHTER * settings.rtol, tightest):g}",
         )
     found = [other]
     if abs(math.log(other / settings.rtol)) > math.log(APART):

@@ -76,6 +76,9 @@ class SweepNode:
         How far it is off the closures, in units.
     given
         With own histories, y_0: the constant multiplier that the first sweep is given; None for 0.
+    passing
+        Whether the split form passes a singular configuration for the sweeps
+        (:mod:`srm_mbs.methods.passing`).
     """
 
     state: FloatArray
@@ -85,6 +88,7 @@ class SweepNode:
     history: MultiplierHistory | None
     off: float = 0.0
     given: FloatArray | None = None
+    passing: bool = False
 
 
 @dataclass
@@ -156,6 +160,8 @@ class StepResult:
         For methods with sweeps: how far any of them is off the closures at the end, in units.
     restarted
         Whether sweeps with own histories started from the accepted state in this step.
+    passing
+        For methods with sweeps: whether the split form made this step for them.
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
@@ -189,6 +195,7 @@ class StepResult:
     drift_ratio: float = 0.0
     off: float = 0.0
     restarted: bool = False
+    passing: bool = False
     placement: str = ""
     quiet: bool = False
     slope: float = 0.0

@@ -30,6 +30,8 @@ configurations."""
 NEAR = 4.0
 """Steps that start with sigma below NEAR |d sigma / dt| h are looked at; of sweeps, which keep
 their constraint errors for about eps, those below NEAR |d sigma / dt| max(h, eps)."""
+FAR = 8.0
+"""Steps from a singular configuration from which a step prepares nothing for one."""
 PROJECTIONS = 4
 """Newton steps at most; the error squares each time."""
 AMBIGUOUS = 0.1
@@ -40,7 +42,15 @@ HELD = 0.1
 TURNS = 2.0
 """Margin for what a constraint error changes by because the closures turn."""
 ROUNDING = 16.0 * np.finfo(float).eps
-"""Rounding of the positions, in units."""
+"""Rounding of the positions, in units: at most."""
+USUAL = 1.0 / 32.0
+"""What it usually is, over ROUNDING: half a unit in the last place."""
+CROSSES = 0.5
+"""sigma at the ends of a step across a singular configuration, over its change."""
+LEAD = 100.0
+"""Steps before a singular configuration from which they are kept long enough for rounding."""
+MOST_FLOOR = 1e-7
+"""Relative error up to which rounding is taken for granted: above, a run had better stop."""
 
 
 @dataclass
@@ -69,6 +79,11 @@ class BranchStages:
     excused
         sigma below which a direct solve errs by more than the tolerance, if such are made because
         predictions err by more; else 0.
+    floor : (n,)
+        Error that rounding leaves in a step of this length that crosses a singular configuration;
+        part of the weights.  It grows like 1/h^2.  Counted from before the configuration on, it
+        keeps the steps so long that their own errors are above it: shorter ones are no more
+        accurate, and get stuck.  0 away from singular configurations.
     projected
         Whether any stage was moved.
     """
@@ -85,9 +100,11 @@ class BranchStages:
     near: bool = field(init=False)
     zone: Zone | None = field(init=False)
     excused: float = field(init=False)
+    floor: FloatArray = field(init=False)
     projected: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
+        self.floor = np.zeros_like(self.weights)
         # All stages of a step or none: a mixture of both loses the order.
         # By time, not by steps alone: errors kept over many short steps grow like 1/sigma^2 in the
         # multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
@@ -100,6 +117,10 @@ class BranchStages:
         if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
             threshold = self.known_from(ZONE_LARGEST, 1.0)
             lingering = threshold < ZONE_LARGEST and self.lingers(threshold)
+            # The zone is as wide as the tolerance asks for; how good its predictions and
+            # projections have to be follows from what can be had.
+            self.floor = self._floor()
+            self.weights = self.weights + self.floor
             uncertain = self.uncertainty()
             if uncertain > 1.0 and not lingering:
                 # A prediction that errs by more than the tolerance is no better than a direct
@@ -180,11 +201,20 @@ class BranchStages:
             error[part] = change / (self.h * sigma) * error[: part.start]
         return self._turning(error, sigma, change)
 
+    def _floor(self) -> FloatArray:
+        change = self.sigma_change
+        near = min(WATCHED, LEAD * change)
+        if not (self.memory.sigma < near and self.norm.negligible > 0.0):
+            return np.zeros_like(self.weights)
+        noise = self.rounding(CROSSES * change, change, True)
+        return np.minimum(USUAL * noise, MOST_FLOOR * self.norm.one)
+
     def widened(
         self, weights: FloatArray, scheme: ButcherTableau, sigmas: FloatArray
     ) -> FloatArray:
         """``weights`` (n,) and what rounding does to the error estimate of a step of ``scheme``
         with ``sigmas`` (s + 1,) at its stages."""
+        weights = weights + self.floor
         # Below the threshold of the zone nothing is solved for directly.  Where that lies lower
         # than the tolerance asks for, shorter steps predict better: rounding is no excuse.
         least = 0.0 if self.zone is None else self.zone.threshold

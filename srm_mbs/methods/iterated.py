@@ -19,7 +19,8 @@ Next to a singular configuration the algebra of all sweeps is evaluated on the b
 tell the branch are restarted from the accepted state.
 
 The zone serves the exact prediction only.  Multipliers of sweeps carry their initial layers and
-errors of order eps; extrapolated, they stalled runs that pass without (measured).
+errors of order eps; extrapolated, they stalled runs that pass without (measured).  Where rounding
+leaves sweeps no way, the split form makes the steps (:mod:`srm_mbs.methods.passing`).
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ import numpy as np
 from srm_mbs.arrays import FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult, SweepNode
-from srm_mbs.methods.branch import AMBIGUOUS, NEAR, BranchStages
+from srm_mbs.methods.branch import AMBIGUOUS, NEAR, WATCHED, BranchStages
 from srm_mbs.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.methods.history import MultiplierHistory
+from srm_mbs.methods.passing import can_hand_over, first_history, split_passing, unresolved
 from srm_mbs.methods.regularisation import Regularisation, real_stability_limit
 from srm_mbs.methods.sweeps import (
     Answer,
@@ -122,6 +124,8 @@ class IteratedSweeps:
         if self._exact and system.has_constraints:
             history = MultiplierHistory.begin(t, terms.multiplier())
         node = SweepNode(state, multiplier, None, 0.0, history)
+        if memory.sigma < WATCHED and can_hand_over(system, self.scheme, norm):
+            node = replace(node, history=first_history(terms, t, node), passing=True)
         memory.sweeps = (node,) * (self.iterations if self.own_history else 1)
         return memory
 
@@ -136,11 +140,16 @@ class IteratedSweeps:
         eps = max(self.eps(h), EPS_SHRINKS * memory.sweeps[-1].eps)
         if not (math.isfinite(eps) and eps > 0.0):
             raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
-        memory, restarted = self._gathered(system, memory, h * memory.sigma_slope)
+        change = h * memory.sigma_slope
+        gathered, restarted = self._gathered(system, memory, change)
         kept = memory.sweeps[-1].history
         weights = norm.weights(memory.magnitude)
-        change = h * memory.sigma_slope
-        stages = BranchStages(system, memory, norm, weights, h, change, kept, t + h, eps)
+        stages = BranchStages(system, gathered, norm, weights, h, change, kept, t + h, eps)
+        if can_hand_over(system, self.scheme, norm) and (
+            memory.sweeps[-1].passing or unresolved(stages)
+        ):
+            return split_passing(system, self.scheme, t, h, state, memory, norm, self._exact)
+        memory = gathered
         make = self._own_sweeps if self.own_history else self._restarted_sweeps
         runs = make(system, t, h, eps, memory, stages)
         last = runs[-1]
@@ -227,9 +236,9 @@ class IteratedSweeps:
         """
         fresh = self.start(system, t, state, norm)
         fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
-        if self.own_history:
-            begun = fresh.sweeps[-1].history
-            fresh.sweeps = tuple(replace(node, rate=None, history=begun) for node in memory.sweeps)
+        if self.own_history and not fresh.sweeps[-1].passing:
+            first = fresh.sweeps[-1].history
+            fresh.sweeps = tuple(replace(node, rate=None, history=first) for node in memory.sweeps)
         return fresh
 
     def _own_sweeps(

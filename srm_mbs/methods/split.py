@@ -22,14 +22,12 @@ import numpy as np
 
 from srm_mbs.arrays import FloatArray
 from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
-from srm_mbs.methods.branch import WATCHED, BranchStages
+from srm_mbs.methods.branch import FAR, WATCHED, BranchStages
 from srm_mbs.methods.butcher import ButcherTableau
 from srm_mbs.methods.history import MultiplierHistory
 from srm_mbs.methods.zone import COUNT_UNCERTAINTY_ABOVE
 from srm_mbs.systems.base import System
 
-FAR = 8.0
-"""Steps from a singular configuration from which a step prepares nothing for one."""
 GAP_EVERY = 16
 """Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
 
@@ -173,11 +171,14 @@ def split_accept(memory: Memory, result: StepResult) -> None:
     memory.rate = result.end_rate
     memory.sigma = float(result.sigmas[-1])
     memory.magnitude = result.magnitude
-    if memory.history is None:
-        return
+    if memory.history is not None:
+        memory.history = history_after(memory.history, result)
+
+
+def history_after(history: MultiplierHistory, result: StepResult) -> MultiplierHistory:
+    """``history`` behind an accepted step."""
     if result.multiplier is not None:
-        memory.history = memory.history.extended(
-            result.t + result.h, result.multiplier, result.normals
-        )
-    elif result.zone is None and memory.history.begun:
-        memory.history = memory.history.emptied()
+        return history.extended(result.t + result.h, result.multiplier, result.normals)
+    if result.zone is None and history.begun:
+        return history.emptied()
+    return history

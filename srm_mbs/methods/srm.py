@@ -39,6 +39,10 @@ class SRM:
     multiplier is constant over the step, whatever m.  The higher orders of the thesis show on its
     problem 1, which has no error but these.
 
+    With step-size control, singular configurations that rounding keeps such short steps from
+    passing within the tolerance are passed by the split form of the same tableau
+    (:mod:`srm_mbs.methods.passing`; slider-crank: from 1e-7 on), and the message says so.
+
     With step-size control, ``restart`` and ``carry``, measured with tvd32 and m = 3: slider-crank
     to t = 40 through its passages, errors 1e-3 and 4e-5 at tolerances of 1e-4 and 1e-5; four-bar
     to t = 5, 5e-3 and 4e-4.  Sweeps with their own history drift apart, and the last one is off the

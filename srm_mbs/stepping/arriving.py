@@ -60,8 +60,8 @@ def arrive(
                 best, memory.history = error, history
             if error < SUFFICES:
                 break
-    except EvaluationError:
-        # A step will meet it, too, and say so.
+    except (EvaluationError, np.linalg.LinAlgError):
+        # A step will meet it, too, and say so; or the search has left all numbers.
         pass
     return memory
 

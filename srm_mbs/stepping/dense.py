@@ -128,7 +128,7 @@ def step_data(
         times=np.array([t0, *times]),
         states=np.array([x0, *(s.state for s in steps)]),
         rates=np.array([s.rates for s in steps]).reshape(n, -1 if n else stages, tangent_size),
-        corrections=np.array([s.correction for s in steps]).reshape(n, -1 if n else 0),
+        corrections=_corrections(steps),
         sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
         ranks=np.array([s.rank for s in steps], dtype=float),
         error_ratios=np.array([s.error_ratio for s in steps]),
@@ -144,6 +144,14 @@ def step_data(
         breaks=np.array(breaks, dtype=int),
         break_rates=np.array([steps[i - 1].end_rate for i in breaks]).reshape(-1, tangent_size),
     )
+
+
+def _corrections(steps: Sequence[StepResult]) -> FloatArray:
+    """What was subtracted at the ends of the ``steps``; 0 where a method does not in every step."""
+    size = max((s.correction.size for s in steps), default=0)
+    nothing = np.zeros(size)
+    rows = [s.correction if s.correction.size else nothing for s in steps]
+    return np.array(rows).reshape(len(steps), size)
 
 
 @lru_cache(maxsize=64)

@@ -340,12 +340,8 @@ def fail(
     reason = trouble or "the error estimate stays above the tolerance however small the step"
     close = memory.sigma < 0.05
     near = f" {words.singular} (sigma = {memory.sigma:.1e})." if close else ""
-    remedy = f"Try a smaller {'rtol' if adaptive else 'step'}, another tableau"
-    predicts = not memory.sweeps or memory.sweeps[-1].history is not None
-    if close and adaptive and not trouble and not predicts:
-        near += " Sweeps solve for the multiplier next to it: rounding grows as steps get shorter."
-        remedy = "Try a larger rtol, PSRM in its split form"
     record.message = (
         f"Stopped at t = {t:.6g} s with step {h:.1e} s: {reason}.{near} "
-        f"Everything up to there is kept. {remedy}, or check that {words.goes_on}."
+        f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
+        f"tableau, or check that {words.goes_on}."
     )

@@ -46,6 +46,17 @@ def drift(steps: Sequence[StepResult], norm: ErrorNorm) -> str:
     )
 
 
+def passings(steps: Sequence[StepResult]) -> str:
+    """A sentence about the steps that the split form made for sweeps."""
+    times = [step.t for step in steps if step.passing]
+    if not times:
+        return ""
+    return (
+        f" {len(times)} steps next to singular configurations, the first at t = {times[0]:.6g} s, "
+        "are of the split PSRM: rounding would have exceeded the tolerance in sweeps."
+    )
+
+
 def restarts(steps: Sequence[StepResult]) -> str:
     """A sentence about sweeps with own histories that did not keep them."""
     times = [step.t for step in steps if step.restarted]

@@ -53,6 +53,8 @@ StepConstants step_constants_of(const nb::dict& d) {
     return {number(d, "watched"),      number(d, "near"),
             number(d, "far"),          number(d, "ambiguous"),
             number(d, "held"),         number(d, "rounding"),
+            number(d, "usual"),        number(d, "crosses"),
+            number(d, "lead"),         number(d, "most_floor"),
             number(d, "zone_largest"), number(d, "count_uncertainty_above"),
             number(d, "hit"),          whole(d, "projections"),
             whole(d, "fewest"),        whole(d, "gap_every")};

@@ -138,6 +138,9 @@ void SplitStep::prepare_branch(const Memory& memory, double end, double sigma_ch
     if (memory.sigma < constants.watched + constants.near * sigma_change) {
         threshold = known_from(memory, sigma_change, 1.0);
         lingering = threshold < constants.zone_largest && lingers(memory, threshold);
+        // The zone is as wide as the tolerance asks for; how good its predictions and projections
+        // have to be follows from what can be had.
+        add_floor(memory, sigma_change);
         const double uncertain = uncertainty(history, end);
         if (uncertain > 1.0 && !lingering) {
             // A prediction that errs by more than the tolerance is no better than a direct solve
@@ -181,6 +184,16 @@ bool SplitStep::onto_branch(double t, double c, const Memory& memory, double sig
         branch_.projected = true;
     }
     return moved;
+}
+
+// Adds to the weights the error that rounding leaves in a step of this length that crosses a
+// singular configuration.
+void SplitStep::add_floor(const Memory& memory, double sigma_change) {
+    const double near = std::min(constants.watched, constants.lead * sigma_change);
+    if (!(memory.sigma < near && norm.negligible > 0.0)) return;
+    rounding(constants.crosses * sigma_change, sigma_change, true, noise_.data());
+    for (int i = 0; i < n_; ++i)
+        weights_[i] += std::min(constants.usual * noise_[i], constants.most_floor * norm.one[i]);
 }
 
 // Adds to the weights what rounding does to the error estimate.
@@ -295,6 +308,7 @@ const StepResult& SplitStep::make(double t, double h, const double* state, const
                         error_[nv_ + i] += h * std::abs(scheme.b[j]) * uncertainty_[i];
                 }
             }
+            add_floor(memory, sigma_change);
             widen(sigma_change);
         }
         r.error_ratio = ErrorNorm::ratio(error_.data(), weights_.data(), n);

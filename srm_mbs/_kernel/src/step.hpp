@@ -18,8 +18,8 @@ struct Scheme {
 
 // The constants of srm_mbs/methods, passed in from Python.
 struct StepConstants {
-    double watched, near, far, ambiguous, held, rounding, zone_largest, count_uncertainty_above,
-        hit;
+    double watched, near, far, ambiguous, held, rounding, usual, crosses, lead, most_floor,
+        zone_largest, count_uncertainty_above, hit;
     int projections, fewest, gap_every;
 };
 
@@ -86,6 +86,7 @@ private:
     double known_from(const Memory& memory, double sigma_change, double allowed) const;
     double uncertainty(const History& history, double end);
     bool lingers(const Memory& memory, double threshold) const;
+    void add_floor(const Memory& memory, double sigma_change);
     void widen(double sigma_change);
 
     System& system_;

@@ -189,7 +189,7 @@ def test_short_steps_of_low_order_pass_and_keep_to_the_tolerance(
     name: str, t: float, rtol: float
 ) -> None:
     """Rounding counts the more the shorter the steps that cross."""
-    mechanism = load(name)
+    mechanism = srm.load(name)
     before = srm.simulate(mechanism, t - 0.02, rtol=1e-12)
     start = mechanism.with_state(before.q[-1], before.v[-1])
     options = {"t0": t - 0.02, "t_eval": [t + 0.02]}

@@ -119,6 +119,28 @@ def test_both_choose_the_same_pivots_and_cut_them_alike(n: int, cut: float) -> N
     assert np.abs(compiled.tangential(w) - dense.tangential(w)).max() < 1e-11
 
 
+@with_kernel
+@pytest.mark.parametrize("cut", [0.0, 1e-9])
+def test_both_leave_redundant_rows_of_a_long_chain_out(cut: float) -> None:
+    """Rows twice, and sums of neighbours: what is left of them is rounding, or nothing at all."""
+    model, M, G = rows_of(40)
+    G = G[np.abs(G).max(axis=1) > 0.0]
+    again = G[:-1:3] + G[1::3] if len(G) % 3 != 1 else G[:-1:3][: len(G[1::3])] + G[1::3]
+    G = np.concatenate([G, G[::4], again])
+    found: list[RowAlgebra] = []
+    for choice in ("dense", "kernel"):
+        found.append(row_algebra(G != 0.0, model, choice))
+        found[-1].factor(M, G, cut)
+    dense, compiled = found
+    rank = int(np.linalg.matrix_rank(G))
+    assert dense.rank == rank
+    assert compiled.rank == rank
+    assert np.abs(compiled.pivots - dense.pivots).max() < 1e-12
+    w = np.random.default_rng(4).standard_normal(model.nv)
+    assert np.abs(G @ compiled.tangential(w)).max() < 1e-11
+    assert np.abs(compiled.tangential(w) - dense.tangential(w)).max() < 1e-11
+
+
 @choices
 def test_what_cannot_be_factorised_is_refused_with_a_reason(choice: str) -> None:
     model, M, G = rows_of(3)
@@ -162,7 +184,7 @@ def test_the_factors_of_a_chain_grow_with_its_loops(angle: float) -> None:
     """Upright, half-way and next to the N-fold singularity; a dense Q would be 16 times as large
     for four times the loops."""
     entries = []
-    for n in (40, 160):
+    for n in (80, 320):
         model = pin.buildModelFromXML(generated.n_four_bar(n)[1])
         tip = {"xyz": (1.0, 0.0, 0.0)}
         loops = [
@@ -183,7 +205,7 @@ def test_the_factors_of_a_chain_grow_with_its_loops(angle: float) -> None:
         algebra.factor(data.M, rows.G)
         assert algebra.rank == 2 * n
         entries.append(algebra.entries)
-    assert entries[1] < 6.4 * entries[0]
+    assert entries[1] < 4.5 * entries[0]
 
 
 # --- ranks of many coordinates ------------------------------------------------------------------

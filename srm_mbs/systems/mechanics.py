@@ -18,6 +18,7 @@ from srm_mbs.systems.forces import resolved_forces
 from srm_mbs.systems.held import HeldForce
 from srm_mbs.systems.loops import COINCIDENT
 from srm_mbs.systems.manifold import Manifold
+from srm_mbs.systems.projection import PIVOT_SHARE, PIVOT_WINDOW
 from srm_mbs.workspaces import workspace
 
 _NO_ROWS = np.zeros(0)
@@ -140,6 +141,9 @@ class Mechanics(Manifold):
             "structural_rank": 0,
             "sigma_ref": 1.0,
             "algebra": "auto",
+            "order": [],
+            "pivot_share": PIVOT_SHARE,
+            "pivot_window": PIVOT_WINDOW,
             "friction_speed": float(self._friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,

@@ -26,6 +26,8 @@ from srm_mbs.systems.driven import DrivenKinematics
 from srm_mbs.systems.loops import LoopKinematics
 from srm_mbs.systems.mechanics import Mechanics
 from srm_mbs.systems.mechanism_terms import ClosedTerms, OpenTerms
+from srm_mbs.systems.ordering import LARGE, graph_order
+from srm_mbs.systems.pivoting import coordinate_parents
 from srm_mbs.systems.projection import Projection
 from srm_mbs.systems.units import constraint_units
 
@@ -80,7 +82,15 @@ class ClosedSystem(Mechanics):
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
         self._gap_scale: FloatArray = mechanism.at_start("gap_scale", self._gap_scales)
-        self.projection = Projection(self.structure.rank, self.structure.sigma_ref)
+        self._order: tuple[int, ...] = mechanism.derived("order", self._graph_order)
+        self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
+
+    def _graph_order(self) -> tuple[int, ...]:
+        """The rows in use along the graph of the loops, if there are many coordinates."""
+        # A joint that mimics another adds entries off the tree: the kernel has no sparse M there.
+        if self.nv <= LARGE or self.model.mimicking_joints:
+            return ()
+        return graph_order(self.loops.pattern(), coordinate_parents(self.model))
 
     def _resolved_loops(self) -> LoopKinematics:
         mechanism, structure = self.mechanism, self.structure
@@ -142,6 +152,7 @@ class ClosedSystem(Mechanics):
             "rows": len(self.loops.g),
             "structural_rank": self.structure.rank,
             "sigma_ref": self.structure.sigma_ref,
+            "order": list(self._order),
         }
         return super()._constants() | self.loops.constants() | own
 

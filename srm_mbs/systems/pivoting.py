@@ -10,6 +10,7 @@ makes it, whose sparse algebra follows the graph of the loops; its twin is ``alg
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,10 +19,17 @@ from scipy.linalg import lapack
 
 from srm_mbs.arrays import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
-from srm_mbs.systems.projection import PIVOT_ZERO, cholesky, pivoted_qr, unwhiten, whiten
-
-LARGE = 64
-"""Coordinates from which the kernel factorises."""
+from srm_mbs.systems.ordering import LARGE, graph_order
+from srm_mbs.systems.projection import (
+    PIVOT_SHARE,
+    PIVOT_WINDOW,
+    PIVOT_ZERO,
+    cholesky,
+    pivoted_qr,
+    swept_qr,
+    unwhiten,
+    whiten,
+)
 
 
 class RowAlgebra(Protocol):
@@ -30,9 +38,10 @@ class RowAlgebra(Protocol):
     Attributes
     ----------
     rank
-        Number of leading pivots that are not below the cut: the rows in use.
+        Number of pivots that are not below the cut: the rows in use.
     pivots : (min(nv, rows),)
-        |R_kk|, falling.
+        |R_kk|, falling.  With many coordinates they are taken along the graph of the loops
+        (:func:`~srm_mbs.systems.projection.swept_qr`), and sorted here.
     row_squares : (rows,)
         Squares of the columns of W.
     """
@@ -68,9 +77,10 @@ class RowAlgebra(Protocol):
 
 
 class DenseAlgebra:
-    """:class:`RowAlgebra` by LAPACK."""
+    """:class:`RowAlgebra` by LAPACK, with pivots along ``order`` if there is one."""
 
-    def __init__(self) -> None:
+    def __init__(self, order: Sequence[int] = ()) -> None:
+        self._graph_order = order
         self.rank = 0
         self.pivots = self.row_squares = np.zeros(0)
 
@@ -81,9 +91,15 @@ class DenseAlgebra:
         self.row_squares = (W * W).sum(axis=0)
         if not np.isfinite(self.row_squares).all():
             raise EvaluationError("the closures are not finite")
-        self._packed, self._order, self._tau, self.pivots = pivoted_qr(W)
-        small = np.flatnonzero(self.pivots < max(PIVOT_ZERO, cut))
-        self.rank = int(small[0]) if small.size else len(self.pivots)
+        floor = max(PIVOT_ZERO, cut)
+        if self._graph_order:
+            found = swept_qr(W, self._graph_order, min(W.shape), floor)
+        else:
+            found = pivoted_qr(W)
+        self._packed, self._order, self._tau, pivots = found
+        small = np.flatnonzero(pivots < floor)
+        self.rank = int(small[0]) if small.size else len(pivots)
+        self.pivots = np.sort(pivots)[::-1] if self._graph_order else pivots
 
     def _times_q(self, x: FloatArray, transposed: bool = False) -> FloatArray:
         """Q x or Q^T x for x (nv, k), with the reflections of the rows in use."""
@@ -153,7 +169,8 @@ class CompiledAlgebra:
     @property
     def pivots(self) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        return self._twin.pivots  # type: ignore[no-any-return]
+        falling: FloatArray = np.sort(self._twin.pivots)[::-1]
+        return falling
 
     @property
     def row_squares(self) -> FloatArray:
@@ -205,11 +222,13 @@ def row_algebra(
     from srm_mbs._kernel import core
 
     rows, nv = pattern.shape
-    if core is None or choice == "dense" or (choice == "auto" and nv <= LARGE) or not rows:
-        return DenseAlgebra()
     parents = [-1] * nv if model is None else coordinate_parents(model)
+    order = graph_order(pattern, parents)
+    if core is None or choice == "dense" or (choice == "auto" and nv <= LARGE) or not rows:
+        return DenseAlgebra(order)
+    supports = [np.flatnonzero(p).tolist() for p in pattern]
     return CompiledAlgebra(
-        core.Algebra(parents, [np.flatnonzero(p).tolist() for p in pattern], "auto")
+        core.Algebra(parents, supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")
     )
 
 

@@ -9,10 +9,16 @@ Householder reflections (LAPACK geqp3) keep Q orthogonal to round-off, so that n
 reorthogonalisation is needed.  Truncating or damping small pivots would delete the weak
 direction next to a singular configuration; pivots are dropped for redundancy only, or in the
 zone, where a prediction takes their place.
+
+The next pivot is the column of the largest remaining norm.  With many loops it is looked for along
+their graph instead (:func:`swept_qr`): what a pivot fills in then stays next to it, so that the
+cost of the kernel's sparse twin grows with the number of loops and no faster.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -65,6 +71,94 @@ def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
     return packed, permutation - 1, tau, np.abs(packed.diagonal())
 
 
+PIVOT_SHARE = 0.01
+"""Part of the largest norm from which a column may be a pivot where some depend on others."""
+
+PIVOT_WINDOW = 16
+"""Columns along the graph of which the largest is the next pivot."""
+
+ALIKE = 1.0 - 1e-8
+"""Squares of norms that differ by less are alike: rounding may have made the difference."""
+
+ABOVE = 1.0 + 1e-12
+"""A norm so little above a floor counts as below it: rounding may move it there."""
+
+
+def swept_qr(
+    W: FloatArray, order: Sequence[int], rank: int, floor: float
+) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
+    """As :func:`pivoted_qr`, with pivots along ``order`` (m,).
+
+    The next pivot is the largest in a window that moves along the order: what is next to each
+    other is pivoted as by :func:`pivoted_qr`.  If it is below ``floor``, all columns in the window
+    wait for the next sweep, which goes back, so that pivots below the floor come after all others.
+    If some columns are left over in the end, those wait, too, that are below ``PIVOT_SHARE`` of
+    the largest norm at the start of the sweep: columns that depend on others but for the error of
+    a stage must not take the place of independent ones.  The twin is ``swept_projection.cpp``.
+
+    Parameters
+    ----------
+    rank
+        Number of pivots; columns that are left over come last, with |R_kk| = 0.
+    floor
+        Zero or more; a smaller pivot is not in use.
+    """
+    A = np.array(W, order="F")
+    tau = np.zeros(min(A.shape))
+    pivots = np.zeros(len(tau))
+    taken: list[int] = []
+    waiting = list(order)
+    forward = True
+    while len(taken) < rank:
+        largest = float(np.sqrt((A[len(taken) :, waiting] ** 2).sum(axis=0).max()))
+        if not math.isfinite(largest):
+            pivots[:] = math.nan
+            break
+        least = PIVOT_SHARE * largest if rank < A.shape[1] else 0.0
+        if largest > floor * ABOVE:
+            least = max(least, floor)
+        deferred: list[int] = []
+        before = k = len(taken)
+        coming = waiting[::-1] if forward else waiting[:]
+        window: list[int] = []
+        open_ = np.zeros(A.shape[1], bool)
+        open_[waiting] = True
+        while k < rank:
+            while coming and len(window) < PIVOT_WINDOW:
+                window.append(coming.pop())
+            if not window:
+                break
+            squares = (A[k:, window] ** 2).sum(axis=0)
+            place = int(np.argmax(squares >= ALIKE * squares.max()))
+            size = math.sqrt(squares[place])
+            if size == 0.0 or size < least:
+                deferred += window
+                window = []
+                continue
+            j = window.pop(place)
+            column = A[k:, j]
+            alpha = float(column[0])
+            beta = -math.copysign(size, alpha)
+            tau[k] = (beta - alpha) / beta
+            v = column / (alpha - beta)
+            v[0] = 1.0
+            open_[j] = False
+            others = A[k:, open_]
+            A[k:, open_] = others - np.outer(tau[k] * v, v @ others)
+            A[k:, j] = v
+            A[k, j] = beta
+            pivots[k] = size
+            taken.append(j)
+            k += 1
+        deferred += window + coming[::-1]
+        if k == before:
+            break
+        waiting = deferred if forward else deferred[::-1]
+        forward = not forward
+    permutation = np.array(taken + waiting)
+    return np.asfortranarray(A[:, permutation]), permutation, tau, pivots
+
+
 class Projection:
     """Factorisation of M and G at one stage; reused from stage to stage.
 
@@ -74,6 +168,9 @@ class Projection:
         Structural rank: the number of pivots that are used in a regular configuration.
     sigma_ref
         Median of the last structural pivot over the closed samples of the load-time walk.
+    order
+        The rows along the graph of the loops, for many of them; see
+        :func:`~srm_mbs.systems.ordering.graph_order`.
 
     Attributes
     ----------
@@ -81,8 +178,9 @@ class Projection:
         How many factorisations were done; 0 for a mechanism without closures.
     """
 
-    def __init__(self, rank: int, sigma_ref: float) -> None:
+    def __init__(self, rank: int, sigma_ref: float, order: Sequence[int] = ()) -> None:
         self.structural_rank = rank
+        self._graph_order = order
         self.sigma_ref = sigma_ref
         self.factorisations = 0
         self.sigma = np.inf
@@ -102,7 +200,7 @@ class Projection:
 
     @property
     def order(self) -> IndexArray:
-        """The rows in use (rank,), by falling pivot."""
+        """The rows in use (rank,), in the order of their pivots."""
         order: IndexArray = self._permutation - 1
         return order
 
@@ -130,13 +228,21 @@ class Projection:
         _dtrtrs(U, self._white, 0, 1, 0, nv, 1)
         force = self.white_force = self._force
         self._gamma[:] = _dgemv(1.0, self._W, force, 1.0, bias, 0, 1, 0, 1, 1)  # W^T force + bias
-        packed, permutation, tau, _, _ = _dgeqp3(self._W, 3 * m + 3, 1)
         structural = self.structural_rank
-        pivot = abs(packed.item(structural - 1, structural - 1))
+        floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
+        if self._graph_order:
+            packed, permutation, tau, pivots = swept_qr(
+                self._W, self._graph_order, structural, floor
+            )
+            permutation = permutation + 1
+            self._pivots = pivots
+            pivot = float(pivots[:structural].min())
+        else:
+            packed, permutation, tau, _, _ = _dgeqp3(self._W, 3 * m + 3, 1)
+            pivot = abs(packed.item(structural - 1, structural - 1))
         self.sigma = pivot / self.sigma_ref
         if not self.sigma >= 0.0:
             raise EvaluationError("the mass matrix or the closures are not finite")
-        floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
         rank = structural
         while rank > 0 and not abs(packed.item(rank - 1, rank - 1)) >= floor:
             rank -= 1
@@ -165,7 +271,10 @@ class Projection:
 
     def normals(self) -> FloatArray:
         """L^-T Q (nv, rank): M-orthonormal normals of the rows in use, the weakest last."""
-        return self.unwhiten(self.Q)
+        if not self._graph_order:
+            return self.unwhiten(self.Q)
+        falling = np.argsort(-self._pivots[: self.rank], kind="stable")
+        return self.unwhiten(np.asfortranarray(self.Q[:, falling]))
 
     def normal(self, right: FloatArray) -> FloatArray:
         """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""

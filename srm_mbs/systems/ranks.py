@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs.arrays import FloatArray
-from srm_mbs.systems.pivoting import LARGE, CompiledAlgebra, RowAlgebra, row_algebra
+from srm_mbs.systems.ordering import LARGE
+from srm_mbs.systems.pivoting import CompiledAlgebra, RowAlgebra, row_algebra
 from srm_mbs.systems.projection import PIVOT_ZERO
 
 INERT = 1e-9

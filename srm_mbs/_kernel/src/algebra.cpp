@@ -32,8 +32,10 @@ nb::object array_of(const double* values, std::initializer_list<std::size_t> sha
 class Algebra {
 public:
     Algebra(std::vector<int> parents, std::vector<std::vector<int>> supports,
+            std::vector<int> order, double pivot_share, int pivot_window,
             const std::string& choice)
-        : pattern_{std::move(parents), std::move(supports)},
+        : pattern_{std::move(parents), std::move(supports), std::move(order), pivot_window,
+                   pivot_share},
           nv_(static_cast<int>(pattern_.parents.size())),
           rows_(static_cast<int>(pattern_.supports.size())),
           projection_(make_projection(std::min(nv_, rows_), 1.0, pattern_, choice)),
@@ -103,8 +105,10 @@ private:
 
 void bind_algebra(nb::module_& m) {
     nb::class_<Algebra>(m, "Algebra")
-        .def(nb::init<std::vector<int>, std::vector<std::vector<int>>, const std::string&>(),
-             nb::arg("parents"), nb::arg("supports"), nb::arg("algebra"))
+        .def(nb::init<std::vector<int>, std::vector<std::vector<int>>, std::vector<int>, double,
+                      int, const std::string&>(),
+             nb::arg("parents"), nb::arg("supports"), nb::arg("order"), nb::arg("pivot_share"),
+             nb::arg("pivot_window"), nb::arg("algebra"))
         .def("factor", &Algebra::factor, nb::arg("M"), nb::arg("G"), nb::arg("threshold"))
         .def("tangential", &Algebra::tangential)
         .def("solve", &Algebra::solve)

@@ -37,6 +37,8 @@ public:
 
     void set(int which, int i) { add(which, Word{1} << (i & 63), i >> 6); }
 
+    void remove(int which, int i) { unset(&words_[which * stride_], i); }
+
     // The bits of word w.
     void add(int which, Word bits, int w) {
         words_[which * stride_ + w] |= bits;

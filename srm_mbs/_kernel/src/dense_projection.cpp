@@ -114,7 +114,7 @@ private:
         times_q(white);
     }
 
-    void factorise(const double* M, const double* f, const double* bias) override {
+    void factorise(const double* M, const double* f, const double* bias, double) override {
         const int n = count();
         std::copy(M, M + n * n, U_.begin());
         std::copy(f, f + n, white_force.begin());

@@ -257,6 +257,9 @@ struct PySystem {
         data.structural_rank = whole(d, "structural_rank");
         data.sigma_ref = number(d, "sigma_ref");
         data.algebra = nb::cast<std::string>(d["algebra"]);
+        data.order = nb::cast<std::vector<int>>(d["order"]);
+        data.pivot_share = number(d, "pivot_share");
+        data.pivot_window = whole(d, "pivot_window");
         data.gap_scale = vector_of(d["gap_scale"]);
         data.unit = vector_of(d["unit"]);
         data.position_of = nb::cast<std::vector<int>>(d["position_of"]);

@@ -6,6 +6,7 @@
 #include "errors.hpp"
 #include "linear.hpp"
 #include "sparse_projection.hpp"
+#include "swept_projection.hpp"
 
 namespace srm {
 
@@ -29,10 +30,10 @@ Projection::Projection(int nv, int rows, int structural_rank, double sigma_ref)
 
 void Projection::factor(const double* M, const double* f, const double* bias, double threshold) {
     ++factorisations;
-    factorise(M, f, bias);
-    sigma = pivots_[structural_rank - 1] / sigma_ref;
-    if (!(sigma >= 0.0)) throw EvaluationError{Failure::closures};
     const double floor = threshold < 0.0 ? pivot_zero : std::max(pivot_zero, threshold * sigma_ref);
+    factorise(M, f, bias, floor);
+    sigma = smallest_pivot() / sigma_ref;
+    if (!(sigma >= 0.0)) throw EvaluationError{Failure::closures};
     rank = structural_rank;
     while (rank > 0 && !(pivots_[rank - 1] >= floor)) --rank;
     weak = rank < structural_rank;
@@ -86,10 +87,12 @@ std::unique_ptr<Projection> make_projection(int structural_rank, double sigma_re
                                             const Pattern& pattern, const std::string& choice) {
     const int nv = static_cast<int>(pattern.parents.size());
     const int rows = static_cast<int>(pattern.supports.size());
+    if (choice != "auto" && choice != "dense" && choice != "sparse")
+        throw std::invalid_argument("algebra must be auto, dense or sparse, not " + choice);
+    if (!pattern.order.empty() && choice != "dense")
+        return std::make_unique<SweptProjection>(structural_rank, sigma_ref, pattern);
     if (choice == "sparse" || (choice == "auto" && sparse_pays(pattern)))
         return std::make_unique<SparseProjection>(structural_rank, sigma_ref, pattern);
-    if (choice != "auto" && choice != "dense")
-        throw std::invalid_argument("algebra must be auto, dense or sparse, not " + choice);
     return make_dense_projection(nv, rows, structural_rank, sigma_ref);
 }
 

@@ -42,11 +42,11 @@ public:
     // x = L^T x and x = L^-T x, in place.
     virtual void whiten_velocity(double* x) const = 0;
     virtual void unwhiten(double* x) const = 0;
-    // M-orthonormal normals L^-T Q (nv, rank).
+    // M-orthonormal normals L^-T Q (nv, rank), that of the smallest pivot last.
     virtual void normals(double* out) const = 0;
     // Orthonormal white vectors (nv, nv - rank) that the rows in use do not see.
     virtual void complement(double* out) const = 0;
-    // |R_kk| (structural rank,), and the squares of the columns of W (rows,).
+    // |R_kk| (structural rank,) in the order of the pivots, and the squares of W's columns (rows,).
     const std::vector<double>& pivots() const { return pivots_; }
     const std::vector<double>& row_squares() const { return row_squares_; }
     virtual bool sparse() const = 0;
@@ -65,8 +65,11 @@ public:
 protected:
     Projection(int nv, int rows, int structural_rank, double sigma_ref);
 
-    // white_force, gamma_, row_squares_ and |R_kk| (pivots_) down to the structural rank.
-    virtual void factorise(const double* M, const double* f, const double* bias) = 0;
+    // white_force, gamma_, row_squares_ and |R_kk| (pivots_) down to the structural rank; those
+    // below `floor` are the last ones.
+    virtual void factorise(const double* M, const double* f, const double* bias,
+                           double floor) = 0;
+    virtual double smallest_pivot() const { return pivots_[structural_rank - 1]; }
     // x = Q Q^T x
     virtual void keep_normal(double* white) const = 0;
 
@@ -85,6 +88,10 @@ constexpr double norm_lost = 1.0536712127723509e-8;
 struct Pattern {
     std::vector<int> parents;                 // (nv,), the next coordinate to the root, or -1
     std::vector<std::vector<int>> supports;   // of the rows of G, ascending
+    // The rows of G along the graph of the loops; empty: the largest is the next pivot.
+    std::vector<int> order;
+    int pivot_window = 1;                     // columns along it, of which the largest is the next
+    double pivot_share = 1.0;                 // of the largest of all, if some depend on others
 };
 
 // choice: "auto", "dense" or "sparse".

@@ -5,6 +5,7 @@
 
 #include "errors.hpp"
 #include "linear.hpp"
+#include "scattered.hpp"
 
 namespace srm {
 
@@ -27,27 +28,6 @@ constexpr double dense_part = 0.5;
 // one is up to 1.8 times as fast where a long chain makes W full; below it the sparse one wins.
 constexpr double densest = 0.5;
 
-inline double gathered(const double* values, const int* rows, int n, const double* x) {
-    double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-    int i = 0;
-    for (; i + 4 <= n; i += 4) {
-        s0 += values[i] * x[rows[i]];
-        s1 += values[i + 1] * x[rows[i + 1]];
-        s2 += values[i + 2] * x[rows[i + 2]];
-        s3 += values[i + 3] * x[rows[i + 3]];
-    }
-    for (; i < n; ++i) s0 += values[i] * x[rows[i]];
-    return (s0 + s1) + (s2 + s3);
-}
-
-// Room for `more` numbers after the first `used`.
-template <class Number>
-Number* room(std::vector<Number>& numbers, int used, int more) {
-    const std::size_t needed = static_cast<std::size_t>(used) + more;
-    if (numbers.size() < needed) numbers.resize(std::max(needed, 2 * numbers.size()));
-    return numbers.data() + used;
-}
-
 // The largest of numbers >= -1, by four partial ones.
 inline double greatest(const double* values, int n) {
     double m0 = -1.0, m1 = -1.0, m2 = -1.0, m3 = -1.0;
@@ -60,10 +40,6 @@ inline double greatest(const double* values, int n) {
     }
     for (; i < n; ++i) m0 = std::max(m0, values[i]);
     return std::max(std::max(m0, m1), std::max(m2, m3));
-}
-
-inline void scattered(double a, const double* values, const int* rows, int n, double* x) {
-    for (int i = 0; i < n; ++i) x[rows[i]] += a * values[i];
 }
 
 }  // namespace
@@ -92,39 +68,42 @@ bool sparse_pays(const Pattern& pattern) {
 SparseProjection::SparseProjection(int structural_rank, double sigma_ref, const Pattern& pattern)
     : Projection(static_cast<int>(pattern.parents.size()),
                  static_cast<int>(pattern.supports.size()), structural_rank, sigma_ref),
-      diagonal_(nv),
-      inverse_(nv),
       A_(static_cast<std::size_t>(nv) * rows),
-      row_at_(nv),
-      column_at_(rows),
-      place_of_(rows),
-      new_row_(nv),
-      rows_of_(rows, nv),
-      packed_rows_of_(rows, nv),
-      columns_of_(nv, rows),
-      open_rows_(words_for(nv)),
-      open_columns_(words_for(rows)),
-      met_(words_for(rows)),
-      changed_(words_for(rows)),
-      own_rows_(words_for(nv)),
-      at_(nv),
-      window_(nv),
-      met_columns_(rows),
-      along_(rows),
       squares_(rows),
       first_squares_(rows),
       least_(rows),
       order_(rows),
-      position_(rows),
-      best_((rows + block - 1) / block),
-      stale_(best_.size()),
-      best_square_(best_.size()),
       pivot_row_(structural_rank),
+      reflections_(structural_rank + 1),
       reflection_start_(structural_rank + 1),
       right_start_(structural_rank + 1),
       tau_(structural_rank),
       right_diagonal_(structural_rank),
-      scratch_(rows) {
+      row_at_(nv),
+      column_at_(rows),
+      rows_of_(rows, nv),
+      columns_of_(nv, rows),
+      open_rows_(words_for(nv)),
+      open_columns_(words_for(rows)),
+      changed_(words_for(rows)),
+      along_(rows),
+      scratch_(rows),
+      diagonal_(nv),
+      inverse_(nv),
+      place_of_(rows),
+      new_row_(nv),
+      packed_rows_of_(rows, nv),
+      met_(words_for(rows)),
+      own_rows_(words_for(nv)),
+      at_(nv),
+      window_(nv),
+      met_columns_(rows),
+      position_(rows),
+      best_((rows + block - 1) / block),
+      stale_(best_.size()),
+      best_square_(best_.size()) {
+    // Each pivot has one reflection.
+    for (int k = 0; k <= structural_rank; ++k) reflections_[k] = k;
     ancestor_start_.push_back(0);
     for (int k = 0; k < nv; ++k) {
         for (int i = pattern.parents[k]; i >= 0; i = pattern.parents[i]) ancestors_.push_back(i);
@@ -176,7 +155,7 @@ void SparseProjection::whiten_velocity(double* x) const {
     }
 }
 
-// W and gamma; the rows of each column are those with entries above `negligible`.
+// W and gamma.
 void SparseProjection::whiten_columns(const double* bias) {
     for (int k = nv - 1; k >= 0; --k) {
         const int first = ancestor_start_[k], n = ancestor_start_[k + 1] - first;
@@ -184,8 +163,6 @@ void SparseProjection::whiten_columns(const double* bias) {
         scattered(-white_force[k], L_.data() + first, ancestors_.data() + first, n,
                   white_force.data());
     }
-    rows_of_.clear(rows, nv);
-    columns_of_.clear(nv, rows);
     for (int j = 0; j < rows; ++j) {
         double* a = column(j);
         const int start = support_start_[j], end = support_start_[j + 1];
@@ -206,7 +183,15 @@ void SparseProjection::whiten_columns(const double* bias) {
             throw EvaluationError{Failure::closures};
         }
         least_[j] = negligible * std::sqrt(squares);
-        for (int s = start; s < end; ++s) {
+    }
+}
+
+void SparseProjection::start_pivots() {
+    rows_of_.clear(rows, nv);
+    columns_of_.clear(nv, rows);
+    for (int j = 0; j < rows; ++j) {
+        double* a = column(j);
+        for (int s = support_start_[j]; s < support_start_[j + 1]; ++s) {
             const int k = support_[s];
             if (std::abs(a[k]) > least_[j]) {
                 rows_of_.set(j, k);
@@ -216,9 +201,6 @@ void SparseProjection::whiten_columns(const double* bias) {
             }
         }
     }
-}
-
-void SparseProjection::start_pivots() {
     for (int i = 0; i < nv; ++i) row_at_[i] = i;
     for (int j = 0; j < rows; ++j) order_[j] = position_[j] = column_at_[j] = place_of_[j] = j;
     open_all(nv, rows);
@@ -461,7 +443,7 @@ double SparseProjection::remaining_squares(int column) const {
     return squares;
 }
 
-void SparseProjection::pivoted_qr() {
+void SparseProjection::pivoted_qr(double) {
     start_pivots();
     for (int k = 0; k < structural_rank; ++k) {
         if (column_count_ > few && rows - k <= packing * column_count_) pack(rows - k);
@@ -473,6 +455,7 @@ void SparseProjection::pivoted_qr() {
     }
     for (int k = 0; k < structural_rank; ++k)
         pivots_[k] = k < steps_ ? std::abs(right_diagonal_[k]) : 0.0;
+    clear();
 }
 
 // The working columns are zero again, but for the supports that the next evaluation writes.
@@ -485,16 +468,16 @@ void SparseProjection::clear() {
     }
 }
 
-void SparseProjection::factorise(const double* M, const double* f, const double* bias) {
+void SparseProjection::factorise(const double* M, const double* f, const double* bias,
+                                 double floor) {
     cholesky(M);
     std::copy(f, f + nv, white_force.begin());
     whiten_columns(bias);
-    pivoted_qr();
-    clear();
+    pivoted_qr(floor);
 }
 
 void SparseProjection::times_q_transposed(double* x) const {
-    for (int k = 0; k < rank; ++k) {
+    for (int k = 0; k < reflections_[rank]; ++k) {
         if (tau_[k] == 0.0) continue;
         const int start = reflection_start_[k], n = reflection_start_[k + 1] - start;
         const int* at = reflection_row_.data() + start;
@@ -504,7 +487,7 @@ void SparseProjection::times_q_transposed(double* x) const {
 }
 
 void SparseProjection::times_q(double* x) const {
-    for (int k = rank - 1; k >= 0; --k) {
+    for (int k = reflections_[rank] - 1; k >= 0; --k) {
         if (tau_[k] == 0.0) continue;
         const int start = reflection_start_[k], n = reflection_start_[k + 1] - start;
         const int* at = reflection_row_.data() + start;

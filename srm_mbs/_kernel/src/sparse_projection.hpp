@@ -29,7 +29,7 @@ std::vector<std::vector<int>> with_ancestors(const Pattern& pattern);
 // Whether the sparse algebra is the faster one.
 bool sparse_pays(const Pattern& pattern);
 
-class SparseProjection final : public Projection {
+class SparseProjection : public Projection {
 public:
     SparseProjection(int structural_rank, double sigma_ref, const Pattern& pattern);
 
@@ -44,15 +44,42 @@ public:
     void complement(double* out) const override;
     bool sparse() const override { return true; }
     std::size_t entries() const override {
-        return static_cast<std::size_t>(reflection_start_[steps_]) + right_start_[steps_];
+        return static_cast<std::size_t>(reflection_start_[reflections_[steps_]]) +
+               right_start_[steps_];
     }
 
+protected:
+    // pivots_ and all of Q and R; the columns of W are zero again.
+    virtual void pivoted_qr(double floor);
+    // Zero, but for the entries of the row's support, before W; then before clearing.
+    std::vector<double> A_;
+    // Rows of W's columns, ascending, with all ancestors.
+    std::vector<int> support_start_, support_;
+    // Squares of W's columns, at first and of what is left; below the last, entries are left out.
+    std::vector<double> squares_, first_squares_, least_;
+
+    // Pivot k: its column of W in order_, its row in pivot_row_, its part of R's row k beside the
+    // diagonal at right_start_[k], and its reflections, those from reflections_[k] on.  Reflection l:
+    // rows and values (1 in the pivot row) at reflection_start_[l].
+    int steps_ = 0;
+    std::vector<int> order_, pivot_row_, reflections_, reflection_start_, right_start_;
+    std::vector<double> tau_, right_diagonal_;
+    std::vector<int> reflection_row_, right_column_;
+    std::vector<double> reflection_, right_;
+
+    // Working rows and columns: their rows and columns of W, bit sets of the rows of each column and
+    // of the columns of each row, and those that are not done.
+    std::vector<int> row_at_, column_at_;
+    BitSets rows_of_, columns_of_;
+    std::vector<Word> open_rows_, open_columns_, changed_;
+    std::vector<double> along_;
+    mutable std::vector<double> scratch_;
+
 private:
-    void factorise(const double* M, const double* f, const double* bias) override;
+    void factorise(const double* M, const double* f, const double* bias, double floor) override;
     void keep_normal(double* white) const override;
     void cholesky(const double* M);
     void whiten_columns(const double* bias);
-    void pivoted_qr();
     void start_pivots();
     void open_all(int row_count, int column_count);
     void pack(int open_columns);
@@ -72,18 +99,13 @@ private:
     // places, its diagonal inverted apart.
     std::vector<int> ancestor_start_, ancestors_;
     std::vector<double> L_, diagonal_, inverse_;
-    // Rows of W's columns, ascending, with all ancestors.
-    std::vector<int> support_start_, support_;
-
-    // Working columns (row_count_, column_count_), zero outside their rows; bit sets of the rows of
-    // each column and of the columns of each row.  All of W at first; then pack() keeps those that
-    // are open, in their order: working row i is row row_at_[i], working column j is column
-    // column_at_[j], and place_of_ its inverse.
-    std::vector<double> A_;
+    // Working columns (row_count_, column_count_) in A_, zero outside their rows.  All of W at
+    // first; then pack() keeps those that are open, in their order; place_of_ is the inverse of
+    // column_at_.
     int row_count_ = 0, column_count_ = 0;
-    std::vector<int> row_at_, column_at_, place_of_, new_row_;
-    BitSets rows_of_, packed_rows_of_, columns_of_;
-    std::vector<Word> open_rows_, open_columns_, met_, changed_, own_rows_;
+    std::vector<int> place_of_, new_row_;
+    BitSets packed_rows_of_;
+    std::vector<Word> met_, own_rows_;
     // The reflection at hand: its working rows and its pivot's, and its values from the first of
     // these rows to the last.
     std::vector<int> at_;
@@ -91,21 +113,12 @@ private:
     std::vector<double> window_;
     int own_first_ = 0, own_last_ = -1;
     std::vector<int> met_columns_;
-    std::vector<double> along_, squares_, first_squares_, least_;
 
     // Pivots: columns by position as in the dense algebra, which swaps them (order_), and positions
     // of the working columns; blocks of these remember their largest norm.
-    std::vector<int> order_, position_, best_;
+    std::vector<int> position_, best_;
     std::vector<char> stale_;
     std::vector<double> best_square_;
-    int steps_ = 0;
-
-    // Reflection k: rows and values (1 in the pivot row) at reflection_start_[k]; row k of R alike.
-    std::vector<int> pivot_row_, reflection_start_, right_start_;
-    std::vector<double> tau_, right_diagonal_;
-    std::vector<int> reflection_row_, right_column_;
-    std::vector<double> reflection_, right_;
-    mutable std::vector<double> scratch_;
 };
 
 }  // namespace srm

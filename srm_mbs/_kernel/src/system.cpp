@@ -82,6 +82,9 @@ Pattern System::pattern() const {
     Pattern out;
     out.parents.assign(work_->data.parents_fromRow.begin(), work_->data.parents_fromRow.end());
     out.supports.resize(data_.rows);
+    out.order = data_.order;
+    out.pivot_share = data_.pivot_share;
+    out.pivot_window = data_.pivot_window;
     for (const LoopRows& loop : data_.loops)
         std::fill_n(out.supports.begin() + loop.first_row,
                     loop.directions.size() / 3 + loop.distances.size() / 2 +

@@ -70,6 +70,9 @@ struct SystemData {
     int rows = 0, structural_rank = 0;
     double sigma_ref = 1.0;
     std::string algebra = "auto";       // "auto", "dense" or "sparse"
+    std::vector<int> order;             // of the rows along the graph of the loops, or empty
+    double pivot_share = 1.0;
+    int pivot_window = 1;
     std::vector<double> gap_scale;      // (rows,)
     std::vector<double> unit;           // (nv,)
     std::vector<int> position_of;       // (nv,), -1 on groups

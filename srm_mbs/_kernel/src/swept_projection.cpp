@@ -1,0 +1,362 @@
+#include "swept_projection.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include "linear.hpp"
+#include "scattered.hpp"
+
+namespace srm {
+
+namespace {
+
+// A norm so little above the floor counts as below it: rounding may move it there.
+constexpr double above = 1.0 + 1e-12;
+// Squares of norms that differ by less are alike: rounding may have made the difference.
+constexpr double alike = 1.0 - 1e-8;
+
+}  // namespace
+
+SweptProjection::SweptProjection(int structural_rank, double sigma_ref, const Pattern& pattern)
+    : SparseProjection(structural_rank, sigma_ref, pattern),
+      pivot_share_(pattern.pivot_share),
+      pivot_window_(pattern.pivot_window),
+      row_place_(nv),
+      values_(static_cast<std::size_t>(nv) * rows),
+      small_(rows),
+      left_(rows),
+      summed_(rows),
+      touched_(nv),
+      last_(nv),
+      entries_(nv),
+      by_pivot_(structural_rank) {
+    waiting_.reserve(rows);
+    deferred_.reserve(rows);
+    window_.reserve(pivot_window_);
+    column_at_ = pattern.order;
+    // Rows in the order in which the columns are done with them.
+    std::vector<int> done(nv, rows);
+    for (int j = 0; j < rows; ++j) {
+        const int row_of_g = column_at_[j];
+        for (int s = support_start_[row_of_g]; s < support_start_[row_of_g + 1]; ++s)
+            done[support_[s]] = j;
+    }
+    std::iota(row_at_.begin(), row_at_.end(), 0);
+    std::stable_sort(row_at_.begin(), row_at_.end(), [&](int a, int b) { return done[a] < done[b]; });
+    for (int i = 0; i < nv; ++i) row_place_[row_at_[i]] = i;
+}
+
+// The columns of W into the working rows.
+void SweptProjection::take_columns() {
+    rows_of_.clear(rows, nv);
+    columns_of_.clear(nv, rows);
+    for (int j = 0; j < rows; ++j) {
+        const int from = column_at_[j];
+        double* const a = column(from);
+        small_[j] = least_[from];
+        left_[j] = squares_[from];
+        for (int s = support_start_[from]; s < support_start_[from + 1]; ++s) {
+            const int k = support_[s];
+            if (std::abs(a[k]) > small_[j]) {
+                const int i = row_place_[k];
+                row(i)[j] = a[k];
+                rows_of_.set(j, i);
+                columns_of_.set(i, j);
+            }
+            a[k] = 0.0;
+        }
+    }
+    std::fill(open_rows_.begin(), open_rows_.end(), Word{0});
+    for (int i = 0; i < nv; ++i) set(open_rows_.data(), i);
+    std::fill(open_columns_.begin(), open_columns_.end(), Word{0});
+    waiting_.resize(rows);
+    std::iota(waiting_.begin(), waiting_.end(), 0);
+    reflections_[0] = reflection_start_[0] = right_start_[0] = steps_ = 0;
+}
+
+// All columns that wait are to come; the largest of their norms.
+double SweptProjection::start_sweep() {
+    if (steps_ > 0) {
+        // While a column waits, its rows are not kept.
+        rows_of_.clear(rows, nv);
+        for (const int j : waiting_) left_[j] = 0.0;
+        for (std::size_t w = 0; w < open_rows_.size(); ++w)
+            each_bit(open_rows_[w], static_cast<int>(w) << 6, [&](int i) {
+                const double* const a = row(i);
+                const Word* const own = columns_of_.words(i);
+                for (int u = columns_of_.first[i]; u <= columns_of_.last[i]; ++u)
+                    each_bit(own[u], u << 6, [&](int j) {
+                        left_[j] += a[j] * a[j];
+                        rows_of_.set(j, i);
+                    });
+            });
+    }
+    double largest = 0.0;
+    for (const int j : waiting_) {
+        largest = std::max(largest, left_[j]);
+        set(open_columns_.data(), j);
+    }
+    return std::sqrt(largest);
+}
+
+// Squares of what is left of a column that is to come.
+double SweptProjection::remaining(int column) const {
+    const Word* const own = rows_of_.words(column);
+    double squares = 0.0;
+    for (int w = rows_of_.first[column]; w <= rows_of_.last[column]; ++w)
+        each_bit(own[w] & open_rows_[w], w << 6, [&](int i) {
+            const double value = row(i)[column];
+            if (std::abs(value) > small_[column]) squares += value * value;
+        });
+    return squares;
+}
+
+// The place in the window of its largest column, the first of those that are alike but for rounding.
+int SweptProjection::take_from_window() {
+    double largest = 0.0;
+    for (const int j : window_) largest = std::max(largest, left_[j]);
+    int place = 0;
+    while (left_[window_[place]] < alike * largest) ++place;
+    return place;
+}
+
+// The open rows of a column and its entries there, which it takes out of them.
+void SweptProjection::gather(int column) {
+    const Word* const own = rows_of_.words(column);
+    touched_.clear();
+    entries_.clear();
+    for (int w = rows_of_.first[column]; w <= rows_of_.last[column]; ++w)
+        each_bit(own[w] & open_rows_[w], w << 6, [&](int i) {
+            double& value = row(i)[column];
+            if (std::abs(value) > small_[column]) {
+                touched_.push_back(i);
+                entries_.push_back(value);
+            }
+            value = 0.0;
+            columns_of_.remove(i, column);
+        });
+}
+
+void SweptProjection::pivoted_qr(double floor) {
+    take_columns();
+    bool forward = true;
+    while (steps_ < structural_rank) {
+        const double largest = start_sweep();
+        // All columns left are zero: no pivot from here on is used.
+        if (!(largest > 0.0)) break;
+        double least = structural_rank < rows ? pivot_share_ * largest : 0.0;
+        if (largest > floor * above) least = std::max(least, floor);
+        deferred_.clear();
+        window_.clear();
+        const int count = static_cast<int>(waiting_.size()), before = steps_;
+        int next = 0;
+        while (steps_ < structural_rank) {
+            for (; window_.size() < pivot_window_ && next < count; ++next) {
+                const int j = waiting_[forward ? next : count - 1 - next];
+                left_[j] = summed_[j] = remaining(j);
+                window_.push_back(j);
+            }
+            if (window_.empty()) break;
+            const int place = take_from_window(), j = window_[place];
+            if (left_[j] > 0.0 && left_[j] >= least * least) {
+                window_.erase(window_.begin() + place);
+                unset(open_columns_.data(), j);
+                gather(j);
+                if (touched_.empty())
+                    deferred_.push_back(j);
+                else
+                    eliminate(j, forward);
+            } else {
+                for (const int other : window_) unset(open_columns_.data(), other);
+                deferred_.insert(deferred_.end(), window_.begin(), window_.end());
+                window_.clear();
+            }
+        }
+        // What is left is negligible.
+        if (steps_ == before) break;
+        if (!forward) std::reverse(deferred_.begin(), deferred_.end());
+        std::swap(waiting_, deferred_);
+        forward = !forward;
+    }
+    for (int k = 0; k < structural_rank; ++k)
+        pivots_[k] = k < steps_ ? std::abs(right_diagonal_[k]) : 0.0;
+    clear_rows();
+}
+
+// Makes `column`, which gather() has found, the next pivot.
+void SweptProjection::eliminate(int column, bool forward) {
+    const int k = steps_, n = static_cast<int>(touched_.size());
+    const Word* const coming = open_columns_.data();
+    // The rows by the last column to come in each, in the direction of the sweep.
+    for (int c = 0; c < n; ++c) {
+        const int i = touched_[c];
+        const double entry = entries_[c];
+        const Word* const of = columns_of_.words(i);
+        int last = -1;
+        if (forward) {
+            for (int w = columns_of_.last[i]; w >= columns_of_.first[i] && last < 0; --w)
+                if (const Word both = of[w] & coming[w]) last = (w << 6) + 63 - __builtin_clzll(both);
+        } else {
+            for (int w = columns_of_.first[i]; w <= columns_of_.last[i] && last < 0; ++w)
+                if (const Word both = of[w] & coming[w])
+                    last = rows - (w << 6) - __builtin_ctzll(both);
+        }
+        int place = c;
+        for (; place > 0 && last_[place - 1] > last; --place) {
+            touched_[place] = touched_[place - 1];
+            entries_[place] = entries_[place - 1];
+            last_[place] = last_[place - 1];
+        }
+        touched_[place] = i;
+        entries_[place] = entry;
+        last_[place] = last;
+    }
+    reflections_[k + 1] = reflections_[k];
+    int pivot = 0;
+    const auto exchange = [&](int a, int b) {
+        std::swap(touched_[a], touched_[b]);
+        std::swap(entries_[a], entries_[b]);
+    };
+    for (int first = 0, end = 1; end <= n; ++end) {
+        if (end < n && last_[end] == last_[first]) continue;
+        if (first == 0) {
+            int top = 0;
+            for (int c = 1; c < end; ++c)
+                if (std::abs(entries_[c]) > std::abs(entries_[top])) top = c;
+            exchange(0, top);
+        } else {
+            // The rows before these are done, but for the pivot's.
+            exchange(first - 1, pivot);
+            pivot = first - 1;
+        }
+        if (end - pivot > 1) reflect(touched_.data() + pivot, entries_.data() + pivot, end - pivot);
+        first = end;
+    }
+    right_diagonal_[k] = entries_[pivot];
+    take_right(column, touched_[pivot]);
+}
+
+// Reflects n rows so that v, their entries in the next pivot's column, is left in the first alone.
+void SweptProjection::reflect(const int* at, double* v, int n) {
+    double squares = 0.0;
+    int from = static_cast<int>(open_columns_.size()), to = -1;
+    for (int c = 0; c < n; ++c) {
+        squares += v[c] * v[c];
+        from = std::min(from, columns_of_.first[at[c]]);
+        to = std::max(to, columns_of_.last[at[c]]);
+    }
+    const double alpha = v[0], beta = -std::copysign(std::sqrt(squares), alpha);
+    const double tau = (beta - alpha) / beta, scale = 1.0 / (alpha - beta);
+    v[0] = 1.0;
+    for (int c = 1; c < n; ++c) v[c] *= scale;
+    // A change by along v is one of length |along| |v|.
+    const double length = std::sqrt(2.0 / tau);
+    double* const along = along_.data();
+    for (int w = from; w <= to; ++w) {
+        Word met = 0;
+        for (int c = 0; c < n; ++c) met |= columns_of_.words(at[c])[w];
+        if (!met) continue;
+        // From the first of these columns to the last: the others are zero in these rows.
+        const int start = (w << 6) + __builtin_ctzll(met);
+        const int count = (w << 6) + 64 - __builtin_clzll(met) - start;
+        const double* const least = small_.data() + start;
+        const double* a = row(at[0]) + start;
+        for (int j = 0; j < count; ++j) along[j] = tau * a[j];
+        for (int c = 1; c < n; ++c) add(tau * v[c], row(at[c]) + start, along, count);
+        Word changed = 0;
+        for (int j = 0; j < count; ++j) {
+            const bool kept = std::abs(along[j]) * length > least[j];
+            along[j] = kept ? along[j] : 0.0;
+            changed |= Word{kept} << j;
+        }
+        if (!changed) continue;
+        changed <<= start & 63;
+        for (int c = 0; c < n; ++c) {
+            add(-v[c], along, row(at[c]) + start, count);
+            columns_of_.add(at[c], changed, w);
+        }
+        each_bit(changed & open_columns_[w], w << 6, [&](int j) {
+            for (int c = 0; c < n; ++c) rows_of_.set(j, at[c]);
+        });
+    }
+    const int l = reflections_[steps_ + 1]++;
+    if (static_cast<int>(tau_.size()) <= l) {
+        tau_.resize(2 * tau_.size());
+        reflection_start_.resize(tau_.size() + 1);
+    }
+    tau_[l] = tau;
+    const int used = reflection_start_[l];
+    int* const rows_at = room(reflection_row_, used, n);
+    double* const kept = room(reflection_, used, n);
+    for (int c = 0; c < n; ++c) {
+        rows_at[c] = row_at_[at[c]];
+        kept[c] = v[c];
+    }
+    reflection_start_[l + 1] = used + n;
+    v[0] = beta;
+}
+
+// The pivot's row is the next of R, and done.
+void SweptProjection::take_right(int column, int pivot) {
+    const int k = steps_++;
+    double* const a = row(pivot);
+    order_[k] = column_at_[column];
+    pivot_row_[k] = row_at_[pivot];
+    const Word* const own = columns_of_.words(pivot);
+    int used = right_start_[k];
+    for (int w = columns_of_.first[pivot]; w <= columns_of_.last[pivot]; ++w) {
+        if (!own[w]) continue;
+        int* const columns = room(right_column_, used, 64);
+        double* const values = room(right_, used, 64);
+        int kept = 0;
+        each_bit(own[w], w << 6, [&](int j) {
+            const double value = a[j];
+            a[j] = 0.0;
+            if (!(std::abs(value) > small_[j])) return;
+            columns[kept] = column_at_[j];
+            values[kept++] = value;
+            left_[j] -= value * value;
+        });
+        used += kept;
+    }
+    right_start_[k + 1] = used;
+    unset(open_rows_.data(), pivot);
+    for (const int j : window_)
+        if (left_[j] <= norm_lost * summed_[j]) left_[j] = summed_[j] = remaining(j);
+}
+
+// The working rows are zero again.
+void SweptProjection::clear_rows() {
+    for (std::size_t w = 0; w < open_rows_.size(); ++w)
+        each_bit(open_rows_[w], static_cast<int>(w) << 6, [&](int i) {
+            double* const a = row(i);
+            const Word* const own = columns_of_.words(i);
+            for (int u = columns_of_.first[i]; u <= columns_of_.last[i]; ++u)
+                each_bit(own[u], u << 6, [&](int j) { a[j] = 0.0; });
+        });
+}
+
+double SweptProjection::smallest_pivot() const {
+    return *std::min_element(pivots_.begin(), pivots_.end());
+}
+
+void SweptProjection::normals(double* out) const {
+    std::iota(by_pivot_.begin(), by_pivot_.begin() + rank, 0);
+    std::stable_sort(by_pivot_.begin(), by_pivot_.begin() + rank,
+                     [&](int a, int b) { return pivots_[a] > pivots_[b]; });
+    for (int k = 0; k < rank; ++k, out += nv) {
+        std::fill(out, out + nv, 0.0);
+        out[pivot_row_[by_pivot_[k]]] = 1.0;
+        for (int l = reflections_[by_pivot_[k] + 1] - 1; l >= 0; --l) {
+            const int start = reflection_start_[l], n = reflection_start_[l + 1] - start;
+            const int* const at = reflection_row_.data() + start;
+            const double* const v = reflection_.data() + start;
+            const double s = tau_[l] * gathered(v, at, n, out);
+            if (s != 0.0) scattered(-s, v, at, n, out);
+        }
+        unwhiten(out);
+    }
+}
+
+}  // namespace srm

@@ -87,8 +87,7 @@ class ClosedSystem(Mechanics):
 
     def _graph_order(self) -> tuple[int, ...]:
         """The rows in use along the graph of the loops, if there are many coordinates."""
-        # A joint that mimics another adds entries off the tree: the kernel has no sparse M there.
-        if self.nv <= LARGE or self.model.mimicking_joints:
+        if self.nv <= LARGE:  # not worth asking for
             return ()
         return graph_order(self.loops.pattern(), coordinate_parents(self.model))
 

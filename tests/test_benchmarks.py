@@ -480,10 +480,8 @@ def test_cost_against_size_has_ours_beside_pinocchio() -> None:
         names = list(row)
         parts = names[names.index("of a Python run: Pinocchio") :][:4]
         assert sum(row[part] for part in parts) == pytest.approx(1.0)
-        if srm.backend() == "kernel":
-            parts = names[names.index("of a run: Pinocchio") :][:4]
-            assert sum(row[part] for part in parts) == pytest.approx(1.0)
-            assert min(row[part] for part in parts) > 0.0
+        # Differences of measured times: on a busy machine a small one may come out negative.
+        assert ("evaluation in the kernel (us)" in row) == (srm.backend() == "kernel")
         if "evaluation in the kernel (us)" in row:
             parts = names[names.index("of a run: Pinocchio") :][:4]
             assert sum(row[part] for part in parts) == pytest.approx(1.0)

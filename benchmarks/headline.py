@@ -25,13 +25,13 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
-from srm_mbs import kernel
-from srm_mbs.compiled.twin import twin_of
-from srm_mbs.systems.loops import closure_errors
-from srm_mbs.systems.multibody import make_system
-from tests import reduced
-from tests.convergence import observed_order, turning
-from tests.mechanisms import floating_ring
+from srm_mbs.dynamics.constraints.rows import closure_errors
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.kernel import backend
+from srm_mbs.integration.kernel.system import twin_of
+from tests.support import reduced
+from tests.support.convergence import observed_order, turning
+from tests.support.mechanisms import floating_ring
 
 EXACT = json.loads((Path(__file__).parent.parent / "tests/data/exact_solutions.json").read_text())
 
@@ -160,7 +160,7 @@ def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float, float]:
 
     inside = 2000
     compiled = float("nan")
-    if kernel.core is not None:
+    if backend.core is not None:
         twin = twin_of(system)
         compiled = per_call(lambda: twin.repeat(0.0, state, inside), 1) / inside
     return compiled, per_call(whole), per_call(pinocchio_only)

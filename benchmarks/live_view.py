@@ -45,7 +45,7 @@ def measured(name: str, seconds: float, repeats: int, page: bool) -> str:
     with ExitStack() as stack:
         chromium = None
         if page:
-            from srm_mbs.rendering import browser
+            from srm_mbs.visualization.animation.video import browser
 
             chromium = stack.enter_context(browser())
         for _ in range(repeats):

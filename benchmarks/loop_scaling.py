@@ -23,8 +23,8 @@ import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs._kernel import core
-from srm_mbs.arrays import FloatArray
-from srm_mbs.systems.multibody import ClosedSystem
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import ClosedSystem
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
 ANGLES = {"regular": 0.5 * np.pi, "half-way": 0.8, "singular": 1e-3}

@@ -27,15 +27,16 @@ from unittest.mock import patch
 import numpy as np
 
 import srm_mbs as srm
-from srm_mbs import kernel, simulation
-from srm_mbs.arrays import FloatArray
-from srm_mbs.compiled import handover
-from srm_mbs.methods import psrm
-from srm_mbs.methods.base import ErrorNorm, Memory, StepResult
-from srm_mbs.methods.split import later_stages
-from srm_mbs.options import step_size_control
-from srm_mbs.stepping.loop import Closures
-from srm_mbs.systems.base import System
+from srm_mbs import api
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.driver import Closures
+from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.kernel import marshalling
+from srm_mbs.integration.methods import psrm
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.split_step import later_stages
+from srm_mbs.simulation.options import step_size_control
 
 CASES = (
     ("four_bar", 6.0),
@@ -130,9 +131,9 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(psrm, "split_start", plain_start),
         patch.object(psrm, "split_step", plain_step),
         patch.object(psrm, "split_accept", plain_accept),
-        patch.object(simulation, "placed_control", control),
-        patch.object(simulation, "start", start),
-        patch.object(simulation, "bifurcations_told", lambda _: ""),
+        patch.object(api, "placed_control", control),
+        patch.object(api, "start", start),
+        patch.object(api, "bifurcations_told", lambda _: ""),
         patch.object(Closures, "trouble", lambda *_: ""),
     ):
         yield
@@ -146,8 +147,8 @@ NEVER = {"watched": -1.0, "far": 0.0, "gap_every": -(2**31 - 1)}
 def nothing_on_the_kernel() -> Iterator[None]:
     """The same for the kernel, together with ``placement="off"``."""
     with (
-        patch.dict(handover.CONSTANTS, NEVER),
-        patch.object(simulation, "bifurcations_told", lambda _: ""),
+        patch.dict(marshalling.CONSTANTS, NEVER),
+        patch.object(api, "bifurcations_told", lambda _: ""),
     ):
         yield
 

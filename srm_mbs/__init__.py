@@ -11,21 +11,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from srm_mbs.actions import Event, Switch, impact
-    from srm_mbs.analysis.certificate import Certificate, certify
-    from srm_mbs.analysis.energy_balance import EnergyBalance
+    from srm_mbs.analysis.accuracy.certificate import Certificate, certify
+    from srm_mbs.analysis.assembly_modes import AssemblyMode, assembly_modes
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
-    from srm_mbs.analysis.following import FollowedPath, follow
     from srm_mbs.analysis.inverse_dynamics import InverseDynamics, inverse_dynamics
     from srm_mbs.analysis.linearisation import Linearisation, linearise
-    from srm_mbs.analysis.mobility import MobilityMap, mobility_map
-    from srm_mbs.analysis.modes import AssemblyMode, assembly_modes
-    from srm_mbs.anchors import Anchor
-    from srm_mbs.assembly import Assembly, assemble
-    from srm_mbs.closures import CLOSURE_TYPES
-    from srm_mbs.dae import solve_dae
-    from srm_mbs.dae_solution import DaeSolution
-    from srm_mbs.drives import Drive
+    from srm_mbs.analysis.path_following import FollowedPath, follow
+    from srm_mbs.api import simulate
+    from srm_mbs.assembly.assemble import Assembly, assemble
     from srm_mbs.errors import (
         AnalysisError,
         AssemblyError,
@@ -34,108 +27,114 @@ if TYPE_CHECKING:
         SrmError,
         SrmWarning,
     )
-    from srm_mbs.force_element import ForceElement
-    from srm_mbs.forces import (
+    from srm_mbs.formats.convert import convert
+    from srm_mbs.formats.load import bundled_models, load, n_four_bar
+    from srm_mbs.integration.kernel.backend import backend
+    from srm_mbs.integration.methods.butcher import ButcherTableau
+    from srm_mbs.integration.methods.psrm import PSRM
+    from srm_mbs.integration.methods.srm import SRM
+    from srm_mbs.integration.methods.tableaus import TABLEAUS
+    from srm_mbs.model.anchors import Anchor
+    from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
+    from srm_mbs.model.dae import SemiExplicitDAE
+    from srm_mbs.model.drives import Drive
+    from srm_mbs.model.forces import (
         FORCE_TYPES,
         Bushing,
+        ForceElement,
         JointTorque,
         LimitSpring,
         SpringDamper,
         TorsionSpring,
+        UserForce,
         Wrench,
     )
-    from srm_mbs.kernel import backend
-    from srm_mbs.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
-    from srm_mbs.live import LiveView
-    from srm_mbs.loading import bundled_models, load, n_four_bar
-    from srm_mbs.loading.converting import convert
-    from srm_mbs.loop_closure import LoopClosure
-    from srm_mbs.mechanism import Mechanism
-    from srm_mbs.methods.butcher import ButcherTableau
-    from srm_mbs.methods.psrm import PSRM
-    from srm_mbs.methods.srm import SRM
-    from srm_mbs.methods.tableaus import TABLEAUS
-    from srm_mbs.motion import JointMotion
-    from srm_mbs.pinocchio_constraints import closures_from_pinocchio
-    from srm_mbs.semi_explicit import SemiExplicitDAE
-    from srm_mbs.simulation import simulate
-    from srm_mbs.simulator import Simulator
-    from srm_mbs.solution import Solution
-    from srm_mbs.storage import load_solution
+    from srm_mbs.model.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
+    from srm_mbs.model.mechanism import Mechanism
+    from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
+    from srm_mbs.simulation.dae_result import DaeSolution
+    from srm_mbs.simulation.dae_run import solve_dae
+    from srm_mbs.simulation.energy_balance import EnergyBalance
+    from srm_mbs.simulation.mobility import MobilityMap, mobility_map
+    from srm_mbs.simulation.result import Solution
+    from srm_mbs.simulation.segmented_run import Event, Switch, impact
+    from srm_mbs.simulation.simulator import Simulator
+    from srm_mbs.simulation.storage import load_solution
     from srm_mbs.sweeps.results import Sweep
-    from srm_mbs.sweeps.running import sweep
+    from srm_mbs.sweeps.sweep import sweep
     from srm_mbs.sweeps.tasks import standard_measures
-    from srm_mbs.user_forces import UserForce
+    from srm_mbs.visualization.animation.joint_motion import JointMotion
+    from srm_mbs.visualization.animation.live import LiveView
 
 _HOME = {
     "AnalysisError": "errors",
-    "Anchor": "anchors",
-    "Assembly": "assembly",
+    "Anchor": "model.anchors",
+    "Assembly": "assembly.assemble",
     "AssemblyError": "errors",
-    "AssemblyMode": "analysis.modes",
-    "Bushing": "forces",
-    "ButcherTableau": "methods.butcher",
-    "CLOSURE_TYPES": "closures",
-    "Certificate": "analysis.certificate",
-    "ConstantSpeed": "laws",
-    "DaeSolution": "dae_solution",
-    "Drive": "drives",
-    "EnergyBalance": "analysis.energy_balance",
+    "AssemblyMode": "analysis.assembly_modes",
+    "Bushing": "model.forces",
+    "ButcherTableau": "integration.methods.butcher",
+    "CLOSURE_TYPES": "model.closures",
+    "Certificate": "analysis.accuracy.certificate",
+    "ConstantSpeed": "model.laws",
+    "DaeSolution": "simulation.dae_result",
+    "Drive": "model.drives",
+    "EnergyBalance": "simulation.energy_balance",
     "Equilibrium": "analysis.equilibrium",
-    "Event": "actions",
-    "FORCE_TYPES": "forces",
-    "FollowedPath": "analysis.following",
-    "ForceElement": "force_element",
+    "Event": "simulation.segmented_run",
+    "FORCE_TYPES": "model.forces",
+    "FollowedPath": "analysis.path_following",
+    "ForceElement": "model.forces",
     "InputError": "errors",
     "InverseDynamics": "analysis.inverse_dynamics",
-    "JointMotion": "motion",
-    "JointTorque": "forces",
-    "LAW_TYPES": "laws",
-    "LimitSpring": "forces",
-    "LiveView": "live",
+    "JointMotion": "visualization.animation.joint_motion",
+    "JointTorque": "model.forces",
+    "LAW_TYPES": "model.laws",
+    "LimitSpring": "model.forces",
     "Linearisation": "analysis.linearisation",
-    "LoopClosure": "loop_closure",
-    "Mechanism": "mechanism",
-    "MinimumJerk": "laws",
-    "MobilityMap": "analysis.mobility",
-    "PSRM": "methods.psrm",
-    "Polynomial": "laws",
-    "SRM": "methods.srm",
-    "SemiExplicitDAE": "semi_explicit",
+    "LiveView": "visualization.animation.live",
+    "LoopClosure": "model.closures",
+    "Mechanism": "model.mechanism",
+    "MinimumJerk": "model.laws",
+    "MobilityMap": "simulation.mobility",
+    "PSRM": "integration.methods.psrm",
+    "Polynomial": "model.laws",
+    "SRM": "integration.methods.srm",
+    "SemiExplicitDAE": "model.dae",
     "SimulationError": "errors",
-    "Simulator": "simulator",
-    "Sine": "laws",
-    "Solution": "solution",
-    "SpringDamper": "forces",
+    "Simulator": "simulation.simulator",
+    "Sine": "model.laws",
+    "Solution": "simulation.result",
+    "SpringDamper": "model.forces",
     "SrmError": "errors",
     "SrmWarning": "errors",
     "Sweep": "sweeps.results",
-    "Switch": "actions",
-    "TABLEAUS": "methods.tableaus",
-    "Table": "laws",
-    "TorsionSpring": "forces",
-    "UserForce": "user_forces",
-    "Wrench": "forces",
-    "assemble": "assembly",
-    "assembly_modes": "analysis.modes",
-    "backend": "kernel",
-    "bundled_models": "loading",
-    "certify": "analysis.certificate",
-    "convert": "loading.converting",
+    "Switch": "simulation.segmented_run",
+    "TABLEAUS": "integration.methods.tableaus",
+    "Table": "model.laws",
+    "TorsionSpring": "model.forces",
+    "UserForce": "model.forces",
+    "Wrench": "model.forces",
+    "assemble": "assembly.assemble",
+    "assembly_modes": "analysis.assembly_modes",
+    "backend": "integration.kernel.backend",
+    "bundled_models": "formats.load",
+    "certify": "analysis.accuracy.certificate",
+    "closures_from_pinocchio": "model.pinocchio_constraints",
+    "convert": "formats.convert",
     "equilibrium": "analysis.equilibrium",
-    "follow": "analysis.following",
+    "follow": "analysis.path_following",
+    "impact": "simulation.segmented_run",
     "inverse_dynamics": "analysis.inverse_dynamics",
     "linearise": "analysis.linearisation",
-    "closures_from_pinocchio": "pinocchio_constraints",
-    "impact": "actions",
-    "load": "loading",
-    "load_solution": "storage",
-    "mobility_map": "analysis.mobility",
-    "n_four_bar": "loading",
-    "simulate": "simulation",
-    "solve_dae": "dae",
+    "load": "formats.load",
+    "load_solution": "simulation.storage",
+    "mobility_map": "simulation.mobility",
+    "n_four_bar": "formats.load",
+    "simulate": "api",
+    "solve_dae": "simulation.dae_run",
     "standard_measures": "sweeps.tasks",
-    "sweep": "sweeps.running",
+    "sweep": "sweeps.sweep",
 }
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 Every exception carries the data that failed, so that a program can react to it without
 parsing the text.  Bad input raises :class:`InputError` before any stepping; a run that
-cannot go on returns a partial :class:`~srm_mbs.solution.Solution` and raises
+cannot go on returns a partial :class:`~srm_mbs.simulation.result.Solution` and raises
 :class:`SimulationError` only on request.
 """
 
@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from srm_mbs.dae_solution import DaeSolution
-    from srm_mbs.solution import Solution
+    from srm_mbs.simulation.dae_result import DaeSolution
+    from srm_mbs.simulation.result import Solution
 
 
 CHECK_WRITING = "Check the folder, its permissions and the space on the disk"

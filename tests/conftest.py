@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.rendering import browser as headless_browser
+from srm_mbs.visualization.animation.video import browser as headless_browser
 
 DATA = Path(__file__).parent / "data"
 

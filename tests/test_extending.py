@@ -9,8 +9,8 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.closures import ClosureType, ClosureValues, RowSet
-from srm_mbs.summary import loop_rows
+from srm_mbs.analysis.summary import loop_rows
+from srm_mbs.model.closures import ClosureType, ClosureValues, RowSet
 
 
 def _rows(values: ClosureValues) -> RowSet:

@@ -15,7 +15,7 @@ from itertools import takewhile
 from pathlib import Path
 
 import srm_mbs as srm
-from srm_mbs.loading.bundled import models_folder
+from srm_mbs.formats.load import models_folder
 
 DOCS = Path(__file__).parents[1] / "docs"
 SIZE = (600, 400)

@@ -18,9 +18,9 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from benchmarks.thesis.drawing import BLACK, BLUE, GREY, VERMILION, label, legend, panels, save
-from srm_mbs.arrays import FloatArray
-from srm_mbs.systems.loops import closure_errors
-from tests.reduced import index_one
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import closure_errors
+from tests.support.reduced import index_one
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,8 +18,8 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 
-from srm_mbs.methods.butcher import ExactRow
-from srm_mbs.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.butcher import ExactRow
+from srm_mbs.integration.methods.tableaus import get_tableau
 
 Point = tuple[float, float]
 

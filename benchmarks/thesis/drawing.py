@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.thesis.entries import Rows
-from srm_mbs.plotting.style import BLACK, BLUE, GREY, VERMILION, prepare
-from srm_mbs.plotting.style import PALETTE as COLOURS
+from srm_mbs.visualization.plotting.figure import BLACK, BLUE, GREY, VERMILION, prepare
+from srm_mbs.visualization.plotting.figure import PALETTE as COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,7 @@ from benchmarks.thesis.pendulum_equations import (
 from benchmarks.thesis.published import PublishedSRM
 from benchmarks.thesis.runs import fixed_step_run
 from benchmarks.thesis.systems import CartesianPendulum
-from srm_mbs.arrays import FloatArray
+from srm_mbs._typing import FloatArray
 
 
 def _length(states: FloatArray) -> FloatArray:

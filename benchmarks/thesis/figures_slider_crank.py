@@ -15,13 +15,13 @@ from benchmarks.thesis.entries import PRINTED, Entry
 from benchmarks.thesis.published import PublishedControl, PublishedSRM
 from benchmarks.thesis.runs import fixed_step_run
 from benchmarks.thesis.systems import Index2, Published, slider_crank
-from srm_mbs.arrays import FloatArray
-from srm_mbs.methods.base import ErrorNorm, Memory, Method, StepResult
-from srm_mbs.stepping.loop import integrate
-from srm_mbs.stepping.stepsize import Proposal, Verdict
-from srm_mbs.systems.loops import closure_errors
-from srm_mbs.systems.multibody import ClosedSystem
-from tests import reduced
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import closure_errors
+from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.integration.control.step_size import Proposal, Verdict
+from srm_mbs.integration.driver import integrate
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method, StepResult
+from tests.support import reduced
 
 PERIOD = 4.29657624142677449
 """Of the motion (s); every half of it a singular configuration is passed."""

@@ -13,7 +13,7 @@ import numpy as np
 
 import srm_mbs as srm
 from benchmarks.thesis.problems import UNIT, problem_one
-from srm_mbs.methods.base import Method
+from srm_mbs.integration.methods.base import Method
 
 STEPS = (10, 16, 25, 40, 63, 100, 158, 250, 400, 630, 1000)
 """Steps per unit time."""

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.thesis.systems import GRAVITY
-from srm_mbs.arrays import FloatArray
-from srm_mbs.methods.butcher import ButcherTableau
+from srm_mbs._typing import FloatArray
+from srm_mbs.integration.methods.butcher import ButcherTableau
 
 Field = Callable[[float, Any], list[float]]
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import srm_mbs as srm
-from tests import daes
+from tests.support import daes
 
 UNIT = 0.01
 """Problem 1 is solved for x = UNIT t^p: it is linear, so that every error scales with it.  The

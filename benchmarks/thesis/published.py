@@ -16,10 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray
-from srm_mbs.methods.base import ErrorNorm, Memory, StepResult, SweepNode
-from srm_mbs.methods.butcher import ButcherTableau
-from srm_mbs.methods.sweeps import (
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.control.step_size import Proposal, Verdict
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult, SweepNode
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.sweep import (
     Answer,
     Start,
     Sweep,
@@ -27,9 +29,7 @@ from srm_mbs.methods.sweeps import (
     multipliers_between,
     sweep_over,
 )
-from srm_mbs.methods.tableaus import get_tableau
-from srm_mbs.stepping.stepsize import Proposal, Verdict
-from srm_mbs.systems.base import System
+from srm_mbs.integration.methods.tableaus import get_tableau
 
 SAFETY, LARGEST_FACTOR = 0.8, 5.0
 """alpha and alpha_max of appendix B."""
@@ -69,7 +69,7 @@ class PublishedSRM:
     def step(
         self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
     ) -> StepResult:
-        """One step; see :class:`~srm_mbs.methods.base.Method`."""
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         scheme, s = self.scheme, self.scheme.n_stages
         eps = h if self.eps is None else self.eps
         how = interpolant(scheme, "auto")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray
-from srm_mbs.methods.base import ErrorNorm, Method
-from srm_mbs.stepping.loop import integrate
-from srm_mbs.stepping.stepsize import FixedStep
-from srm_mbs.systems.base import System
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.control.step_size import FixedStep
+from srm_mbs.integration.driver import integrate
+from srm_mbs.integration.methods.base import ErrorNorm, Method
 
 CHUNK = 1000
 """Steps recorded at a time."""

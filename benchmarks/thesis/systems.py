@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
-from srm_mbs.arrays import FloatArray
-from srm_mbs.systems.base import Terms, Zone
-from srm_mbs.systems.loops import LoopKinematics
-from srm_mbs.systems.multibody import ClosedSystem
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.dynamics.system import Terms, Zone
 
 GRAVITY = 9.81
 """m/s^2; the thesis prints no value, and this one gives its figures."""
@@ -143,7 +143,7 @@ class Index2(Published):
     """Index 2: the constraint is G v = 0 alone, (2.4): q' = v without -E g/eps."""
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
-        """See :class:`~srm_mbs.systems.base.System`."""
+        """See :class:`~srm_mbs.dynamics.system.System`."""
         terms = super().evaluate(t, state, zone)
         return _Index2Terms(terms, state[self.nq :])  # type: ignore[return-value]
 
@@ -184,7 +184,7 @@ class CartesianPendulum:
     """Unit mass on a massless unit rod, state (x, z, x', z') in m and m/s; g = x^2 + z^2 - 1.
 
     Only what fixed-step sweeps of (2.6) need of the contract of
-    :class:`~srm_mbs.systems.base.System`.
+    :class:`~srm_mbs.dynamics.system.System`.
     """
 
     has_constraints = True

@@ -21,7 +21,7 @@ from benchmarks.thesis.orders import (
     srm_fixed_step_curve,
 )
 from benchmarks.thesis.problems import START_TWO, problem_two
-from srm_mbs.methods.base import Method
+from srm_mbs.integration.methods.base import Method
 
 FIXED_STEP = 0.005
 GRIDS = (

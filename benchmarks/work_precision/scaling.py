@@ -35,11 +35,11 @@ from benchmarks.work_precision.peers.pinocchio_dynamics import PinocchioDynamics
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.records import Results
-from srm_mbs.arrays import FloatArray
-from srm_mbs.compiled.run import CompiledRun
-from srm_mbs.compiled.twin import twin_of
-from srm_mbs.systems.multibody import make_system
-from srm_mbs.workspaces import workspace
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.kernel.run import CompiledRun
+from srm_mbs.integration.kernel.system import twin_of
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
 LOOPS_OF_ALL = 160

@@ -20,12 +20,13 @@ import pinocchio as pin
 import srm_mbs as srm
 from benchmarks.work_precision import timing
 from benchmarks.work_precision.records import Results
-from srm_mbs import kernel, simulation
-from srm_mbs.loading.urdf import lock_joints
-from srm_mbs.methods import split
-from srm_mbs.systems.multibody import OpenSystem, make_system
-from srm_mbs.systems.projection import cholesky, unwhiten, whiten
-from srm_mbs.visuals import visuals_of
+from srm_mbs import api
+from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
+from srm_mbs.dynamics.multibody import OpenSystem, make_system
+from srm_mbs.formats.urdf.parser import lock_joints
+from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.methods import split_step
+from srm_mbs.visualization.animation.shapes import visuals_of
 
 RTOL = 1e-8
 SAME = 1e-6
@@ -82,7 +83,7 @@ class _AlgebraAnyway(OpenSystem):
 
 def _open_chain() -> Item:
     mechanism = srm.load("pendulum_chain")
-    anyway = lambda: patch.object(simulation, "make_system", _AlgebraAnyway)  # noqa: E731
+    anyway = lambda: patch.object(api, "make_system", _AlgebraAnyway)  # noqa: E731
     run = lambda: _run(mechanism, 3.0)  # noqa: E731
     return Item(
         "constraint algebra of an open chain",
@@ -217,7 +218,7 @@ def _lazy_results() -> Item:
 def _placement() -> Item:
     mechanism = srm.load("four_bar")
     run = lambda: _run(mechanism, 5.0)  # noqa: E731
-    near = lambda: patch.object(split, "FAR", 1e300)  # noqa: E731
+    near = lambda: patch.object(split_step, "FAR", 1e300)  # noqa: E731
     return Item(
         "placement and zone while sigma is far", "four_bar, 5 s", run, _under(near, run), _last
     )
@@ -226,7 +227,7 @@ def _placement() -> Item:
 def _history() -> Item:
     mechanism = srm.load("four_bar")
     run = lambda: _run(mechanism, 5.0)  # noqa: E731
-    always = lambda: patch.object(split, "WATCHED", 1e300)  # noqa: E731
+    always = lambda: patch.object(split_step, "WATCHED", 1e300)  # noqa: E731
     return Item(
         "multiplier history while sigma is far", "four_bar, 5 s", run, _under(always, run), _last
     )

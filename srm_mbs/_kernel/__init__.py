@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 
-from srm_mbs._kernel.sources import fingerprint
+from srm_mbs._kernel.build_hash import fingerprint
 
 INSTALL_AGAIN = (
     "install srm-mbs again from its source: "

@@ -1,1 +1,1 @@
-"""Around the simulation: energy balance, equilibria, linearisation, inverse dynamics, mobility."""
+"""Statics, linearisation, inverse dynamics, assembly modes, path following, summaries."""

@@ -1,10 +1,11 @@
 r"""Static equilibria: where gravity, force elements and closures balance at rest.
 
-In minimal coordinates z around the current configuration (:mod:`srm_mbs.systems.tangent`) the
-forces at rest are Q(z) = S^T f, S the velocities per unit z', and an equilibrium has Q = 0.  With
-K = -dQ/dz, the Hessian of the potential where there is one, *stable* equilibria are searched by
-trust-region steps (K + mu) p = Q that the forces do work on, the *nearest* one by
-Levenberg-Marquardt steps on Q.  S^T f = S^T M v', with the constrained acceleration v' at rest.
+In minimal coordinates z around the current configuration
+(:mod:`srm_mbs.dynamics.constraints.local_coordinates`) the forces at rest are Q(z) = S^T f, S the
+velocities per unit z', and an equilibrium has Q = 0.  With K = -dQ/dz, the Hessian of the potential
+where there is one, *stable* equilibria are searched by trust-region steps (K + mu) p = Q that the
+forces do work on, the *nearest* one by Levenberg-Marquardt steps on Q.  S^T f = S^T M v', with the
+constrained acceleration v' at rest.
 """
 
 from __future__ import annotations
@@ -17,17 +18,27 @@ from typing import Any, Literal
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray, IndexArray
-from srm_mbs.assembly import assemble
-from srm_mbs.closing_failure import free_coordinates
-from srm_mbs.coordinates import joint_coordinates
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.assembly.assemble import assemble
+from srm_mbs.assembly.diagnosis import free_coordinates
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.local_coordinates import (
+    ChartPoint,
+    TangentChart,
+    differences,
+    tangent_basis,
+)
+from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.singularities.local_analysis import (
+    SINGULAR,
+    TAU,
+    nearest_singular,
+    smallest_singular_value,
+)
 from srm_mbs.errors import AnalysisError, InputError
-from srm_mbs.mechanism import Mechanism
-from srm_mbs.systems.closure_geometry import ClosureGeometry
-from srm_mbs.systems.multibody import make_system
-from srm_mbs.systems.reactions import reactions_at
-from srm_mbs.systems.singular import SINGULAR, TAU, nearest_singular, smallest_singular_value
-from srm_mbs.systems.tangent import ChartPoint, TangentChart, differences, tangent_basis
+from srm_mbs.model.coordinates import joint_coordinates
+from srm_mbs.model.mechanism import Mechanism
 
 log = logging.getLogger(__name__)
 

@@ -18,16 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.arrays import FloatArray, IndexArray
-from srm_mbs.coordinates import coordinate_names, joint_coordinates
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import Mechanism
-from srm_mbs.options import numbers
-from srm_mbs.solution import Solution
-from srm_mbs.systems.closure_geometry import ClosureGeometry
-from srm_mbs.systems.multibody import make_system
-from srm_mbs.systems.reactions import reactions_at
-from srm_mbs.systems.tangent import tangent_basis
+from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.options import numbers
+from srm_mbs.simulation.result import Solution
 
 TOLERANCE = 1e-6
 """Default of ``tolerance``."""
@@ -143,9 +143,9 @@ def inverse_dynamics(
     mechanism
         Its gravity, force elements, damping and friction act as well.
     motion
-        A run (:class:`~srm_mbs.solution.Solution`; its controller is part of what is to be found),
-        arrays (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t that
-        returns q, v, a.
+        A run (:class:`~srm_mbs.simulation.result.Solution`; its controller is part of what is to be
+        found), arrays (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t
+        that returns q, v, a.
     actuated
         Names of the joints with actuators; by default all joints.
     t : (n,) s

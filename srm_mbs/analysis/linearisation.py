@@ -1,9 +1,10 @@
 r"""Linearisation on the closures: x' = A x + B tau with x = (z, w).
 
-z (k,) are minimal coordinates around the state (:mod:`srm_mbs.systems.tangent`), here k joint
-coordinates, and w their rates: L v, which is z' unless a ball, planar or free joint moves.  A comes
-from central differences of order 6 of the constrained dynamics on the closures; B is exact, because
-the accelerations are linear in the forces.
+z (k,) are minimal coordinates around the state
+(:mod:`srm_mbs.dynamics.constraints.local_coordinates`), here k joint coordinates, and w their
+rates: L v, which is z' unless a ball, planar or free joint moves.  A comes from central differences
+of order 6 of the constrained dynamics on the closures; B is exact, because the accelerations are
+linear in the forces.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.arrays import FloatArray, IndexArray
-from srm_mbs.coordinates import coordinate_names, joint_coordinates
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.local_coordinates import TangentChart, differences, tangent_basis
+from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
+from srm_mbs.dynamics.controllers import Controller
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.singularities.local_analysis import TAU
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import Mechanism
-from srm_mbs.motion import JointMotion
-from srm_mbs.options import positive
-from srm_mbs.systems.closure_geometry import ClosureGeometry
-from srm_mbs.systems.controllers import Controller
-from srm_mbs.systems.multibody import make_system
-from srm_mbs.systems.projection import cholesky, unwhiten, whiten
-from srm_mbs.systems.singular import TAU
-from srm_mbs.systems.tangent import TangentChart, differences, tangent_basis
-from srm_mbs.workspaces import workspace
+from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.options import positive
+from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = logging.getLogger(__name__)
 

@@ -1,1 +1,1 @@
-"""Sweeps: one mechanism, or a family of them, simulated many times on any executor."""
+"""Parameter sweeps: many runs, in parallel, with a journal."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import Mechanism
+from srm_mbs.model.mechanism import Mechanism
 
 STARTS = ("q0", "v0", "q", "v")
 """Parameters that say where a given mechanism starts."""

@@ -129,7 +129,7 @@ class Sweep:
         OSError
             If the file cannot be written.
         """
-        from srm_mbs.export import write_table
+        from srm_mbs.simulation.csv_export import write_table
 
         write_table(self.table, Path(path))
 

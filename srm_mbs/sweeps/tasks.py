@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from srm_mbs.api import simulate
 from srm_mbs.errors import InputError
-from srm_mbs.mechanism import Mechanism
-from srm_mbs.simulation import simulate
-from srm_mbs.solution import Solution
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.result import Solution
 from srm_mbs.sweeps.cases import RESERVED, STARTS
 
 Value = bool | int | float | str | None
@@ -111,7 +111,7 @@ class Task:
             return mechanism, chosen | more
         start = {name: parameters[name] for name in STARTS if name in parameters}
         if "q" in start or "v" in start:
-            from srm_mbs.assembly import assemble
+            from srm_mbs.assembly.assemble import assemble
 
             state = assemble(self.source, **start)
             start = {"q0": state.q, "v0": state.v}

@@ -14,8 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
-from srm_mbs.systems.forces import ForceKinematics
-from srm_mbs.systems.loops import LoopKinematics
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.dynamics.forces import ForceKinematics
 
 
 def fingerprint(mechanism: srm.Mechanism) -> dict[str, Any]:

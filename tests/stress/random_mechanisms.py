@@ -13,7 +13,7 @@ import pinocchio as pin
 from hypothesis import strategies as st
 
 import srm_mbs as srm
-from srm_mbs.arrays import FloatArray
+from srm_mbs._typing import FloatArray
 
 G = 9.81
 WORLD = -1

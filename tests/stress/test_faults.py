@@ -14,9 +14,9 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.arrays import FloatArray
-from srm_mbs.systems.loops import closure_errors
-from tests.mechanisms import along_x, rod
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import closure_errors
+from tests.support.mechanisms import along_x, rod
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(60)]
 

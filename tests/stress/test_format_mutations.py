@@ -13,8 +13,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pytest
 
+from tests.formats.urdf.test_urdf_loops import BAR, HINGE, SLIDER
 from tests.stress.isolation import load_isolated
-from tests.test_urdf_loops import BAR, HINGE, SLIDER
 
 pytestmark = pytest.mark.stress
 

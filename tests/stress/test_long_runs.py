@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from tests.test_singular_passages import PERIOD, crank_at, error_at_end, run
+from tests.integration.test_singular_passages import PERIOD, crank_at, error_at_end, run
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
 

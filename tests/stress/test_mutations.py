@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.loading.bundled import models_folder
+from srm_mbs.formats.load import models_folder
 from tests.stress.isolation import ROOT, load_isolated
 from tests.stress.mutation import DEFAULTS, LOOPS, NAMES, START, TREE, Files, Mutation
 from tests.stress.toml_mutations import TomlMutator
@@ -182,7 +182,7 @@ def test_mutated_mechanisms_on_the_command_line_end_with_one_line_and_a_status(
         (mutation, path), (_, outcome, _) = written[i], outcomes[i]
         command = ["info"] if i % 40 else ["simulate", "--t-end", "0.01"]
         run = subprocess.run(
-            [sys.executable, "-m", "srm_mbs.cli", command[0], path, *command[1:]],
+            [sys.executable, "-m", "srm_mbs.cli.app", command[0], path, *command[1:]],
             cwd=ROOT, capture_output=True, text=True, timeout=60,
         )  # fmt: skip
         said = f"{mutation.model}, {mutation.change}: {run.stdout}\n{run.stderr}"

@@ -9,9 +9,9 @@ from hypothesis import event, given, settings
 from scipy.integrate import trapezoid
 
 import srm_mbs as srm
-from srm_mbs.arrays import FloatArray
-from srm_mbs.systems.loops import LoopKinematics, closure_errors
-from srm_mbs.systems.units import row_units
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import LoopKinematics, closure_errors
+from srm_mbs.dynamics.scaling import row_units
 from tests.stress.random_mechanisms import Spec, build, specs
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(900)]

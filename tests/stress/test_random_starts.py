@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.arrays import FloatArray
-from tests import reduced
+from srm_mbs._typing import FloatArray
+from tests.support import reduced
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(300)]
 

@@ -13,10 +13,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pytest
 
-from tests.mjcf_files import FOUR_BAR, TREE, TWO_LOOPS
-from tests.sdf_files import four_bar, joint, link, sdf
 from tests.stress.isolation import load_isolated
 from tests.stress.urdf_mutations import GARBAGE, misspelt
+from tests.support.mjcf_files import FOUR_BAR, TREE, TWO_LOOPS
+from tests.support.sdf_files import four_bar, joint, link, sdf
 
 pytestmark = pytest.mark.stress
 

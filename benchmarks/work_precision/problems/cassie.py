@@ -16,7 +16,7 @@ import srm_mbs as srm
 from benchmarks.work_precision.problems.base import Array, Problem
 from benchmarks.work_precision.problems.walking_robot import observe
 from benchmarks.work_precision.trees import Equations, TorsionSpring, Tree, tree_of
-from tests.sdf_files import cassie as path_of
+from tests.support.sdf_files import cassie as path_of
 
 SEED = 5
 JOINT_SPEED = 1.0  # rad/s, standard deviation before the rates are made consistent

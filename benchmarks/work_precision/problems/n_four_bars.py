@@ -10,7 +10,7 @@ import numpy as np
 import srm_mbs as srm
 from benchmarks.work_precision.problems.base import Array, Problem, ReducedModel
 from benchmarks.work_precision.trees import tree_of
-from tests import reduced
+from tests.support import reduced
 
 SPEED = 1.0  # m/s, the first crank tip in +x at the start
 

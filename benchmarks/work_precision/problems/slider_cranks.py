@@ -14,7 +14,7 @@ import pinocchio as pin
 import srm_mbs as srm
 from benchmarks.work_precision.problems.base import Problem, ReducedModel, crank
 from benchmarks.work_precision.trees import PointClosure, Tree
-from tests import reduced
+from tests.support import reduced
 
 START = math.pi / 4.0  # rad, crank angle
 

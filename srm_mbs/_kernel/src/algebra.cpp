@@ -28,7 +28,7 @@ nb::object array_of(const double* values, std::initializer_list<std::size_t> sha
     return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), shape.size(), shape.begin(), owner));
 }
 
-// Twin of srm_mbs/systems/pivoting.py.
+// Twin of srm_mbs/dynamics/constraints/row_algebra.py.
 class Algebra {
 public:
     Algebra(std::vector<int> parents, std::vector<std::vector<int>> supports,

@@ -1,4 +1,4 @@
-// Twin of srm_mbs/systems/charts.py: tangent charts of ball, free and planar joints.
+// Twin of srm_mbs/dynamics/manifold.py: tangent charts of ball, free and planar joints.
 #pragma once
 
 #include <vector>

@@ -1,4 +1,4 @@
-// Twin of srm_mbs/stepping/stepsize.py, placement.py, singular_times.py (SlopeOfSigma) and
+// Twin of srm_mbs/integration/control/step_size.py, placement.py, singular_times.py (SlopeOfSigma) and
 // guard.py: how long the next step is, and whether the last one stands.
 #pragma once
 

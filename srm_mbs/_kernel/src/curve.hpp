@@ -1,4 +1,4 @@
-// Twin of srm_mbs/laws.py: a law over time.
+// Twin of srm_mbs/model/laws.py: a law over time.
 //
 //     s(t) = sum_j c_ij (t - b_i)^j  on [b_i, b_{i+1})  +  sum_k A_k sin(w_k t + phi_k).
 #pragma once

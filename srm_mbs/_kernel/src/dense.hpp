@@ -1,4 +1,4 @@
-// Twin of srm_mbs/stepping/dense.py and hermite.py: the state at any time of a run.
+// Twin of srm_mbs/integration/dense_output.py and hermite.py: the state at any time of a run.
 #pragma once
 
 #include <utility>
@@ -8,7 +8,7 @@
 
 namespace srm {
 
-// The continuous extension of a scheme, in the nested form of srm_mbs/methods/butcher.py.
+// The continuous extension of a scheme, in the nested form of srm_mbs/integration/methods/butcher.py.
 struct Extension {
     int degree = 0, n_rates = 0, n_extra = 0;
     std::vector<double> rows, extra_A, extra_c;

@@ -1,4 +1,4 @@
-// Twin of srm_mbs/systems/forces.py: generalised forces of the force elements.
+// Twin of srm_mbs/dynamics/forces.py: generalised forces of the force elements.
 #pragma once
 
 #include <string>

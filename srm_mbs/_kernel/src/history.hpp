@@ -1,4 +1,4 @@
-// Twin of srm_mbs/methods/history.py: multipliers of recent steps, extrapolated into the zone.
+// Twin of srm_mbs/integration/methods/multiplier_history.py: multipliers of recent steps, extrapolated into the zone.
 #pragma once
 
 #include <limits>

@@ -604,7 +604,7 @@ PyType_Slot* collected() {
 NB_MODULE(_core, m) {
     // Results that live until the interpreter ends are no leak.
     nb::set_leak_warnings(false);
-    m.doc() = "Compiled twin of the default paths of srm_mbs; see srm_mbs.kernel.";
+    m.doc() = "Compiled twin of the default paths of srm_mbs; see srm_mbs.integration.kernel.backend.";
     nb::register_exception_translator([](const std::exception_ptr& p, void*) {
         try {
             std::rethrow_exception(p);

@@ -1,4 +1,4 @@
-// Twin of srm_mbs/systems/projection.py: E, P, rank and sigma from one pivoted factorisation.
+// Twin of srm_mbs/dynamics/constraints/projection.py: E, P, rank and sigma from one pivoted factorisation.
 //
 //     M = L L^T,  W = L^{-1} G^T,  W Pi = Q R,
 //     E g = L^{-T} Q R^{-T} Pi^T g,   P v = L^{-T} Q Q^T L^T v,   yhat = E gamma.

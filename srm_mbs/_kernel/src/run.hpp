@@ -1,4 +1,4 @@
-// Twin of srm_mbs/stepping/loop.py: propose a step, make it, judge it, record it; in chunks.
+// Twin of srm_mbs/integration/driver.py: propose a step, make it, judge it, record it; in chunks.
 #pragma once
 
 #include <memory>
@@ -19,14 +19,14 @@ enum class Stop {
     arrival = 7,     // the end lies beside a singular configuration: Python prepares for it
 };
 
-// The constants of srm_mbs/stepping/loop.py.
+// The constants of srm_mbs/integration/driver.py.
 struct LoopConstants {
     double smallest_step, standstill, large_correction, open, lost;
     int watched_steps;
     double look, closer, allowed;  // breakpoints.py
 };
 
-// The pieces of a run between breakpoints; see srm_mbs/stepping/breakpoints.py.
+// The pieces of a run between breakpoints; see srm_mbs/integration/breakpoints.py.
 struct Pieces {
     std::vector<double> ends, first, last;  // (n,)
     std::vector<char> given;                // (n - 1,)

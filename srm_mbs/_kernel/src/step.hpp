@@ -1,4 +1,4 @@
-// Twin of srm_mbs/methods/split.py, branch.py and zone.py: one step of the split PSRM.
+// Twin of srm_mbs/integration/methods/split_step.py, branch.py and zone.py: one step of the split PSRM.
 #pragma once
 
 #include <vector>
@@ -31,7 +31,7 @@ struct ErrorNorm {
     static double ratio(const double* error, const double* weights, int n);
 };
 
-// Twin of srm_mbs/stepping/stepsize.py, initial_step, and its constants.
+// Twin of srm_mbs/integration/control/step_size.py, initial_step, and its constants.
 struct FirstStepConstants {
     double overflow, probe, longest;
 };
@@ -62,7 +62,7 @@ class SplitStep {
 public:
     SplitStep(System& system, Scheme scheme, StepConstants constants, ErrorNorm norm);
 
-    // One step from `state`; see srm_mbs/methods/base.py.  Throws EvaluationError.
+    // One step from `state`; see srm_mbs/integration/methods/base.py.  Throws EvaluationError.
     const StepResult& make(double t, double h, const double* state, const Memory& memory,
                            double theta);
     // Moves `memory` to the end of the step made last.

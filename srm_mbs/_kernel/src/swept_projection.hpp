@@ -1,6 +1,6 @@
 // The sparse projection of a mechanism with many loops, its pivots taken along the graph of the loops.
 //
-// Twin of swept_qr in srm_mbs/systems/projection.py.  The largest norm as the next pivot hops about
+// Twin of swept_qr in srm_mbs/dynamics/constraints/projection.py.  The largest norm as the next pivot hops about
 // the graph, and what the pivots fill in between spreads.  So the next pivot is the largest in a
 // window that moves along the order of the graph.  Columns below the floor wait for the next sweep,
 // and so do those of less than a share of the largest norm if some depend on others.  That sweep

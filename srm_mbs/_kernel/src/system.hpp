@@ -1,4 +1,4 @@
-// Twin of srm_mbs/systems/multibody.py and loops.py: a mechanism as a system.
+// Twin of srm_mbs/dynamics/multibody.py and loops.py: a mechanism as a system.
 //
 //     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),
 //
@@ -92,7 +92,7 @@ public:
     System(const void* model, SystemData data, Controller controller);
     ~System();
 
-    // The zone of a stage; see srm_mbs/systems/base.py.  threshold < 0: none.
+    // The zone of a stage; see srm_mbs/dynamics/system.py.  threshold < 0: none.
     struct ZoneView {
         double threshold = -1.0;
         const History* history = nullptr;

@@ -1,4 +1,4 @@
-// Twin of srm_mbs/systems/vectors.py: products of three numbers, in the order of the reference.
+// Twin of srm_mbs/dynamics/constraints/rows.py: products of three numbers, in the order of the reference.
 #pragma once
 
 namespace srm {

@@ -1,0 +1,1 @@
+"""The accuracy of a run: error estimate, conservation, certificate."""

@@ -1,0 +1,135 @@
+"""How accurate a run is: drift, energy balance, and an error estimate from other runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from srm_mbs.analysis.accuracy.assessment import (
+    GRADES,
+    Finding,
+    Grade,
+    drift_finding,
+    energy_finding,
+    error_findings,
+    status_finding,
+)
+from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of, energy_error
+from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
+from srm_mbs.errors import InputError
+from srm_mbs.simulation.rerun import why_not
+from srm_mbs.simulation.result import Solution
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """The accuracy of a run, from :func:`srm_mbs.certify`; ``print`` it to read it.
+
+    Attributes
+    ----------
+    name
+        Of the mechanism.
+    findings
+        Sentences, each with ``topic``, ``grade`` (``good``, ``fair``, ``poor`` or ``unknown``) and
+        ``text``.
+    drift
+        The largest closure errors, :class:`srm_mbs.analysis.accuracy.conservation.Drift` for each
+        unit; empty for an open chain.
+    energy
+        How well the energy balance closes,
+        :class:`srm_mbs.analysis.accuracy.conservation.EnergyError`; None if it cannot be computed.
+    estimate
+        What the other runs say, :class:`srm_mbs.analysis.accuracy.error_estimate.ErrorEstimate`;
+        None without them.
+    """
+
+    name: str
+    findings: tuple[Finding, ...]
+    drift: tuple[Drift, ...]
+    energy: EnergyError | None
+    estimate: ErrorEstimate | None
+
+    @property
+    def grade(self) -> Grade:
+        """The worst of all findings."""
+        return max((finding.grade for finding in self.findings), key=GRADES.index)
+
+    @property
+    def error(self) -> dict[str, tuple[float, float]]:
+        """The largest estimated error of positions and of rates, for each unit: {"rad": (rad,
+        rad/s), "m": (m, m/s)}; empty without an estimate."""
+        rows = () if self.estimate is None else self.estimate.joints
+        return {
+            unit: (
+                max(row.position for row in rows if row.unit == unit),
+                max(row.rate for row in rows if row.unit == unit),
+            )
+            for unit in dict.fromkeys(row.unit for row in rows)
+        }
+
+    def __str__(self) -> str:
+        lines = [f"Accuracy of the run of {self.name}"]
+        lines += [f"  {found.topic} ({found.grade}): {found.text}" for found in self.findings]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"Certificate({self.name!r}, grade={self.grade!r}, error={self.error})"
+
+
+def certify(
+    solution: Solution, *, rtol: float | None = None, again: bool = True, progress: Any = False
+) -> Certificate:
+    """Estimate how accurate a run is.
+
+    It is made again twice: at a tenth and a hundredth of its tolerance (no tighter than rounding
+    allows, 1e-12), or
+    with half and a quarter of its fixed step.  With dop853 this takes some three times as long as
+    the run, with fixed steps six times.  Functions of the user are called again.
+
+    Parameters
+    ----------
+    solution
+        A run, finished or not.
+    rtol
+        Relative tolerance of the second run instead of a hundredth; the third lies between.  A
+        looser one gives a bound.
+    again
+        Whether the run is made again; without, there are drift and energy only.
+    progress
+        As for :func:`srm_mbs.simulate`, of each run.
+
+    Returns
+    -------
+    Certificate
+        If the run cannot be made again (a loaded one that had Python functions), it says why, and
+        has the rest.
+
+    Raises
+    ------
+    InputError
+        If ``solution`` is no run, or ``rtol`` cannot be used for it.
+    """
+    if not isinstance(solution, Solution):
+        raise InputError(
+            f"a {type(solution).__name__} is not a run",
+            element="solution",
+            remedy="Give what srm.simulate or srm.load_solution returned",
+        )
+    settings = checked_settings(solution, rtol)
+    drift, energy = drift_of(solution), energy_error(solution)
+    reason = why_not(solution) if again else "it was not asked for"
+    if not reason and not solution.steps.count:
+        reason = "the run took no step"
+    estimate = reason or estimate_error(solution, settings, progress)
+    return Certificate(
+        solution.mechanism.name,
+        (
+            status_finding(solution),
+            drift_finding(drift),
+            energy_finding(energy),
+            *error_findings(solution, estimate),
+        ),
+        drift,
+        None if isinstance(energy, str) else energy,
+        None if isinstance(estimate, str) else estimate,
+    )

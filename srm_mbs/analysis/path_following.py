@@ -1,0 +1,192 @@
+"""Dragging joints through given values, on one branch; see :mod:`srm_mbs.assembly.continuation`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.assembly.assemble import assemble
+from srm_mbs.assembly.continuation import drag
+from srm_mbs.assembly.position import ClosureProblem
+from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
+from srm_mbs.errors import InputError
+from srm_mbs.model.coordinates import position_of
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.visualization.animation.joint_motion import JointMotion
+
+log = logging.getLogger(__name__)
+
+KEPT = 0.9
+"""Smallest cosine between neighbouring tangents on one branch."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathPoint:
+    """A configuration on a path: the dragged joints' ``values`` (rad, m), ``q`` (nq,), and for a
+    singular one the ``loops`` whose rows lose rank."""
+
+    values: Mapping[str, float]
+    q: FloatArray
+    loops: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedPath:
+    """What following held values gave.
+
+    Attributes
+    ----------
+    mechanism
+        What was moved.
+    q : (m, nq)
+        Configurations at the first m of the given values; all of them if it is ``complete``.
+    complete
+        Whether all values were reached.
+    limit
+        Where the dragged joints go no further (a turning point of the path); None if the path is
+        complete.
+    singular
+        Singular configurations on the way, in order.
+    branch_kept
+        Whether the tangent turned but little from each configuration to the next.
+    path : (k, nq)
+        All configurations on the way.
+    message
+        How it ended.
+    """
+
+    mechanism: Mechanism
+    q: FloatArray
+    complete: bool
+    limit: PathPoint | None
+    singular: tuple[PathPoint, ...]
+    branch_kept: bool
+    path: FloatArray
+    message: str
+
+    def motion(self, duration: float = 3.0) -> JointMotion:
+        """The path over ``duration`` (s), to be played.
+
+        Raises
+        ------
+        InputError
+            If the duration is not positive.
+        """
+        if not duration > 0.0:
+            raise InputError(
+                f"duration = {duration!r} is not positive",
+                element="duration",
+                remedy="Give a positive number of seconds",
+            )
+        times = np.linspace(0.0, duration, len(self.path)) if len(self.path) > 1 else np.zeros(1)
+        return JointMotion(self.mechanism, times, self.path)
+
+
+def _dragged(mechanism: Mechanism, values: Mapping[str, Any]) -> FloatArray:
+    """The values (n, joints) of the dragged joints."""
+    columns = []
+    for name, given in values.items():
+        joint = mechanism.joint(name)
+        try:
+            array = np.atleast_1d(np.asarray(given, dtype=float))
+        except (TypeError, ValueError):
+            array = np.full(1, np.nan)
+        if joint.nv != 1 or array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+            raise InputError(
+                f"joint {name!r} cannot be dragged along {given!r}",
+                element="values",
+                remedy="Give finite numbers (rad, m) for a joint of one degree of freedom",
+            )
+        columns.append(array)
+    if not columns or len({len(column) for column in columns}) > 1:
+        raise InputError(
+            f"the joints have {[len(column) for column in columns]} values",
+            element="values",
+            remedy="Name at least one joint, and give each the same number of values",
+        )
+    return np.column_stack(columns)
+
+
+def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> FollowedPath:
+    """Drag joints through values, closing the loops on the way and staying on one branch.
+
+    Parameters
+    ----------
+    values
+        Joint name -> positions (n,) (rad, m; angles count turns) that are followed in their order,
+        in straight lines.  The joints go to the first of them from where they are.
+    q : (nq,)
+        Where to start; by default the initial configuration.
+
+    Raises
+    ------
+    InputError
+        For malformed values, joints that cannot be dragged independently, or a start on a singular
+        configuration.
+    AssemblyError
+        If the start cannot be closed.
+    """
+    mechanism = mechanism.undriven  # what is dragged takes the place of drives
+    wanted = _dragged(mechanism, values)
+    if not mechanism.loops:
+        raise InputError(
+            "a mechanism without loops has nothing to follow",
+            element="loop",
+            remedy="Set its joints directly: they do not depend on each other",
+        )
+    start = assemble(mechanism, q, hold=list(values))
+    problem = ClosureProblem(mechanism, start.q)
+    columns = np.array([mechanism.joint(name).idx_v for name in values])
+    if start.singular:
+        raise InputError(
+            "the path starts on a singular configuration, where branches meet",
+            element="q",
+            remedy="Start next to it, on the branch that is meant",
+        )
+    basis, _ = tangent_basis(problem, start.q, np.arange(mechanism.model.nv))
+    if np.linalg.matrix_rank(basis[columns], tol=SINGULAR) < len(columns):
+        raise InputError(
+            f"{', '.join(values)} cannot be dragged independently of each other here",
+            element="values",
+            remedy=f"Drag at most {basis.shape[1]}, which move independently",
+        )
+    here = np.array([position_of(mechanism, start.q, name) for name in values])
+    found = drag(problem, start.q, columns, wanted - here, mechanism.structure.rank)
+
+    def named(displacement: FloatArray) -> dict[str, float]:
+        return dict(zip(values, (here + displacement).tolist()))
+
+    singular = tuple(PathPoint(named(met.values), met.q, met.loops) for met in found.met)
+    limit = None if found.complete else PathPoint(named(found.values[-1]), found.path[-1])
+    reached = found.q[1:].copy()
+    for k, name in enumerate(values):  # exactly as given
+        joint = mechanism.joint(name)
+        if joint.nq == 1:
+            reached[:, joint.idx_q] = wanted[: len(reached), k]
+    message = _message(limit, found.turned)
+    log.debug("%s: %s", mechanism.name, message)
+    return FollowedPath(
+        mechanism,
+        reached,
+        found.complete,
+        limit,
+        singular,
+        found.cosine > KEPT,
+        found.path,
+        message,
+    )
+
+
+def _message(limit: PathPoint | None, turned: bool) -> str:
+    if limit is None:
+        return "all values were reached"
+    at = ", ".join(f"{name} = {value:.9g}" for name, value in limit.values.items())
+    if turned:
+        return f"no further than {at}: the path turns back there"
+    return f"no further than {at}: the path cannot be followed beyond"

@@ -1,0 +1,260 @@
+"""A mechanism and a run as rows of text, for the command line and for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import closure_errors
+from srm_mbs.dynamics.scaling import row_angles, turning_coordinates
+from srm_mbs.integration.kernel.backend import backend
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.coordinates import position_of
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.result import Solution
+
+JOINT_TYPES = {
+    **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
+    **{f"RUB{axis}": f"continuous about {axis.lower()}" for axis in "XYZ"},
+    **{f"P{axis}": f"prismatic along {axis.lower()}" for axis in "XYZ"},
+    "RevoluteUnaligned": "revolute",
+    "RevoluteUnboundedUnaligned": "continuous",
+    "PrismaticUnaligned": "prismatic",
+    "FreeFlyer": "floating",
+    "Planar": "planar",
+    "Spherical": "ball",
+    "Universal": "universal",
+    "HelicalUnaligned": "screw",
+}
+"""Pinocchio's joint types as URDF calls them."""
+MANY = 8
+"""Numbers of a list from which only the ends are shown."""
+BUSHING = [False, False, False, True, True, True]
+"""Which of its six numbers belong to angles."""
+BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
+
+
+def run_rows(solution: Solution, *, passages: bool = True) -> list[tuple[str, str]]:
+    """What a run did: (quantity, value with unit).
+
+    Parameters
+    ----------
+    passages
+        Whether to count the singular passages, which is slow if there are thousands.
+    """
+    stats = solution.stats
+    energy = solution.energy - solution.energy[0]
+    rows = [
+        ("mechanism", solution.mechanism.name),
+        ("status", solution.status),
+        ("computed by", BACKENDS[solution.settings.backend]),
+        ("end time", f"{solution.t[-1]:.6g} s"),
+        ("steps", f"{stats.steps}"),
+        ("rejected steps", f"{stats.rejected}"),
+        ("evaluations", f"{stats.evaluations}"),
+    ]
+    if solution.mechanism.constrained:
+        position, rate = solution.drift.max(axis=0)
+        rows += [
+            ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
+            ("zone steps", f"{stats.zone_steps}"),
+            *([("singular passages", f"{len(solution.crossings)}")] if passages else []),
+            ("largest ||g||", f"{position:.2e} (m, rad)"),
+            ("largest ||G v||", f"{rate:.2e} (m/s, rad/s)"),
+        ]
+    rows += [
+        ("energy change", f"{energy[-1]:.2e} J at the end, at most {abs(energy).max():.2e} J"),
+        ("wall time", f"{stats.wall_time:.3g} s"),
+    ]
+    return rows
+
+
+def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
+    """Degrees of freedom, rank and redundancy: (quantity, value)."""
+    structure, source = mechanism.structure, mechanism.source
+    found = mechanism.mobility
+    count = f"{found.joint_freedoms} - {found.rows} = {found.gruebler}"
+    if found.planar_gruebler is not None:
+        count += f", in the plane {found.planar_gruebler}"
+    freedom = f"{mechanism.degrees_of_freedom}"
+    if mechanism.drives:
+        freedom += f", {found.degrees_of_freedom} without the drives"
+    idle = [f"{', '.join(motion.joints)} ({motion.directions})" for motion in found.idle]
+    return [
+        ("mechanism", mechanism.name),
+        ("read from", "Python" if source is None else f"{source.path} ({source.format})"),
+        ("degrees of freedom", freedom),
+        ("Gruebler count", count),
+        ("closure rows", f"{found.rows}"),
+        *([("drives", f"{len(mechanism.drives)}")] if mechanism.drives else []),
+        ("rank", f"{structure.rank}"),
+        ("redundant rows, left out", ", ".join(structure.redundant_rows) or "none"),
+        ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
+        ("joints that cannot move", ", ".join(found.unreachable_joints) or "none"),
+        ("joints that move no loop", "; ".join(idle) or "none"),
+        ("runs on", BACKENDS[backend()]),
+    ]
+
+
+def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, type, initial position, initial rate) of each moving joint."""
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        kind = _kind(joint)
+        v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
+        rate = f"{_shown(v[0]):.6g} {_unit(kind)}/s" if joint.nv == 1 else _vector(map(_shown, v))
+        yield name, kind, position_text(mechanism, name, mechanism.q0), rate
+
+
+def position_text(mechanism: Mechanism, name: str, q: FloatArray) -> str:
+    """Position of the joint ``name`` in q (nq,), with its unit where it has one degree."""
+    joint = mechanism.joint(name)
+    if joint.nv > 1:
+        return _vector(map(_shown, q[joint.idx_q : joint.idx_q + joint.nq]))
+    return f"{_shown(position_of(mechanism, q, name)):.6g} {_unit(_kind(joint))}"
+
+
+def force_text(mechanism: Mechanism, name: str, force: FloatArray) -> str:
+    """The generalised force (n,) on the joint ``name``, with its units."""
+    return _in_units(force, _turning(mechanism, name), ["N m", "N"])
+
+
+def _turning(mechanism: Mechanism, name: str) -> list[bool]:
+    """Which degrees of freedom of the joint ``name`` are angles."""
+    joint = mechanism.joint(name)
+    own = slice(joint.idx_v, joint.idx_v + joint.nv)
+    turning: list[bool] = turning_coordinates(mechanism.model)[own].tolist()
+    return turning
+
+
+def _in_units(values: FloatArray, turning: list[bool], units: list[str]) -> str:
+    """Numbers (n,) of angles and of lengths, which have the two ``units``: a list of each."""
+    if len(turning) == 1:
+        return f"{values[0]:.6g} {units[not turning[0]]}"
+    parts = groupby(zip(turning, values.tolist()), itemgetter(0))
+    return ", ".join(f"{_vector(x for _, x in own)} {units[not turns]}" for turns, own in parts)
+
+
+def _shown(value: float) -> float:
+    """``value`` without the rounding noise of assembly, which means zero."""
+    return round(float(value), 12) + 0.0
+
+
+def _kind(joint: Any) -> str:
+    short = str(joint.shortname()).removeprefix("JointModel")
+    return JOINT_TYPES.get(short, short)
+
+
+def _unit(kind: str) -> str:
+    return "m" if kind.startswith("prismatic") else "rad"
+
+
+def body_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(links, joint that carries it, mass, centre of mass in its frame) of each moving body."""
+    model = mechanism.model
+    links: dict[int, list[str]] = {}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            links.setdefault(int(frame.parentJoint), []).append(frame.name)
+    for k, name in enumerate(mechanism.joint_names, start=1):
+        inertia = model.inertias[k]
+        centre = _vector(map(_shown, inertia.lever)) + " m" if inertia.mass else ""
+        yield ", ".join(links.get(k, ())), name, f"{inertia.mass:.6g} kg", centre
+
+
+def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
+    """(name, type, anchor a or joints, anchor b or relation, gap at the start) of each loop."""
+    model, loops = mechanism.model, mechanism.loops
+    g = closure_errors(model, loops, mechanism.q0[None], mechanism.v0[None])[0][0]
+    angles = row_angles(mechanism)
+    at = 0
+    for loop in loops:
+        own, turned = g[at : at + loop.rows.count], angles[at : at + loop.rows.count]
+        at += loop.rows.count
+        gaps = [(own[~turned], "m"), (own[turned], "rad")]
+        gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
+        if loop.joints is not None:
+            yield loop.name, loop.type_name, ", ".join(loop.joints), _relation(loop), gap
+            continue
+        a, b = map(_anchor, loop.anchors)
+        yield loop.name, loop.type_name, a, b, gap
+
+
+def _relation(loop: LoopClosure) -> str:
+    """A coupling in words: "first = 2 second + 0.1"."""
+    (row,) = loop.rows.joint_rows
+    if loop.ratio is not None:
+        terms = f"{row.joints[0]} = {loop.ratio:g} {row.joints[1]}"
+        return f"{terms} {row.offset:+g}" if row.offset else terms
+    terms = " ".join(f"{c:+g} {name}" for c, name in zip(row.coefficients, row.joints))
+    return f"{terms} = {row.offset:g}"
+
+
+def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, type, what it acts on, values with units) of each force element."""
+    for force in mechanism.forces:
+        places, values = [], []
+        for key in fields(force):  # type: ignore[arg-type]
+            value = getattr(force, key.name)
+            if isinstance(value, Anchor):
+                places.append(_anchor(value))
+            elif key.name == "joint":
+                places.append(value)
+            elif key.name != "name":
+                if value is None:
+                    continue
+                units = key.metadata.get("unit", "").split(", ")
+                text = f"{value:.6g}" if isinstance(value, float) else value
+                if key.name == "law":
+                    laws = value if isinstance(value, tuple) else (value,)
+                    text = ", ".join(dict.fromkeys(law.type for law in laws))
+                elif len(units) > 1:
+                    joint = getattr(force, "joint", None)
+                    turning = BUSHING if joint is None else _turning(mechanism, joint)
+                    text, units = _in_units(np.atleast_1d(value), turning, units), [""]
+                elif isinstance(value, tuple):
+                    text = _vector(value)
+                elif callable(value):
+                    text = getattr(value, "__name__", "of the user")
+                values.append(f"{key.name} {text} {units[0]}".rstrip())
+        yield force.name, force.type, ", ".join(places), ", ".join(values)
+
+
+def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, law, what it moves, values) of each drive."""
+    for drive in mechanism.drives:
+        place = drive.joint or ""
+        if drive.a is not None and drive.b is not None:
+            along = "distance" if drive.axis is None else f"along {_vector(drive.axis)}"
+            place = f"{_anchor(drive.a)}, {_anchor(drive.b)}, {along}"
+        values = []
+        for key in fields(drive.law):  # type: ignore[arg-type]
+            value = getattr(drive.law, key.name)
+            if isinstance(value, tuple) and len(value) > MANY:
+                values.append(f"{key.name} {value[0]:.6g} .. {value[-1]:.6g} ({len(value)})")
+            elif value is not None:
+                text = _vector(value) if isinstance(value, tuple) else f"{value:.6g}"
+                values.append(f"{key.name} {text}")
+        values += ["absolute"] if drive.absolute else []
+        yield drive.name, drive.law.type, place, ", ".join(values)
+
+
+def _anchor(anchor: Anchor) -> str:
+    text = anchor.where
+    if any(anchor.xyz):
+        text += f" xyz {_vector(anchor.xyz)} m"
+    if any(anchor.rpy):
+        text += f" rpy {_vector(anchor.rpy)} rad"
+    return text
+
+
+def _vector(values: Iterable[float]) -> str:
+    return f"[{', '.join(f'{value:.6g}' for value in values)}]"

@@ -1,0 +1,269 @@
+"""Consistent initial states: close the loops, then make the rates fit.
+
+Positions come from :mod:`srm_mbs.assembly.position`, rates from :mod:`srm_mbs.assembly.velocity`.
+
+Where drives begin that prescribe positions and not only motions.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.assembly.diagnosis import cannot_close, free_coordinates, limits_in_the_way
+from srm_mbs.assembly.position import (
+    ClosureProblem,
+    beyond_limits,
+    close_loops,
+    close_within_limits,
+)
+from srm_mbs.assembly.velocity import consistent_rates
+from srm_mbs.dynamics.constraints.rheonomic import DriveRows
+from srm_mbs.dynamics.constraints.row_algebra import null_basis
+from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.model.coordinates import set_position, set_rate
+from srm_mbs.model.mechanism import Mechanism
+
+CONTRADICTS = 1e-9
+"""Difference (rad, m) between a held position and where a drive begins."""
+
+
+def with_absolute_drives(
+    mechanism: Mechanism, start: FloatArray, held: tuple[str, ...]
+) -> tuple[tuple[str, ...], Mechanism]:
+    """Put what absolute drives begin with: joints into ``start`` and ``held``, points into the
+    loops of the mechanism.
+
+    Raises
+    ------
+    AssemblyError
+        If a held position contradicts a drive.
+    """
+    loops = list(mechanism.loops)
+    for drive in mechanism.drives:
+        if not drive.absolute:
+            continue
+        value = drive.curve(0.0)(0.0)[0]
+        if drive.joint is None:
+            loops.append(drive.frozen(value))
+            continue
+        wanted = start.copy()
+        set_position(mechanism, wanted, drive.joint, value)
+        if drive.joint in held and np.abs(wanted - start).max() > CONTRADICTS:
+            raise AssemblyError(
+                f"the held position of {drive.joint!r} contradicts the drive {drive.name!r}, "
+                f"which begins at {value:.6g}",
+                residuals={},
+                q=start,
+                held=(drive.joint,),
+                element="initial.q",
+                remedy="Free it, or remove absolute from the drive: its law then begins there",
+            )
+        start[:] = wanted
+        held = (*held, *(() if drive.joint in held else (drive.joint,)))
+    if len(loops) == len(mechanism.loops):
+        return held, mechanism
+    return held, replace(mechanism, loops=tuple(loops), drives=())
+
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """A consistent state.
+
+    Attributes
+    ----------
+    q : (nq,), v : (nv,)
+        Configuration and velocity with closed loops and consistent rates.
+    residuals : (rows,)
+        Closure errors left at q, m and rad; those of the drives last.
+    rate_residuals : (rows,)
+        G v - s' left, m/s and rad/s.
+    free_directions : (nv, k)
+        Basis of the velocities that keep the loops closed and the drives still at q, orthonormal
+        when divided by the units of the coordinates (1 rad, the scene diagonal).  More columns
+        than degrees of freedom: q is singular.
+    singular : bool
+        Whether the closures have lost rank at q against the mechanism's structural rank.
+    """
+
+    q: FloatArray
+    v: FloatArray
+    residuals: FloatArray
+    rate_residuals: FloatArray
+    free_directions: FloatArray
+    singular: bool
+
+
+def _positions(
+    mechanism: Mechanism,
+    problem: ClosureProblem,
+    start: FloatArray,
+    held: tuple[str, ...],
+    limits: bool,
+) -> FloatArray:
+    free = free_coordinates(mechanism, held)
+    q = close_loops(problem, start, free)
+    if not problem.closed(q):
+        raise cannot_close(mechanism, problem, start, held, q)
+    if not limits or not beyond_limits(mechanism, q):
+        return q
+    within = close_within_limits(problem, start, free)
+    if within is None:
+        raise limits_in_the_way(mechanism, problem, held, q)
+    return within
+
+
+def _vector(values: Any, size: int, what: str) -> FloatArray:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} must be {size} finite numbers",
+            element=what,
+            remedy="Give an array, or a mapping from joint names to values",
+        )
+    return array
+
+
+def _check_distances(problem: ClosureProblem, start: FloatArray) -> None:
+    """Refuse a guess in which the points of a ``distance`` coincide."""
+    try:
+        problem.closure(start)
+    except EvaluationError as error:
+        raise InputError(
+            f"the loops cannot be evaluated at the guess: {error}",
+            element="initial.guess",
+            remedy='Give another guess, or use type = "point" if they are to coincide',
+        ) from error
+
+
+def assemble(
+    mechanism: Mechanism,
+    q: Mapping[str, Any] | Any = None,
+    v: Mapping[str, Any] | Any = None,
+    *,
+    guess: Mapping[str, Any] | None = None,
+    hold: Iterable[str] | None = None,
+    limits: bool = False,
+) -> Assembly:
+    """Close the loops and make the rates consistent.
+
+    Parameters
+    ----------
+    mechanism
+        Its q0 is the guess for everything that is not given.
+    q
+        Joint name -> position (rad, m, or a list, see :mod:`srm_mbs.model.coordinates`), held
+        exactly unless ``hold`` says otherwise; or a configuration (nq,), of which only the joints
+        in ``hold`` are held.
+    v
+        Joint name -> rate, held exactly; or a velocity (nv,), which is changed as little as
+        possible.  Rates not given are the least-norm ones: at a singular configuration, those of
+        the branch on which the norm is least; give one more rate to choose another branch.
+    guess
+        Joint name -> position from which assembly starts; chooses the branch (the closing
+        nearest to it that was found, in rad and scene diagonals).
+    hold
+        Names of the joints whose position is held; by default those named in ``q``.  If given,
+        the other positions in ``q`` are guesses.
+    limits
+        Stay within the position limits of the joints.
+
+    Returns
+    -------
+    Assembly
+        With |g| <= 1e-12 in rad and scene diagonals, |G v| <= 1e-12 in those per second.  Next to
+        a singular configuration, at distance d, the rates are those of the branch, exact to
+        round-off over d; |G v| may be as large.
+
+    Raises
+    ------
+    AssemblyError
+        If the loops cannot close (with each loop's gap, the closest configuration, the held joints
+        or limits in the way, and the nearest values of held joints that close), or if held values
+        or rates contradict each other (naming them).
+    InputError
+        For unknown joints or malformed values, or a guess in which the points of a ``distance``
+        coincide.
+    """
+    model = mechanism.model
+    start = np.array(mechanism.q0)
+    for name, value in (guess or {}).items():
+        if isinstance(q, Mapping) and name in q:
+            raise InputError(
+                f"joint {name!r} is held in q and guessed in guess",
+                element="guess",
+                remedy="Keep one of the two",
+            )
+        set_position(mechanism, start, name, value)
+    held: tuple[str, ...] = ()
+    if isinstance(q, Mapping):
+        for name, value in q.items():
+            set_position(mechanism, start, name, value)
+        held = tuple(q)
+    elif q is not None:
+        start = _vector(q, model.nq, "q")
+        start = pin.normalize(model, start)
+        if not (np.isfinite(start).all() and pin.isNormalized(model, start, 1e-9)):
+            raise InputError(
+                "q has a quaternion, or a (cos, sin) pair, of length zero",
+                element="q",
+                remedy="Use pinocchio.normalize(model, q)",
+            )
+    if hold is not None:
+        held = (hold,) if isinstance(hold, str) else tuple(hold)
+        for name in held:
+            mechanism.joint(name)
+    rates = np.zeros(model.nv)
+    held_rates: tuple[str, ...] = ()
+    if isinstance(v, Mapping):
+        for name, value in v.items():
+            set_rate(mechanism, rates, name, value)
+        held_rates = tuple(v)
+    elif v is not None:
+        rates = _vector(v, model.nv, "v")
+    if not mechanism.constrained:
+        return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
+    held, to_close = with_absolute_drives(mechanism, start, held)
+    problem = ClosureProblem(to_close, start)
+    closed = start.copy()
+    if to_close.loops:
+        _check_distances(problem, start)
+        closed = _positions(to_close, problem, start, held, limits)
+    if to_close is not mechanism:
+        problem = ClosureProblem(mechanism, start)
+    for name in held:  # moving a quaternion by nothing rounds it
+        joint = mechanism.joint(name)
+        own = slice(joint.idx_q, joint.idx_q + joint.nq)
+        closed[own] = start[own]
+    consistent = consistent_rates(mechanism, problem, closed, rates, held_rates)
+    drives = DriveRows(mechanism, problem, closed)
+    free = null_basis(np.concatenate([problem.normalised(closed), drives.rows]), SINGULAR)
+    residuals, rate_residuals = mechanism.with_state(closed, consistent).initial_errors
+    log.debug(
+        "%s: assembled with %s held, closed to %.1e, %d directions free",
+        mechanism.name,
+        ", ".join(held) or "no joint",
+        np.abs(residuals).max(initial=0.0),
+        free.shape[1],
+    )
+    return Assembly(
+        closed,
+        consistent,
+        residuals,
+        rate_residuals,
+        problem.unit[:, None] * free,
+        free.shape[1] > mechanism.degrees_of_freedom,
+    )

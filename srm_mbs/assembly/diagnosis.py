@@ -1,0 +1,135 @@
+"""Why loops do not close: which, how far, and what is in the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.assembly.continuation import CLOSE, drag
+from srm_mbs.assembly.position import ClosureProblem, beyond_limits, close_loops
+from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, smallest_singular_value
+from srm_mbs.errors import AssemblyError
+from srm_mbs.model.coordinates import joint_coordinates, position_of
+from srm_mbs.model.mechanism import Mechanism
+
+
+def free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:
+    """Velocity indices of the joints that are not held."""
+    return np.setdiff1d(np.arange(mechanism.model.nv), joint_coordinates(mechanism, set(held)))
+
+
+def quoted(names: Iterable[str]) -> str:
+    """The names in quotes, with commas."""
+    return ", ".join(repr(name) for name in names)
+
+
+def _described(gaps: Mapping[str, tuple[float | None, float | None]]) -> str:
+    parts = []
+    for name, (gap, angle) in gaps.items():
+        values = [] if gap is None else [f"{gap:.3g} m"]
+        values += [] if angle is None else [f"{angle:.3g} rad"]
+        parts.append(f"{name}: {', '.join(values)}")
+    return "; ".join(parts)
+
+
+def cannot_close(
+    mechanism: Mechanism,
+    problem: ClosureProblem,
+    start: FloatArray,
+    held: tuple[str, ...],
+    q: FloatArray,
+) -> AssemblyError:
+    """The error about loops that do not close from ``start`` with ``held`` joints.
+
+    ``q`` (nq,) is the closest configuration that was found.
+    """
+    gaps = problem.gaps(q)
+    remaining = f"remaining gaps: {_described(gaps)}"
+    closings = {}
+    for name in held:
+        others = tuple(other for other in held if other != name)
+        closed = close_loops(problem, start, free_coordinates(mechanism, others))
+        if problem.closed(closed):
+            closings[name] = closed
+    guilty = tuple(closings)
+    if not guilty and len(held) > 1:
+        everything_free = close_loops(problem, start, free_coordinates(mechanism, ()))
+        guilty = held if problem.closed(everything_free) else ()
+    if not guilty:
+        return AssemblyError(
+            f"the loops cannot be closed from this guess; {remaining}",
+            residuals=gaps,
+            q=q,
+            element="initial.guess",
+            remedy="Check the anchors and link lengths, or give a guess closer to a closed "
+            "configuration; the closest one found is in the error's q",
+        )
+    nearest = {
+        name: value
+        for name, closed in closings.items()
+        if (value := _nearest(mechanism, problem, start, closed, name, held)) is not None
+    }
+    remedy = "Free some of them: put them into guess instead of q"
+    if len(guilty) < len(held) or len(held) == 1:
+        remedy = f"Change or free one of {quoted(guilty)}: with it free, the loops close"
+    if nearest:
+        values = ", ".join(f"{name} = {value:.9g}" for name, value in nearest.items())
+        remedy += f"; nearest values that close, one at a time: {values}"
+    return AssemblyError(
+        f"the loops cannot close with the held values of {quoted(held)}; {remaining}",
+        residuals=gaps,
+        q=q,
+        held=guilty,
+        nearest=nearest,
+        element="initial.q",
+        remedy=remedy,
+    )
+
+
+def _nearest(
+    mechanism: Mechanism,
+    problem: ClosureProblem,
+    start: FloatArray,
+    closed: FloatArray,
+    name: str,
+    held: tuple[str, ...],
+) -> float | None:
+    """The position of joint ``name`` nearest to that in ``start`` with which the loops close.
+
+    Dragged there from ``closed``, where it was free; None for a joint of several degrees of
+    freedom, or where branches meet.
+    """
+    if mechanism.joint(name).nv != 1:
+        return None
+    here = position_of(mechanism, closed, name)
+    columns = joint_coordinates(mechanism, (name, *(other for other in held if other != name)))
+    rank = mechanism.structure.loop_rank
+    if smallest_singular_value(problem, closed, rank) < CLOSE:
+        return None
+    basis, _ = tangent_basis(problem, closed, np.arange(problem.model.nv))
+    if np.linalg.matrix_rank(basis[columns], tol=SINGULAR) < len(columns):
+        return here  # the other held joints leave it no choice
+    target = np.zeros((1, len(columns)))
+    target[0, 0] = position_of(mechanism, start, name) - here
+    end = drag(problem, closed, columns, target, rank)
+    return here + float(end.values[-1, 0])
+
+
+def limits_in_the_way(
+    mechanism: Mechanism, problem: ClosureProblem, held: tuple[str, ...], q: FloatArray
+) -> AssemblyError:
+    """The error about loops that close at ``q`` (nq,), but nowhere within the joint limits."""
+    beyond = beyond_limits(mechanism, q)
+    parts = [f"{name} at {at:.6g}, limit {limit:.6g}" for name, (at, limit) in beyond.items()]
+    return AssemblyError(
+        f"the loops close, but not within the limits of {quoted(beyond)}: {'; '.join(parts)}",
+        residuals=problem.gaps(q),
+        q=q,
+        held=tuple(name for name in held if name in beyond),
+        limits=tuple(beyond),
+        element="limits",
+        remedy="Widen these limits, change the held values, or give a guess on another branch",
+    )

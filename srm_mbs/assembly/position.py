@@ -1,0 +1,366 @@
+r"""Closing loops: the closure equations of a mechanism as a root-finding problem.
+
+Two stages on the configuration manifold: a trust-region least-squares solve from the guess
+(SciPy), whose residual has the intended closing as its only zero, and Gauss-Newton on the closure
+rows to round-off.  The guess chooses the branch: where the closing found lies far from it, others
+are looked for and the nearest is taken.
+
+Position limits of joints: which are left, and closing within them.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.row_algebra import shortest, weakest
+from srm_mbs.dynamics.constraints.rows import support, world_jacobian
+from srm_mbs.dynamics.scaling import coordinate_units, counted_turns, row_angles
+from srm_mbs.dynamics.singularities.local_analysis import sharpened
+from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.forces import OPEN, LimitSpring
+from srm_mbs.model.mechanism import Mechanism
+
+CLOSED = 1e-12
+"""Largest closure error of an assembled state, in rad and in scene diagonals."""
+RANK = 1e-10
+"""Relative singular value below which a direction does not move the closures."""
+NEARLY_SINGULAR = 1e-4
+"""Singular value below which a closing may be an inaccurate singular one."""
+FAR = 0.5
+"""Motion of a joint (rad, scene diagonals) from the guess beyond which nearer closings are looked
+for."""
+OTHER_STARTS = 8
+SEARCH_STEPS = 200
+PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
+"""Sizes (rad, scene diagonals) of the restarts when the guess itself leads nowhere."""
+
+
+def _plain(loop: LoopClosure) -> IndexArray:
+    """The rows of ``loop`` whose only zeros are the intended closing."""
+    lengths, alignments, joints = loop.rows.blocks
+    rows = np.arange(loop.rows.count)
+    turns = () if len(loop.rows.matched) else rows[alignments]
+    return np.concatenate([rows[lengths], turns, rows[joints]]).astype(int)
+
+
+class ClosureProblem(ClosureGeometry):
+    """Closure equations of a mechanism, and how far it is from the intended closing."""
+
+    def mismatch(self, q: FloatArray) -> FloatArray:
+        """Closing residual whose only zero is the intended closing: gaps and axis differences."""
+        g, _ = self.closure(q)
+        parts, at = [], 0
+        for loop in self.mechanism.loops:
+            own = g[at : at + loop.rows.count]
+            at += loop.rows.count
+            parts.append(own[_plain(loop)])
+            if len(loop.rows.matched):
+                Ta, Tb = self._anchors(loop)
+                R = Tb.rotation.T @ Ta.rotation
+                parts.append((loop.rows.matched @ R.T - loop.rows.matched).ravel())
+        return np.concatenate(parts)
+
+    def mismatch_jacobian(self, q: FloatArray) -> FloatArray:
+        """Derivative of :meth:`mismatch` for motions of the joints, in units (entries, nv)."""
+        _, G = self.closure(q)
+        parts, at = [], 0
+        for loop in self.mechanism.loops:
+            parts.append(G[at : at + loop.rows.count][_plain(loop)])
+            at += loop.rows.count
+            if len(loop.rows.matched):
+                Ta, Tb = self._anchors(loop)
+                joint_a, joint_b = (joint for joint, _ in loop.resolve(self.model))
+                moves = support(self.model, joint_a) - support(self.model, joint_b)
+                turn = Tb.rotation.T @ (world_jacobian(self.data)[3:] * moves * self.unit)
+                R = Tb.rotation.T @ Ta.rotation
+                parts += [-pin.skew(m) @ turn for m in loop.rows.matched @ R.T]
+        return np.concatenate(parts)
+
+    def gaps(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
+        """Gap (m) and misalignment (rad) of each loop at q; None where a type has none."""
+        g = self.closure(q)[0] * self.row_unit
+        angles = row_angles(self.mechanism)
+        out = {}
+        at = 0
+        for loop in self.mechanism.loops:
+            own = slice(at, at + loop.rows.count)
+            at = own.stop
+            rows, turned = g[own][_plain(loop)], angles[own][_plain(loop)]
+            gap = float(np.linalg.norm(rows[~turned])) if not turned.all() else None
+            angle = float(np.linalg.norm(rows[turned])) if turned.any() else None
+            if len(loop.rows.matched):
+                Ta, Tb = self._anchors(loop)
+                R = Tb.rotation.T @ Ta.rotation
+                # chord of the unit vectors -> angle, accurate for small ones
+                chords = np.linalg.norm(loop.rows.matched @ R.T - loop.rows.matched, axis=1)
+                angle = float(np.max(2.0 * np.arcsin(np.minimum(0.5 * chords, 1.0))))
+            elif len(loop.rows.alignments):
+                angle = float(np.max(np.arcsin(np.minimum(np.abs(rows[turned]), 1.0))))
+            out[loop.name] = (gap, angle)
+        return out
+
+    def _anchors(self, loop: LoopClosure) -> tuple[pin.SE3, pin.SE3]:
+        a, b = (self.data.oMi[joint] * inside for joint, inside in loop.resolve(self.model))
+        return a, b
+
+    def distance(self, q: FloatArray) -> float:
+        """From the start to q: the norm of the joint motions in units."""
+        return float(np.linalg.norm(self.difference(self.start, q)))
+
+    @cached_property
+    def _hinges(self) -> tuple[IndexArray, IndexArray]:
+        """Indices into q and into v of the angles of which whole turns do not matter: those of
+        coupled joints do."""
+        coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
+        turning = self.mechanism.derived("counted turns", lambda: counted_turns(self.model))
+        in_q: list[int] = []
+        in_v: list[int] = []
+        for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
+            own = np.flatnonzero(turning[joint.idx_v : joint.idx_v + joint.nv])
+            if name not in coupled:
+                in_q += (joint.idx_q + own).tolist()
+                in_v += (joint.idx_v + own).tolist()
+        return np.array(in_q, dtype=int), np.array(in_v, dtype=int)
+
+    @property
+    def hinges(self) -> IndexArray:
+        """Velocity indices of the angles of which whole turns do not matter: hinges and universal
+        joints."""
+        return self._hinges[1]
+
+    def unwound(self, q: FloatArray) -> FloatArray:
+        """q without full turns of its hinges away from the start, except of coupled ones."""
+        own = self._hinges[0]
+        turns = np.round((q[own] - self.start[own]) / (2.0 * np.pi))
+        q = q.copy()
+        q[own] -= 2.0 * np.pi * turns
+        return q
+
+    def closed(self, q: FloatArray) -> bool:
+        """Whether every loop is closed as intended, axes in the right sense."""
+        g, _ = self.closure(q)
+        return float(np.abs(g).max()) <= CLOSED and float(np.abs(self.mismatch(q)).max()) < 1e-6
+
+
+def _search(
+    problem: ClosureProblem,
+    q: FloatArray,
+    free: IndexArray,
+    steps: int,
+    bounds: tuple[Any, Any],
+    *,
+    near: bool,
+) -> FloatArray:
+    """Least-squares solve of the closing residual over the free coordinates, from q.
+
+    To round-off: next to closings that are not isolated, or where G loses rank, convergence is
+    slow, and stopping early would leave the rest to Newton's steps, which may lead anywhere.
+
+    Along directions that do not move the closures SciPy's trust region goes as far as it reaches,
+    to the side that rounding chooses.  With ``near``, Levenberg's damping, rows for the step with
+    the size of the residual, keeps such closings next to q (Yamashita, Fukushima: On the rate of
+    convergence of the Levenberg-Marquardt method, 2001); it vanishes with the residual, whose zeros
+    stay.
+    """
+    from scipy.optimize import least_squares
+
+    def residual(delta: FloatArray) -> FloatArray:
+        out: FloatArray = np.append(problem.mismatch(problem.move(q, delta, free)), zeros)
+        return out
+
+    def jacobian(delta: FloatArray) -> FloatArray:
+        full = np.zeros(problem.model.nv)
+        full[free] = delta * problem.unit[free]
+        chart = pin.dIntegrate(problem.model, q, full, pin.ARG1)
+        here = problem.move(q, delta, free)
+        at_end = problem.mismatch_jacobian(here) / problem.unit
+        out: FloatArray = ((at_end @ chart) * problem.unit)[:, free]
+        if near:
+            damping = max(float(np.linalg.norm(problem.mismatch(here))), CLOSED)
+            out = np.vstack([out, damping * np.eye(len(free))])
+        return out
+
+    zeros = np.zeros(len(free) if near else 0)
+    found = least_squares(
+        residual,
+        np.zeros(len(free)),
+        jac=jacobian,
+        method="trf",
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+        max_nfev=steps,
+        bounds=bounds,
+    )
+    return problem.move(q, found.x, free)
+
+
+def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
+    """Gauss-Newton on the closure rows until they stop improving."""
+    g, G = problem.closure(q)
+    best, error = q, float(np.abs(g).max())
+    for _ in range(60):
+        if error == 0.0:
+            break
+        step = shortest(G[:, free], g, RANK)
+        q = problem.move(q, -step, free)
+        g, G = problem.closure(q)
+        new_error = float(np.abs(g).max())
+        if not new_error < error:
+            break
+        best, error = q, new_error
+    return best
+
+
+def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
+    """Sharpen a double root of g; q itself where this does not help."""
+    rows = problem.normalised(q)[:, free]
+    if not weakest(rows, 1e-13) < NEARLY_SINGULAR:
+        return q
+    rank = int(np.sum(np.linalg.svd(rows, compute_uv=False) > NEARLY_SINGULAR))
+    # A regular closing close to a singular one must stay: g may not become larger.
+    closed = max(2e-15, float(np.abs(problem.closure(q)[0]).max()))
+    found = sharpened(problem, q, rank, NEARLY_SINGULAR, closed, free)
+    return q if found is None else found
+
+
+def close_from(
+    problem: ClosureProblem,
+    q: FloatArray,
+    free: IndexArray,
+    steps: int = SEARCH_STEPS,
+    bounds: tuple[Any, Any] = (-np.inf, np.inf),
+) -> FloatArray:
+    """Where closing leads from q (nq,) while the ``free`` coordinates move; closed or not.
+
+    ``bounds`` are the least and largest motions of these, in units.
+    """
+    if np.linalg.norm(problem.mismatch(q)) <= CLOSED:
+        return problem.unwound(_polish(problem, q, free))
+    for near in (True, False):  # far away where loops close nowhere near, were it by rounding only
+        found = _polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
+        if problem.closed(found):
+            break
+    return problem.unwound(found)
+
+
+def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) -> FloatArray:
+    """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
+    if not len(free):
+        return start
+    rng = np.random.default_rng(0)
+
+    best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
+    for size in (0.0, *PERTURBATIONS):
+        spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
+        q = close_from(problem, problem.move(start, spread, free), free)
+        if problem.closed(q):
+            break
+        gap = float(np.linalg.norm(problem.mismatch(q)))
+        if gap < best_gap:
+            best, best_gap = q, gap
+    else:
+        return best
+    away = problem.difference(start, q)[free]
+    far = float(np.abs(away).max())
+    if far > FAR:
+        # Another branch may be nearer: look on the other side of the guess and around it.
+        others = [-0.5 * away, -away]
+        others += list(rng.uniform(-far, far, (OTHER_STARTS, len(free))))
+        for other in others:
+            candidate = close_from(problem, problem.move(start, other, free), free)
+            if problem.distance(candidate) < problem.distance(q) and problem.closed(candidate):
+                q = candidate
+    return onto_singular_point(problem, q, free)
+
+
+SLACK = 1e-9
+"""What rounding may take a joint beyond its limit, rad or m."""
+CONTACT = 100.0
+"""Angular frequency of a default contact over the mechanism's characteristic rate."""
+DAMPING_RATIO = 0.1
+SMALLEST_INERTIA = 1e-3
+"""Least inertia that a default contact is made for, over the largest of the tree."""
+STARTS = 24
+SPREAD = 1.5
+"""Size of the restarts, rad or scene diagonals."""
+
+
+def _limited(mechanism: Mechanism) -> list[tuple[str, int, int, float, float]]:
+    """(name, index in q, index in v, lowest, highest) of the one-degree joints with limits."""
+    model = mechanism.model
+    rows = []
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        if joint.nq == joint.nv == 1:
+            low = float(model.lowerPositionLimit[joint.idx_q])
+            high = float(model.upperPositionLimit[joint.idx_q])
+            # Without limits Pinocchio has -inf, inf, or both zero where none were ever set.
+            if low < high:
+                rows.append((name, joint.idx_q, joint.idx_v, low, high))
+    return rows
+
+
+def beyond_limits(mechanism: Mechanism, q: FloatArray) -> dict[str, tuple[float, float]]:
+    """Joint name -> (its position in q (nq,), the limit that it is beyond), rad or m."""
+    out = {}
+    for name, i, _, low, high in _limited(mechanism):
+        if q[i] < low - SLACK:
+            out[name] = (float(q[i]), low)
+        elif q[i] > high + SLACK:
+            out[name] = (float(q[i]), high)
+    return out
+
+
+def close_within_limits(
+    problem: ClosureProblem, start: FloatArray, free: IndexArray
+) -> FloatArray | None:
+    """The closed configuration nearest to ``start`` that was found within all limits, or None."""
+    mechanism = problem.mechanism
+    rng = np.random.default_rng(0)
+    limited = _limited(mechanism)
+    found: list[FloatArray] = []
+    for k in range(STARTS):
+        q = (
+            problem.move(start, rng.uniform(-SPREAD, SPREAD, len(free)), free)
+            if k
+            else start.copy()
+        )
+        low, high = np.full(problem.model.nv, -np.inf), np.full(problem.model.nv, np.inf)
+        for _, i, j, least, largest in limited:
+            inside = 1e-6 * min(1.0, largest - least)  # the search starts within its bounds
+            if j in free:
+                q[i] = np.clip(q[i], least + inside, largest - inside)
+            low[j], high[j] = (least - q[i]) / problem.unit[j], (largest - q[i]) / problem.unit[j]
+        closed = close_from(problem, q, free, bounds=(low[free], high[free]))
+        # Angles count as they are: a turn more may be within the limits.
+        if problem.closed(closed) and not beyond_limits(mechanism, closed):
+            found.append(closed)
+    return min(found, key=problem.distance, default=None)
+
+
+def limit_springs(mechanism: Mechanism) -> tuple[LimitSpring, ...]:
+    """Springs at all position limits that have none yet, as stiff as the mechanism is fast.
+
+    k = M_jj (100 w)^2 and c = 0.2 sqrt(k M_jj), with the inertia M_jj that the joint moves in the
+    open tree at q0 and the mechanism's characteristic rate w
+    (:class:`~srm_mbs.dynamics.scaling.Units`): a contact takes about a hundredth of its time.
+    """
+    there = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
+    rate = coordinate_units(mechanism, mechanism.q0, mechanism.v0).rate
+    inertia = np.diag(pin.crba(mechanism.model, workspace(mechanism.model), mechanism.q0))
+    out = []
+    for name, _, j, low, high in _limited(mechanism):
+        moved = max(float(inertia[j]), SMALLEST_INERTIA * float(inertia.max()))
+        stiffness = moved * (CONTACT * rate) ** 2
+        if name not in there and min(abs(low), abs(high)) < OPEN:
+            damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * moved))
+            out.append(LimitSpring(name, stiffness, damping, name=f"limit_{name}"))
+    return tuple(out)

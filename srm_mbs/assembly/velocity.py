@@ -1,0 +1,227 @@
+r"""Rates that fit the closures of a closed configuration.
+
+They solve G v = s', the rates of the drives, 0 in the rows of the loops.  Where the configuration
+is singular, that is not enough: a motion through it also has u^T (Gdot v - s'') = 0 for every left
+null vector u of G (the tangents of the branches).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.assembly.diagnosis import free_coordinates, quoted
+from srm_mbs.assembly.position import ClosureProblem
+from srm_mbs.dynamics.constraints.rheonomic import DriveRows
+from srm_mbs.dynamics.constraints.row_algebra import null_basis, ranked, weakest
+from srm_mbs.dynamics.singularities.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
+from srm_mbs.dynamics.singularities.local_analysis import (
+    SINGULAR,
+    SingularConfiguration,
+    analyse_singular,
+    nearest_singular,
+)
+from srm_mbs.errors import AssemblyError
+from srm_mbs.model.mechanism import Mechanism
+
+RATE_TOLERANCE = 1e-12
+ROUNDING, LOOSEST = 1e-14, 1e-8
+"""Closure error of q, which over the distance from a singular configuration is an error of G v, and
+the largest such error: the square root of round-off."""
+AT_REST = 1e-14
+"""Part of the given rates up to which what remains of them is rounding."""
+EXACTLY, NEARLY = 1e-12, 1e-3
+"""Singular values of G, rows over their usual size, between which rates come from the branch."""
+CURVATURE = 1e-7
+"""Largest u^T (Gdot v) of consistent rates, over the square of the rates."""
+
+
+def consistent_rates(
+    mechanism: Mechanism,
+    problem: ClosureProblem,
+    q: FloatArray,
+    v: FloatArray,
+    held: tuple[str, ...],
+) -> FloatArray:
+    """The rates (nv,) nearest to v that a motion of ``mechanism`` through q has.
+
+    Parameters
+    ----------
+    mechanism, problem
+        What moves, and its closures.
+    q : (nq,), v : (nv,)
+        A configuration with closed loops, and the rates asked for.
+    held
+        Joints whose rates stay as in ``v``.
+
+    Raises
+    ------
+    AssemblyError
+        If there are none, naming the held rates or drives that contradict the closures.
+    """
+    drives = DriveRows(mechanism, problem, q)
+    _, G = problem.closure(q)
+    G = np.concatenate([G, drives.rows])
+    asked = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
+    normalised = np.concatenate([problem.normalised(q), drives.rows])
+    conditions, close = _conditions(mechanism, problem, q, drives)
+    fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
+
+    def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
+        """The rates nearest to u that satisfy the conditions; None if there are none."""
+        moved = ranked(to.rows[:, free], SINGULAR)
+        u = u.copy()
+        for _ in range(2):  # the second pass removes the rounding of the first
+            u[free] -= moved.solve(to.rows @ u - to.right)
+        if np.abs(u).max() <= AT_REST * fastest:
+            u[:] = 0.0  # what is left is rounding, which has no direction
+        return _onto_tangent(u, free, moved.null, to.curvature)
+
+    def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
+        """Rates in units, the largest G v left, and whether a motion has these rates."""
+        free = free_coordinates(mechanism, names)
+        u = fit(v / problem.unit, free, conditions)
+        if u is not None and close is not None:
+            limit = branch_limit(close, q, u)
+            u = u if limit is None else fit(u, free, _on_branch(limit, problem.unit, drives))
+        if u is None:
+            start = v / problem.unit
+            linear = replace(conditions, curvature=lambda u: np.zeros(0))
+            nearest = fit(start, free, linear)
+            closest = start if nearest is None else nearest
+            return start, float(np.abs(G @ closest - asked).max()), False
+        return u, float(np.abs(G @ u - asked).max()), True
+
+    # Next to a singular configuration q lies off its branch by round-off over the distance.
+    smallest = min(weakest(normalised, EXACTLY), 1.0)
+    tolerance = max(RATE_TOLERANCE, min(ROUNDING / smallest, LOOSEST))
+    tolerance *= max(1.0, fastest)
+
+    def consistent(error: float, moves: bool) -> bool:
+        return error <= tolerance and moves
+
+    solved, error, moves = solve(held)
+    if consistent(error, moves):
+        return solved * problem.unit
+    guilty = [
+        name for name in held if consistent(*solve([h for h in held if h != name])[1:])
+    ] or list(held)
+    driven = quoted(drive.name for drive in mechanism.drives)
+    if error > tolerance and not held:
+        what = (
+            f"the drives ({driven}) contradict the closures, or each other "
+            f"(by {error:.2e} in units per second)"
+        )
+    elif error > tolerance:
+        against = f"the closures or the drives ({driven})" if driven else "the closures"
+        what = f"the held rates of {quoted(held)} contradict {against} (G v = {error:.2e})"
+    elif held:
+        what = f"no motion through this singular configuration has the rates of {quoted(held)}"
+    else:
+        what = "no motion through this singular configuration has rates close to these"
+    remedy = f"Change or free one of {quoted(guilty)}" if guilty else "Give other rates"
+    if driven and not held:
+        remedy = "Change or remove a drive, or start where the motion can follow it"
+    if weakest(normalised, 1e-13) < 10.0 * SINGULAR:
+        remedy += (
+            "; the held positions lie so close to a singular configuration that the rates are not "
+            "determined: give them with all digits, or further away"
+        )
+    raise AssemblyError(
+        what,
+        residuals=problem.gaps(q),
+        q=q,
+        held=tuple(guilty),
+        element="initial.v",
+        remedy=remedy,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Conditions:
+    """What the rates u (nv,) of a motion, in units, satisfy: rows u = right, curvature(u) = 0."""
+
+    rows: FloatArray
+    right: FloatArray
+    curvature: Callable[[FloatArray], FloatArray]
+
+
+def _with_drives(
+    rows: FloatArray, drives: DriveRows, curvature: Callable[[FloatArray], FloatArray]
+) -> _Conditions:
+    """Those of the closures, rows u = 0, and of the drives."""
+    right = np.concatenate([np.zeros(len(rows)), drives.rates])
+    return _Conditions(np.concatenate([rows, drives.rows]), right, curvature)
+
+
+def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Conditions:
+    """Those on one branch next to a singular configuration: the normal part vanishes."""
+    normal = limit.projector * unit / unit[:, None]
+    return _with_drives(normal, drives, lambda u: np.zeros(0))
+
+
+def _conditions(
+    mechanism: Mechanism, problem: ClosureProblem, q: FloatArray, drives: DriveRows
+) -> tuple[_Conditions, SingularConfiguration | None]:
+    """The conditions at q, and the singular configuration so close to q that rates choose the
+    branch and not q."""
+    normalised = problem.normalised(q)
+    left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
+
+    def curvature(u: FloatArray) -> FloatArray:
+        bias = np.concatenate([problem.bias(q, u), drives.bias(u)])
+        out: FloatArray = left.T @ bias
+        return out
+
+    here = _with_drives(normalised, drives, curvature)
+    if not weakest(normalised, EXACTLY) < NEARLY:
+        return here, None
+    # G determines the rates to round-off over the square of the distance: use the branch.
+    rank = mechanism.structure.loop_rank
+    found = nearest_singular(problem, q, rank, reach=10.0 * NEARLY)
+    if found is None:
+        return here, None
+    close = analyse_singular(problem, found, rank)
+    away = problem.difference(found, q)
+    if np.linalg.norm(away) > TELLS_THE_BRANCH:
+        limit = branch_limit(close, q, away)
+        return (here if limit is None else _on_branch(limit, problem.unit, drives)), None
+    return _with_drives(problem.normalised(found), drives, close.curvature), close
+
+
+def _onto_tangent(
+    u: FloatArray,
+    free: IndexArray,
+    null: FloatArray,
+    curvature: Callable[[FloatArray], FloatArray],
+) -> FloatArray | None:
+    """The rates nearest to u (nv,) that a motion has: ``curvature`` zero; None if there are none.
+
+    They differ from u by combinations of the columns of ``null`` in the ``free`` coordinates.
+    """
+    from scipy.optimize import least_squares
+
+    size = float(np.abs(u).max())
+    if size == 0.0 or np.abs(curvature(u)).max(initial=0.0) <= CURVATURE * size**2:
+        return u
+    if not null.shape[1]:
+        return None
+
+    def bent(w: FloatArray) -> FloatArray:
+        out = u.copy()
+        out[free] += size * (null @ w)
+        return out
+
+    rng = np.random.default_rng(0)
+    best = None
+    for start in (np.zeros(null.shape[1]), *rng.uniform(-2.0, 2.0, (8, null.shape[1]))):
+        found = least_squares(
+            lambda w: curvature(bent(w)) / size**2, start, xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
+        closer = best is None or np.linalg.norm(found.x) < np.linalg.norm(best)
+        if closer and np.abs(found.fun).max() <= CURVATURE:
+            best = found.x
+    return None if best is None else bent(best)

@@ -1,0 +1,233 @@
+"""The commands around the simulation: assembly modes, equilibria, linearisation, dragging."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import srm_mbs
+from srm_mbs.cli.output import RUN_FAILED, Model, check_output, reported, table
+from srm_mbs.errors import InputError
+
+if TYPE_CHECKING:
+    from srm_mbs.model.mechanism import Mechanism
+    from srm_mbs.visualization.animation.joint_motion import JointMotion
+
+Hold = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--hold",
+        metavar="JOINT[=VALUE]",
+        help="Keep a joint at VALUE (rad, m), or where it starts. May be given several times.",
+    ),
+]
+Html = Annotated[
+    Path | None, typer.Option(metavar="FILE.html", help="Write the animation as one page.")
+]
+
+
+def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]], list[str]]:
+    """Joints with values (``JOINT=VALUE,...``), and those without."""
+    values: dict[str, list[float]] = {}
+    names = []
+    for text in given or []:
+        name, equals, numbers = text.partition("=")
+        if name in values or name in names:
+            raise InputError(
+                f"joint {name!r} is given twice", element=option, remedy="Give each joint once"
+            )
+        if not equals:
+            names.append(name)
+            continue
+        try:
+            values[name] = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            raise InputError(
+                f"{text!r} is not a joint with a value", element=option, remedy="Write crank=1.5"
+            ) from None
+    return values, names
+
+
+def _held(given: list[str] | None) -> tuple[dict[str, float], list[str]]:
+    """Positions of the held joints that have one, and all their names."""
+    values, names = _values(given, "--hold")
+    if any(len(numbers) > 1 for numbers in values.values()):
+        raise InputError("a held joint takes one value", element="--hold", remedy="Give one value")
+    positions = {name: numbers[0] for name, numbers in values.items()}
+    return positions, [*positions, *names]
+
+
+def _write_page(html: Path | None, motion: Callable[[], JointMotion]) -> None:
+    if html is not None:
+        motion().export_html(html)
+        typer.echo(f"written: {html}")
+
+
+@reported()
+def modes(
+    model: Model,
+    hold: Hold = None,
+    starts: Annotated[
+        int, typer.Option(metavar="N", help="Number of configurations from which closing starts.")
+    ] = 200,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the random ones among them.")] = 0,
+) -> None:
+    """List the assembly modes, the ways in which loops close.
+
+    Without --hold as many joints as there are degrees of freedom keep their initial position.
+    """
+    from srm_mbs.cli.tables import mode_rows
+
+    mechanism = srm_mbs.load(model)
+    positions, names = _held(hold)
+    found = srm_mbs.assembly_modes(
+        mechanism,
+        positions if hold else None,
+        hold=names if hold else None,
+        starts=starts,
+        seed=seed,
+    )
+    if not found:
+        typer.echo("no closed configuration was found", err=True)
+        raise typer.Exit(RUN_FAILED)
+    typer.echo(f"held: {', '.join(found[0].held) or 'no joint'}")
+    table(mode_rows(mechanism, found), ("mode", "found", "", *mechanism.joint_names))
+
+
+@reported()
+def equilibrium(
+    model: Model,
+    hold: Hold = None,
+    nearest: Annotated[
+        bool, typer.Option("--nearest", help="Find the nearest one, stable or not.")
+    ] = False,
+) -> None:
+    """Find a static equilibrium.
+
+    Prints positions, stability, holding forces and reactions.
+    """
+    from srm_mbs.cli.tables import equilibrium_rows, position_rows
+
+    mechanism = srm_mbs.load(model)
+    positions, names = _held(hold)
+    found = srm_mbs.equilibrium(
+        mechanism, positions, hold=names, search="nearest" if nearest else "stable"
+    )
+    table(equilibrium_rows(mechanism, found))
+    typer.echo()
+    table(position_rows(mechanism, found.q), ("joint", "position"))
+
+
+@reported()
+def linearise(
+    model: Model,
+    at: Annotated[
+        str,
+        typer.Option(
+            metavar="initial|rest|equilibrium|nearest",
+            help="Where: the initial state, the initial configuration at rest, a stable "
+            "equilibrium, or the nearest one.",
+        ),
+    ] = "initial",
+    actuated: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--input",
+            metavar="JOINT",
+            help="Joint whose force is an input of B. May be given several times.",
+            show_default="all joints",
+        ),
+    ] = None,
+    coordinate: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT",
+            help="Joint that is a coordinate. May be given several times.",
+            show_default="chosen",
+        ),
+    ] = None,
+    mode: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=0, help="Mode that --html shows.", show_default="0"),
+    ] = None,
+    html: Html = None,
+) -> None:
+    """Linearise a mechanism: A, B, eigenvalues and mode shapes."""
+    from srm_mbs.cli.tables import eigenvalue_rows, matrix_rows, state_names
+    from srm_mbs.model.coordinates import coordinate_names
+
+    if mode is not None and html is None:
+        raise InputError(
+            "there is no page that could show it",
+            element="--mode",
+            remedy="Give --html, or leave it out",
+        )
+    if html is not None:
+        check_output(html, "--html", (".html", ".htm"))
+    mechanism = srm_mbs.load(model)
+    state = _state(mechanism, at)
+    found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
+    inputs = (f"force of {name}" for name in found.inputs)
+    table(matrix_rows(found), ("", *state_names(found), *inputs, "drift"))
+    typer.echo()
+    header = ("mode", "eigenvalue 1/s", "frequency Hz", "damping")
+    table(eigenvalue_rows(found), (*header, *coordinate_names(mechanism)))
+    _write_page(html, lambda: found.mode_shape(mode or 0))
+
+
+def _state(mechanism: Mechanism, at: str) -> tuple[Any, ...]:
+    if at == "initial":
+        return ()
+    if at == "rest":
+        return (mechanism.q0,)
+    if at in ("equilibrium", "nearest"):
+        search: Any = "nearest" if at == "nearest" else "stable"
+        return (srm_mbs.equilibrium(mechanism, search=search).q,)
+    raise InputError(
+        f"there is no state {at!r}",
+        element="--at",
+        remedy="Known: initial, rest, equilibrium, nearest",
+    )
+
+
+@reported()
+def drag(
+    model: Model,
+    values: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="JOINT=VALUE[,VALUE...]", help="Joint and the positions to go to (rad, m)."
+        ),
+    ],
+    html: Html = None,
+    duration: Annotated[
+        float, typer.Option(metavar="S", help="Length of the animation (s).")
+    ] = 3.0,
+) -> None:
+    """Drag joints through positions, on one branch.
+
+    The exit status is 1 where they go no further.
+    """
+    from srm_mbs.cli.tables import path_rows, position_rows
+
+    if html is not None:
+        check_output(html, "--html", (".html", ".htm"))
+    mechanism = srm_mbs.load(model)
+    targets, bare = _values(values, "JOINT=VALUE")
+    if bare:
+        raise InputError(
+            f"joint {bare[0]!r} has no value", element="JOINT=VALUE", remedy="Write crank=1.5"
+        )
+    found = srm_mbs.follow(mechanism, targets)
+    table(path_rows(found))
+    typer.echo()
+    table(
+        position_rows(mechanism, found.q[-1] if found.complete else found.path[-1]),
+        ("joint", "position"),
+    )
+    _write_page(html, lambda: found.motion(duration))
+    if not found.complete:
+        raise typer.Exit(RUN_FAILED)

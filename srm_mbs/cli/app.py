@@ -1,0 +1,371 @@
+"""The command line ``srm-mbs``: thin, every command calls the package and prints.
+
+Everything slow is imported inside the commands, so that ``srm-mbs --help`` answers at once.
+Exit status: 0; 1 when a run or a search did not reach its end; 2 for bad input.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import subprocess
+import sys
+from functools import partial
+from itertools import takewhile
+from pathlib import Path
+from typing import Annotated
+
+# Before NumPy is loaded: on matrices of this size the threads of BLAS cost many times their work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import typer
+
+import srm_mbs
+from srm_mbs.cli import analysis, playback, plot_report
+from srm_mbs.cli.output import (
+    BAD_INPUT,
+    RUN_FAILED,
+    Lines,
+    Model,
+    check_output,
+    reported,
+    table,
+    write_files,
+)
+from srm_mbs.cli.playback import (
+    At,
+    Gaps,
+    Image,
+    Live,
+    Reactions,
+    Trace,
+    Video,
+    check_overlays,
+    check_pictures,
+    check_time,
+    drawn,
+    live_view,
+    play_run,
+)
+from srm_mbs.errors import InputError
+
+T_END, RTOL = 10.0, 1e-6
+"""End time (s) and tolerance where neither the command nor the description gives one."""
+
+app = typer.Typer(
+    name="srm-mbs",
+    help="Simulate closed-loop mechanisms without drift and through singular configurations.",
+    epilog="Exit status: 0; 1 if a run or a search did not reach its end; 2 for bad input.",
+    no_args_is_help=True,
+    add_completion=False,
+    # Plain help and usage errors: rich would draw boxes into pipes, and eat "[simulation]".
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"srm-mbs {srm_mbs.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    context: typer.Context,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log what is done on standard error.")
+    ] = False,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    logger = logging.getLogger("srm_mbs")
+    level, handler = logger.level, Lines()
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
+
+    def restore() -> None:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+    context.call_on_close(restore)
+
+
+@app.command()
+@reported()
+def simulate(
+    model: Model,
+    t_end: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            help="End of the run (s).",
+            show_default=f"the description's, else {T_END:g}",
+        ),
+    ] = None,
+    method: Annotated[str, typer.Option(metavar="NAME", help="Integration method.")] = "psrm",
+    tableau: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Runge-Kutta scheme of the method.",
+            show_default="the method's: dop853 with psrm, tvd32 with srm",
+        ),
+    ] = None,
+    rtol: Annotated[
+        float | None,
+        typer.Option(
+            metavar="R",
+            help="Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
+            "1e-4 with srm).",
+            show_default="the description's, else 1e-6",
+        ),
+    ] = None,
+    atol: Annotated[
+        float | None,
+        typer.Option(
+            metavar="A",
+            help="Absolute tolerance of every coordinate.",
+            show_default="the description's, else rtol times the unit of each coordinate",
+        ),
+    ] = None,
+    step: Annotated[
+        float | None,
+        typer.Option(metavar="H", help="Fixed step (s) instead of step-size control."),
+    ] = None,
+    backend: Annotated[
+        str,
+        typer.Option(metavar="auto|python|kernel", help="Backend that computes the run."),
+    ] = "auto",
+    out: Annotated[
+        Path | None, typer.Option(metavar="RUN.npz", help="Save the run, for plot and play.")
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Plot the run as .png, .pdf or .svg."),
+    ] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="Write the motion at the steps as a table."),
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write the animation as one page."),
+    ] = None,
+    image: Image = None,
+    at: At = None,
+    video: Video = None,
+    trace: Trace = None,
+    gaps: Gaps = False,
+    reactions: Reactions = False,
+    balance: Annotated[
+        bool, typer.Option("--balance", help="Print the energy balance of the run.")
+    ] = False,
+    play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
+    live: Live = False,
+) -> None:
+    """Simulate a mechanism and print a summary of the run.
+
+    A run that fails, or is interrupted with Ctrl-C, keeps everything computed so far: the files
+    are written and the exit status is 1. Of an interrupted run singular passages are not counted.
+    """
+    from srm_mbs.analysis.summary import run_rows
+
+    if out is not None:
+        check_output(out, "--out", (".npz",))
+    if plot is not None:
+        from srm_mbs.visualization.plotting.figure import FORMATS
+
+        check_output(plot, "--plot", FORMATS)
+    if csv is not None:
+        check_output(csv, "--csv", (".csv",))
+    if html is not None:
+        check_output(html, "--html", (".html", ".htm"))
+    check_pictures(image, at, video)
+
+    mechanism = srm_mbs.load(model)
+    shown = drawn(mechanism, trace, gaps, reactions)
+    check_overlays(trace, gaps, reactions, (html, image, video, play, live))
+    defaults = mechanism.defaults
+    t_end = _first(t_end, defaults.t_end, T_END)
+    check_time(at, t_end)
+    view = live_view(mechanism) if live else None
+    solution = srm_mbs.simulate(
+        mechanism,
+        t_end,
+        method=method,
+        tableau=tableau,
+        rtol=_first(rtol, defaults.rtol, RTOL),
+        atol=defaults.atol if atol is None else atol,
+        step=step,
+        progress=True if view is None else view,
+        backend=backend,
+    )
+    written, failed = write_files(
+        [
+            (out, solution.save),
+            (plot, solution.plot),
+            (csv, solution.to_csv),
+            (html, partial(solution.export_html, **shown)),
+            (image, partial(solution.export_image, t=at, **shown)),
+            (video, partial(solution.export_video, **shown)),
+        ]
+    )
+    rows = run_rows(solution, passages=solution.status != "interrupted")
+    table([*rows, *(("written", str(path)) for path in written)])
+    if balance:
+        from srm_mbs.cli.tables import balance_rows
+
+        table(balance_rows(solution.energy_balance))
+    typer.echo(solution.message, err=not solution.success)
+    if play or view:
+        play_run(solution, shown, view)
+    if failed:
+        raise typer.Exit(BAD_INPUT)
+    if not solution.success:
+        raise typer.Exit(RUN_FAILED)
+
+
+def _first(*values: float | None) -> float:
+    """The first value that is given."""
+    return next(value for value in values if value is not None)
+
+
+@app.command()
+@reported()
+def convert(
+    model: Model,
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT.toml", help="The description; its URDF goes beside it.")
+    ],
+    cut: Annotated[
+        list[str] | None,
+        typer.Option(metavar="JOINT", help="Cut a loop at this joint. May be given several times."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
+) -> None:
+    """Write a file of any format as a TOML description and a URDF."""
+    from srm_mbs.formats.convert import convert as write
+
+    *written, notes = write(model, out, cut=cut or (), force=force)
+    for path in written:
+        typer.echo(f"written: {path}")
+    for note in notes:
+        typer.echo(f"note: {note}")
+
+
+@app.command()
+@reported()
+def info(model: Model) -> None:
+    """Describe a mechanism: joints, loops, forces, the start.
+
+    With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
+    """
+    from srm_mbs.analysis.summary import (
+        drive_rows,
+        force_rows,
+        joint_rows,
+        loop_rows,
+        mechanism_rows,
+    )
+
+    mechanism = srm_mbs.load(model)
+    table(mechanism_rows(mechanism))
+    typer.echo()
+    table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
+    if mechanism.loops:
+        typer.echo()
+        table(loop_rows(mechanism), ("loop", "type", "a", "b", "gap at the start"))
+    if mechanism.forces:
+        typer.echo()
+        table(force_rows(mechanism), ("force", "type", "acts on", "values"))
+    if mechanism.drives:
+        typer.echo()
+        table(drive_rows(mechanism), ("drive", "law", "moves", "values"))
+    notes = (*mechanism.notes, *mechanism.structure.notes)
+    from srm_mbs._kernel import missing
+
+    if missing:
+        notes = (*notes, f"the compiled kernel is missing: {missing}")
+    if notes:
+        typer.echo()
+    for note in notes:
+        typer.echo(f"note: {note}")
+
+
+@app.command()
+@reported()
+def models() -> None:
+    """List the mechanisms that come with the package."""
+    from srm_mbs.formats.load import largest_n, models_folder
+
+    folder = models_folder()
+    table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
+    typer.echo(f"n_four_bar_<N> is made for any N up to {largest_n()}.")
+
+
+def _first_sentence(path: Path) -> str:
+    """The first sentence of the comment at the top of a description."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comment = takewhile(lambda line: line.startswith("#"), lines)
+    text = " ".join(line.removeprefix("#").strip() for line in comment)
+    # An initial ("C. B. Macdonald") ends no sentence.
+    return re.split(r"(?<!\b[A-Z])\.(?:\s|$)", text, maxsplit=1)[0]
+
+
+app.command()(playback.play)
+
+
+app.command()(plot_report.plot)
+
+
+app.command()(plot_report.report)
+
+
+@app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...]",
+    add_help_option=False,
+)
+@reported()
+def benchmark(context: typer.Context) -> None:
+    """Compare run time and error with other simulators.
+
+    In a checkout of the source only.  The options are those of
+    'python -m benchmarks.work_precision'.
+    """
+    harness = Path("benchmarks", "work_precision", "__main__.py")
+    if not harness.is_file():
+        if "--help" in context.args:
+            typer.echo(context.get_help())
+            raise typer.Exit
+        raise InputError(
+            "the benchmark is not installed with the package, and there is none in this folder",
+            file=str(harness),
+            element="benchmark",
+            remedy="Run it at the top of a checkout of the source",
+        )
+    # A process of its own: it reads the number of threads before it loads anything.
+    command = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
+    status = subprocess.run(command, check=False).returncode
+    if status:
+        raise typer.Exit(status)
+
+
+for command in (
+    analysis.modes,
+    analysis.equilibrium,
+    analysis.linearise,
+    analysis.drag,
+):
+    app.command()(command)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app(prog_name="srm-mbs")

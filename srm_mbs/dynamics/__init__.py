@@ -1,0 +1,1 @@
+"""Equations of motion behind the :class:`~srm_mbs.dynamics.system.System` protocol."""

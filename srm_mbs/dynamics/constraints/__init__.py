@@ -1,0 +1,1 @@
+"""Closure rows and their linear algebra: projection, rank, structure, mobility, reactions."""

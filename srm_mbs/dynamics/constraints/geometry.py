@@ -1,0 +1,270 @@
+"""Closure rows without forces: g, G and Gdot v as pure numbers, for geometry on the loops.
+
+Drives are not part of it: what is singular here is singular whatever the motion.  With them, and
+time as one more coordinate, it is :mod:`srm_mbs.dynamics.constraints.geometry`.
+
+Coordinates count in their units (1 rad, the scene diagonal), rows in theirs; *normalised* rows are
+divided by their usual size, so that ranks can be judged.
+
+Closures and drives as pure numbers, with time as one more coordinate.
+
+The rows g(q) - s(t) of drives depend on (q, t) as those of closures do on q, and time passes
+evenly: with the coordinates (q, t) and the rates (v, 1), and ' for the derivative by t,
+
+    [G, -s'] (v, 1) = 0,     [G, -s'] (v', 0) + (Gdot v - s'') = 0.
+
+So what holds of singular configurations of closures, their branches and the constraint algebra on
+them, holds of drives in (q, t), where t has no inertia of its own: it is prescribed.  Where the
+rows G of closures and drives lose rank on a motion, [G, -s'] does, since G v = s' has a solution.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
+from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW
+from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_units
+from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.mechanism import Mechanism
+
+
+class ClosureGeometry:
+    """Closure equations of a mechanism.
+
+    Parameters
+    ----------
+    mechanism
+        Its model and loops.
+    start : (nq,)
+        Configuration at which units are measured.
+
+    Attributes
+    ----------
+    coordinate_unit : (nv,), length, row_unit : (rows,)
+        Units of the coordinates, the scene diagonal (m), units of the rows.
+    unit : (n,)
+        Units of all that moves here: the coordinates, n = nv.
+    drives
+        Names of the drives whose rows follow those of the loops: none.
+    """
+
+    def __init__(self, mechanism: Mechanism, start: FloatArray) -> None:
+        self.mechanism = mechanism
+        self.start = start
+        # Gravity cancels in Gdot v, but its rounding would not at small rates.
+        self.model = mechanism.model.copy()
+        self.model.gravity.linear = np.zeros(3)
+        self.data = workspace(self.model)
+        self.rows = LoopKinematics(self.model, mechanism.loops)
+        units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
+        self.unit = self.coordinate_unit = units.coordinate
+        self.length = units.length
+        self.row_unit = row_units(mechanism, units)
+        self.drives: tuple[str, ...] = ()
+
+    def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        self.rows.update(self.data, q, with_bias=False)
+        return self.rows.g / self.row_unit, self.rows.G / self.row_unit[:, None] * self.unit
+
+    @cached_property
+    def row_size(self) -> FloatArray:
+        """Usual norm of the rows of G in :meth:`closure`: rms over open configurations (rows,).
+
+        One size for the lengths of a loop and one for its alignments; 1 where all are zero.
+        """
+        rng = np.random.default_rng(0)
+        squares = np.zeros(len(self.row_unit))
+        uncancelled = np.zeros(2)
+        for _ in range(8):
+            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.unit
+            _, G = self.closure(pin.integrate(self.model, self.start, spread))
+            squares += (G**2).sum(axis=1) / 8
+            # What rows would measure if nothing in them cancelled: their rounding is eps of it.
+            J = world_jacobian(self.data)
+            turn = np.linalg.norm(J[3:], axis=0) * self.unit
+            shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.length + turn
+            uncancelled += np.array([shift @ shift, turn @ turn]) / 8
+        at = 0
+        for loop in self.mechanism.loops:
+            own = squares[at : at + loop.rows.count]
+            for block, whole in zip(loop.rows.blocks[:2], uncancelled):
+                if block.stop > block.start:
+                    mean = own[block].mean()
+                    # Always satisfied: rounding must not be scaled up to a row.
+                    own[block] = mean if mean > ROUNDING_ROW**2 * whole else whole
+            at += loop.rows.count
+        return np.sqrt(np.where(squares > 0.0, squares, 1.0))
+
+    def normalised(self, q: FloatArray) -> FloatArray:
+        """G of :meth:`closure`, rows over their usual size: what ranks are judged by."""
+        return self.closure(q)[1] / self.row_size[:, None]
+
+    @cached_property
+    def _shares(self) -> list[tuple[int, int, float]]:
+        """The eliminations of the load-time analysis, between normalised rows."""
+        eliminations = self.mechanism.structure.eliminations
+        if not eliminations:
+            return []
+        size = (self.row_unit * self.row_size).tolist()
+        return [(e.row, e.other, e.factor * size[e.other] / size[e.row]) for e in eliminations]
+
+    def _without_shares(self, q: FloatArray) -> FloatArray:
+        G = self.normalised(q)
+        for row, other, share in self._shares:
+            G[row] -= share * G[other]
+        return G
+
+    @cached_property
+    def _left(self) -> FloatArray:
+        """Size of what is left of each row (rows,), where the mechanism starts."""
+        start = self.at(self.mechanism.q0, 0.0)
+        before, left = (
+            np.linalg.norm(rows, axis=1)
+            for rows in (self.normalised(start), self._without_shares(start))
+        )
+        out: FloatArray = np.where(left > DEPENDENT * before, left / np.maximum(before, left), 1.0)
+        return out
+
+    def separated(self, q: FloatArray) -> FloatArray:
+        """As :meth:`normalised`, where nearly parallel rows of closures between the same bodies
+        are replaced by their differences, as large as themselves: what is small everywhere hides
+        no singular configuration."""
+        return self._without_shares(q) / self._left[:, None] if self._shares else self.normalised(q)
+
+    def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
+        """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        pin.nonLinearEffects(self.model, self.data, q, u * self.unit)
+        self.rows.update(self.data, q)
+        return self.rows.bias / self.row_unit / self.row_size
+
+    def mass(self) -> FloatArray:
+        """Mass matrix (nv, nv) for rates in units, where the closures were evaluated last."""
+        upper, unit = np.triu(self.data.M), self.coordinate_unit
+        out: FloatArray = (upper + np.triu(upper, 1).T) * unit * unit[:, None]
+        return out
+
+    def at(self, q: FloatArray, t: float) -> FloatArray:
+        """What the other methods take for the configuration q (nq,) at the time t (s): q itself."""
+        return q
+
+    def rates(self, v: FloatArray) -> FloatArray:
+        """Rates (n,) in units of a motion with the velocity v (nv,)."""
+        out: FloatArray = v / self.unit
+        return out
+
+    def move(self, q: FloatArray, delta: Any, free: IndexArray | None = None) -> FloatArray:
+        """q (+) delta, delta in units: (nv,), or (k,) over the ``free`` coordinates (indices)."""
+        full = np.zeros(self.model.nv)
+        own = slice(None) if free is None else free
+        full[own] = delta * self.unit[own]
+        return pin.integrate(self.model, q, full)  # type: ignore[no-any-return]
+
+    def difference(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Motion (nv,) from a to b, in units."""
+        return pin.difference(self.model, a, b) / self.unit  # type: ignore[no-any-return]
+
+
+class DrivenGeometry(ClosureGeometry):
+    """Closure and drive equations of a mechanism over places (q, t), (nq + 1,).
+
+    Parameters
+    ----------
+    mechanism
+        Its model, loops and drives.
+    start : (nq,)
+        Configuration at which units are measured.
+    t
+        Every law is the piece of it that begins at this time (s) or holds there; without, the whole
+        law, whose third derivative may jump.
+
+    Attributes
+    ----------
+    unit : (nv + 1,)
+        Those of the coordinates, and that of time (s), in which drives and mechanism move by one
+        unit at most.
+    """
+
+    def __init__(self, mechanism: Mechanism, start: FloatArray, t: float | None = None) -> None:
+        super().__init__(mechanism, start)
+        units = mechanism.structure.units
+        curves = mechanism.drive_curves
+        if t is not None:
+            curves = {name: curve.piece(t) for name, curve in curves.items()}
+        drives = in_order_of_rows(mechanism.drives)
+        closures = len(self.row_unit)
+        self.drives = tuple(drive.name for drive in drives)
+        self.row_unit = constraint_units(mechanism, units)
+        self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives, curves)
+        fastest = units.rate
+        for drive, unit in zip(drives, self.row_unit[closures:].tolist()):
+            _, rate, bend = curves[drive.name](0.0 if t is None else t)
+            fastest = max(fastest, abs(rate) / unit, float(np.sqrt(abs(bend) / unit)))
+        self.unit = np.append(self.coordinate_unit, 1.0 / fastest)
+
+    @cached_property
+    def row_size(self) -> FloatArray:
+        """Usual norm of the rows of G (rows,): that of closures, 1 for drives."""
+        of_closures = ClosureGeometry(self.mechanism, self.start).row_size
+        return np.concatenate([of_closures, np.ones(len(self.drives))])
+
+    def _update(self, place: FloatArray, with_bias: bool) -> FloatArray:
+        """Evaluate the rows at (q, t); their Gdot v, without what the laws add."""
+        self._rows.update(self.data, place[:-1], with_bias)
+        bias = self._rows.bias.copy()
+        self._rows.move_to(float(place[-1]))
+        return bias
+
+    def closure(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(g - s) over row units (rows,), and [G, -s'] over row units times units (rows, n)."""
+        pin.crba(self.model, self.data, place[:-1], pin.Convention.WORLD)
+        self._update(place, with_bias=False)
+        jacobian = np.column_stack([self._rows.G, -self._rows.pushed])
+        return self._rows.g / self.row_unit, jacobian / self.row_unit[:, None] * self.unit
+
+    def bias(self, place: FloatArray, u: FloatArray) -> FloatArray:
+        """Gdot v - s'' (dt)^2, rows over their usual size, for the rates u = (v, dt) in units."""
+        q, rates = place[:-1], u * self.unit
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        pin.nonLinearEffects(self.model, self.data, q, rates[:-1])
+        own = self._update(place, with_bias=True)
+        out: FloatArray = own + (self._rows.bias - own) * rates[-1] ** 2
+        return out / self.row_unit / self.row_size
+
+    def move(self, place: FloatArray, delta: Any, free: IndexArray | None = None) -> FloatArray:
+        """(q, t) (+) delta, delta in units: (n,), or (k,) over the ``free`` of them (indices)."""
+        full = np.zeros(len(self.unit))
+        own = slice(None) if free is None else free
+        full[own] = delta * self.unit[own]
+        return np.append(pin.integrate(self.model, place[:-1], full[:-1]), place[-1] + full[-1])
+
+    def difference(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Motion (n,) from a to b, in units."""
+        moved = pin.difference(self.model, a[:-1], b[:-1])
+        out: FloatArray = np.append(moved, b[-1] - a[-1]) / self.unit
+        return out
+
+    def at(self, q: FloatArray, t: float) -> FloatArray:
+        """The place (q, t)."""
+        return np.append(q, t)
+
+    def rates(self, v: FloatArray) -> FloatArray:
+        """(v, 1) in units (n,), for the velocity v (nv,)."""
+        out: FloatArray = np.append(v, 1.0) / self.unit
+        return out
+
+
+def geometry_of(mechanism: Mechanism, q: FloatArray, t: float | None = None) -> ClosureGeometry:
+    """The closures of a mechanism, and its drives if it has any; parameters as for
+    :class:`DrivenGeometry`."""
+    return DrivenGeometry(mechanism, q, t) if mechanism.drives else ClosureGeometry(mechanism, q)

@@ -1,0 +1,298 @@
+r"""The constraint algebra of one stage: E, P, rank and sigma from one pivoted factorisation.
+
+With M = L L^T and W = L^{-1} G^T a column-pivoted QR, W Pi = Q R, gives (docs/notation.md)
+
+    E g = L^{-T} Q R^{-T} Pi^T g,        P v = L^{-T} Q Q^T L^T v,
+    yhat = E gamma,                      gamma = W^T (L^{-1} f) + Gdot v.
+
+Householder reflections (LAPACK geqp3) keep Q orthogonal to round-off, so that no
+reorthogonalisation is needed.  Truncating or damping small pivots would delete the weak
+direction next to a singular configuration; pivots are dropped for redundancy only, or in the
+zone, where a prediction takes their place.
+
+The next pivot is the column of the largest remaining norm.  With many loops it is looked for along
+their graph instead (:func:`swept_qr`): what a pivot fills in then stays next to it, so that the
+cost of the kernel's sparse twin grows with the number of loops and no faster.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.errors import EvaluationError
+
+# With positional arguments, because a keyword costs as much as the algebra of a small stage:
+# dtrtrs(triangle, right, lower, trans, unitdiag, lda, overwrite), dgeqp3(W, lwork, overwrite),
+# dgemv(alpha, a, x, beta, y, offset and increment of x and y, trans).
+_dgemv = blas.dgemv
+_dpotrf, _dtrtrs = lapack.dpotrf, lapack.dtrtrs
+_dgeqp3, _dorgqr = lapack.dgeqp3, lapack.dorgqr
+
+PIVOT_ZERO = 1e-13
+"""Pivots (of scaled rows) below this are zero."""
+
+
+def cholesky(M: FloatArray) -> FloatArray:
+    """U (nv, nv), upper, with M = U^T U; reads the upper triangle of M only.
+
+    Raises
+    ------
+    EvaluationError
+        If M is not positive definite or not finite.
+    """
+    U, info = _dpotrf(M)  # lower=0
+    if info != 0:
+        raise EvaluationError(
+            "the mass matrix is not positive definite or not finite "
+            f"(leading minor {info}): a joint that moves no inertia, or a state that is not finite"
+        )
+    return U  # type: ignore[no-any-return]
+
+
+def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
+    """L^-1 right = U^-T right."""
+    return _dtrtrs(U, right, 0, 1)[0]  # type: ignore[no-any-return]
+
+
+def unwhiten(U: FloatArray, right: FloatArray) -> FloatArray:
+    """L^-T right = U^-1 right."""
+    return _dtrtrs(U, right)[0]  # type: ignore[no-any-return]
+
+
+def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
+    """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (k,)."""
+    packed, permutation, tau, _, _ = _dgeqp3(W)
+    return packed, permutation - 1, tau, np.abs(packed.diagonal())
+
+
+PIVOT_SHARE = 0.01
+"""Part of the largest norm from which a column may be a pivot where some depend on others."""
+
+PIVOT_WINDOW = 16
+"""Columns along the graph of which the largest is the next pivot."""
+
+ALIKE = 1.0 - 1e-8
+"""Squares of norms that differ by less are alike: rounding may have made the difference."""
+
+ABOVE = 1.0 + 1e-12
+"""A norm so little above a floor counts as below it: rounding may move it there."""
+
+
+def swept_qr(
+    W: FloatArray, order: Sequence[int], rank: int, floor: float
+) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
+    """As :func:`pivoted_qr`, with pivots along ``order`` (m,).
+
+    The next pivot is the largest in a window that moves along the order: what is next to each
+    other is pivoted as by :func:`pivoted_qr`.  If it is below ``floor``, all columns in the window
+    wait for the next sweep, which goes back, so that pivots below the floor come after all others.
+    If some columns are left over in the end, those wait, too, that are below ``PIVOT_SHARE`` of
+    the largest norm at the start of the sweep: columns that depend on others but for the error of
+    a stage must not take the place of independent ones.  The twin is ``swept_projection.cpp``.
+
+    Parameters
+    ----------
+    rank
+        Number of pivots; columns that are left over come last, with |R_kk| = 0.
+    floor
+        Zero or more; a smaller pivot is not in use.
+    """
+    A = np.array(W, order="F")
+    tau = np.zeros(min(A.shape))
+    pivots = np.zeros(len(tau))
+    taken: list[int] = []
+    waiting = list(order)
+    forward = True
+    while len(taken) < rank:
+        largest = float(np.sqrt((A[len(taken) :, waiting] ** 2).sum(axis=0).max()))
+        if not math.isfinite(largest):
+            pivots[:] = math.nan
+            break
+        least = PIVOT_SHARE * largest if rank < A.shape[1] else 0.0
+        if largest > floor * ABOVE:
+            least = max(least, floor)
+        deferred: list[int] = []
+        before = k = len(taken)
+        coming = waiting[::-1] if forward else waiting[:]
+        window: list[int] = []
+        open_ = np.zeros(A.shape[1], bool)
+        open_[waiting] = True
+        while k < rank:
+            while coming and len(window) < PIVOT_WINDOW:
+                window.append(coming.pop())
+            if not window:
+                break
+            squares = (A[k:, window] ** 2).sum(axis=0)
+            place = int(np.argmax(squares >= ALIKE * squares.max()))
+            size = math.sqrt(squares[place])
+            if size == 0.0 or size < least:
+                deferred += window
+                window = []
+                continue
+            j = window.pop(place)
+            column = A[k:, j]
+            alpha = float(column[0])
+            beta = -math.copysign(size, alpha)
+            tau[k] = (beta - alpha) / beta
+            v = column / (alpha - beta)
+            v[0] = 1.0
+            open_[j] = False
+            others = A[k:, open_]
+            A[k:, open_] = others - np.outer(tau[k] * v, v @ others)
+            A[k:, j] = v
+            A[k, j] = beta
+            pivots[k] = size
+            taken.append(j)
+            k += 1
+        deferred += window + coming[::-1]
+        if k == before:
+            break
+        waiting = deferred if forward else deferred[::-1]
+        forward = not forward
+    permutation = np.array(taken + waiting)
+    return np.asfortranarray(A[:, permutation]), permutation, tau, pivots
+
+
+class Projection:
+    """Factorisation of M and G at one stage; reused from stage to stage.
+
+    Parameters
+    ----------
+    rank
+        Structural rank: the number of pivots that are used in a regular configuration.
+    sigma_ref
+        Median of the last structural pivot over the closed samples of the load-time walk.
+    order
+        The rows along the graph of the loops, for many of them; see
+        :func:`~srm_mbs.dynamics.constraints.row_algebra.graph_order`.
+
+    Attributes
+    ----------
+    factorisations
+        How many factorisations were done; 0 for a mechanism without closures.
+    """
+
+    def __init__(self, rank: int, sigma_ref: float, order: Sequence[int] = ()) -> None:
+        self.structural_rank = rank
+        self._graph_order = order
+        self.sigma_ref = sigma_ref
+        self.factorisations = 0
+        self.sigma = np.inf
+        self.rank = rank
+        self.weak = False
+        self.held: FloatArray | None = None
+        self._allocate(0, 0)
+
+    def _allocate(self, m: int, nv: int) -> None:
+        """Workspace of :meth:`factor` for m rows: (G, f) and gamma."""
+        self._right = np.empty((m + 1, nv))
+        self._rows, self._force = self._right[:m], self._right[m]
+        self._white = self._right.T
+        self._W = self._white[:, :m]
+        self._permuted = np.zeros(m + 1)
+        self._gamma = self._permuted[1:]
+
+    @property
+    def order(self) -> IndexArray:
+        """The rows in use (rank,), in the order of their pivots."""
+        order: IndexArray = self._permutation - 1
+        return order
+
+    def factor(
+        self,
+        M: FloatArray,
+        G: FloatArray,
+        f: FloatArray,
+        bias: FloatArray,
+        threshold: float | None,
+    ) -> None:
+        """Factorise M (nv, nv), G (m, nv) and solve for the multiplier with f (nv,), bias (m,).
+
+        ``threshold`` drops every pivot below threshold * sigma_ref (the zone); ``None`` uses all
+        structural pivots.
+        """
+        self.factorisations += 1
+        m, nv = G.shape
+        if self._right.shape != (m + 1, nv):
+            self._allocate(m, nv)
+        U = self.U = cholesky(M)
+        self._rows[:] = G
+        self._force[:] = f
+        # Both overwrite their argument: from here on _force is L^-1 f, and _W first W, then its QR.
+        _dtrtrs(U, self._white, 0, 1, 0, nv, 1)
+        force = self.white_force = self._force
+        self._gamma[:] = _dgemv(1.0, self._W, force, 1.0, bias, 0, 1, 0, 1, 1)  # W^T force + bias
+        structural = self.structural_rank
+        floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
+        if self._graph_order:
+            packed, permutation, tau, pivots = swept_qr(
+                self._W, self._graph_order, structural, floor
+            )
+            permutation = permutation + 1
+            self._pivots = pivots
+            pivot = float(pivots[:structural].min())
+        else:
+            packed, permutation, tau, _, _ = _dgeqp3(self._W, 3 * m + 3, 1)
+            pivot = abs(packed.item(structural - 1, structural - 1))
+        self.sigma = pivot / self.sigma_ref
+        if not self.sigma >= 0.0:
+            raise EvaluationError("the mass matrix or the closures are not finite")
+        rank = structural
+        while rank > 0 and not abs(packed.item(rank - 1, rank - 1)) >= floor:
+            rank -= 1
+        self.rank = rank
+        self.weak = rank < structural
+        if rank < m:
+            packed, permutation, tau = packed[:, :rank], permutation[:rank], tau[:rank]
+        self._permutation = permutation
+        self.R = packed
+        self.Q: FloatArray = _dorgqr(packed, tau)[0] if rank else packed
+        self.held = None
+        # LAPACK counts rows from 1, and so does _permuted.
+        self.white_multiplier = self.normal(self._permuted.take(permutation))
+
+    def hold(self, normals: FloatArray) -> None:
+        """Keep the motion tangential to the last of ``normals`` (nv, k) in place of the dropped
+        rows, whose own normals cannot be told here."""
+        missing = self.structural_rank - self.rank
+        white = self.U @ normals[:, -missing:]
+        for _ in range(2):
+            white = white - self.Q @ (self.Q.T @ white)
+        self.held = np.linalg.qr(white)[0]
+        self.white_multiplier = self.white_multiplier + self.held @ (
+            self.held.T @ (self.white_force - self.white_multiplier)
+        )
+
+    def normals(self) -> FloatArray:
+        """L^-T Q (nv, rank): M-orthonormal normals of the rows in use, the weakest last."""
+        if not self._graph_order:
+            return self.unwhiten(self.Q)
+        falling = np.argsort(-self._pivots[: self.rank], kind="stable")
+        return self.unwhiten(np.asfortranarray(self.Q[:, falling]))
+
+    def normal(self, right: FloatArray) -> FloatArray:
+        """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
+        if self.rank == 0:
+            return np.zeros(self.U.shape[0])
+        out: FloatArray = self.Q.dot(_dtrtrs(self.R, right, 0, 1)[0])
+        return out
+
+    def unwhiten(self, right: FloatArray) -> FloatArray:
+        """L^-T right."""
+        return unwhiten(self.U, right)
+
+    def white_project(self, w: FloatArray) -> FloatArray:
+        """Q Q^T L^T w (nv,), held normals included."""
+        white = self.U.dot(w)
+        out: FloatArray = self.Q.dot(white.dot(self.Q))
+        return out if self.held is None else out + self.held @ (self.held.T @ white)
+
+    def project(self, w: FloatArray) -> FloatArray:
+        """P w (nv,)."""
+        return self.unwhiten(self.white_project(w))

@@ -1,0 +1,476 @@
+r"""The pivoted factorisation of rows in a metric, for what is found out about a mechanism.
+
+    M = L L^T,   W = L^-1 G^T,   W Pi = Q R,
+
+as in :mod:`srm_mbs.dynamics.constraints.projection`, but with its own cut of the pivots, and with
+the vectors that the rows do not see.  With M = 1 and all pivots above a cut it takes the place of
+singular values and least squares, at a fraction of their cost.  For many coordinates the kernel
+makes it, whose sparse algebra follows the graph of the loops; its twin is ``algebra.cpp``.
+
+The order of the rows along the graph of the loops, in which many of them are factorised.
+
+Two rows meet where they have coordinates or ancestors of these in common.  Rows that meet the
+fewest others come first (greedy minimum degree), those that hang together next to each other (in
+postorder of the elimination tree): along a chain of loops from one end to the other, in a tree of
+loops from the leaves to the root.
+
+Source: J. A. George, J. W. H. Liu, The evolution of the minimum degree ordering algorithm, SIAM
+Review 31 (1989) 1.
+
+Rank, null vectors, weakest singular value and shortest solution of rows A x = b.
+
+Few coordinates: singular values.  Many: the pivoted factorisation A^T Pi = Q R on the pattern of A
+(:mod:`srm_mbs.dynamics.constraints.row_algebra`), whose cost follows the graph of the loops.  Both
+say the same unless A has singular values, or pivots, next to the cut.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg import lapack
+
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.dynamics.constraints.projection import (
+    PIVOT_SHARE,
+    PIVOT_WINDOW,
+    PIVOT_ZERO,
+    cholesky,
+    pivoted_qr,
+    swept_qr,
+    unwhiten,
+    whiten,
+)
+from srm_mbs.errors import EvaluationError
+
+LARGE = 64
+"""Coordinates above which pivots are taken along the graph, by the kernel where there is one."""
+
+FULL = 0.5
+"""Part of the entries of W from which there is no graph to follow."""
+
+COMMON = 16
+"""Loops that a coordinate is common to before it says nothing about their order."""
+
+
+def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
+    """All rows along the graph of the loops; () for up to 64 coordinates, or if W is full.
+
+    Parameters
+    ----------
+    pattern : (rows, nv)
+        Which entries of G may differ from zero.
+    parents : (nv,)
+        The next coordinate to the root, or -1.
+    """
+    if pattern.shape[1] <= LARGE or not len(pattern):
+        return ()
+    return _ordered(pattern.shape, np.packbits(pattern).tobytes(), tuple(parents))
+
+
+@lru_cache(maxsize=32)
+def _ordered(shape: tuple[int, int], bits: bytes, parents: tuple[int, ...]) -> tuple[int, ...]:
+    size = shape[0] * shape[1]
+    pattern = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape).astype(bool)
+    supports = [_with_ancestors(np.flatnonzero(row).tolist(), parents) for row in pattern]
+    if sum(map(len, supports)) > FULL * size:
+        return ()
+    alike: dict[frozenset[int], list[int]] = {}
+    for row, support in enumerate(supports):
+        alike.setdefault(support, []).append(row)
+    groups = list(alike.values())
+    order = _postordered(*_eliminated(_neighbours(list(alike))))
+    return tuple(row for group in order for row in groups[group])
+
+
+def _with_ancestors(support: Sequence[int], parents: Sequence[int]) -> frozenset[int]:
+    found: set[int] = set()
+    for k in support:
+        while k >= 0 and k not in found:
+            found.add(k)
+            k = parents[k]
+    return frozenset(found)
+
+
+def _neighbours(supports: Sequence[frozenset[int]]) -> list[set[int]]:
+    """The supports that each one meets; coordinates that very many have in common do not count."""
+    of: dict[int, list[int]] = {}
+    for k, support in enumerate(supports):
+        for coordinate in support:
+            of.setdefault(coordinate, []).append(k)
+    most = max(COMMON, 10 * int(np.sqrt(len(supports))))
+    found: list[set[int]] = [set() for _ in supports]
+    for together in of.values():
+        if len(together) <= most:
+            for k in together:
+                found[k].update(together)
+    for k, others in enumerate(found):
+        others.discard(k)
+    return found
+
+
+def _eliminated(neighbours: list[set[int]]) -> tuple[list[int], list[int]]:
+    """Nodes in the order of their degree when they are eliminated, which makes their neighbours
+    meet, and the next neighbour to be eliminated, or -1."""
+    heap = [(len(others), k) for k, others in enumerate(neighbours)]
+    heapq.heapify(heap)
+    place: dict[int, int] = {}
+    met: list[set[int]] = [set() for _ in neighbours]
+    while heap:
+        degree, k = heapq.heappop(heap)
+        if k in place or degree != len(neighbours[k]):
+            continue
+        place[k] = len(place)
+        met[k] = others = neighbours[k]
+        for other in others:
+            own = neighbours[other]
+            own |= others
+            own -= {k, other}
+            heapq.heappush(heap, (len(own), other))
+    parents = [min(others, key=place.__getitem__, default=-1) for others in met]
+    return list(place), parents
+
+
+def _postordered(order: Sequence[int], parents: Sequence[int]) -> list[int]:
+    """``order`` with each node after those that it is the parent of, and next to them."""
+    children: dict[int, list[int]] = {}
+    for k in order:
+        children.setdefault(parents[k], []).append(k)
+    out: list[int] = []
+    waiting = children.get(-1, [])[:]
+    # From the root: each node before its children, the last ones first; then turned round.
+    while waiting:
+        k = waiting.pop()
+        out.append(k)
+        waiting += children.get(k, [])
+    return out[::-1]
+
+
+class RowAlgebra(Protocol):
+    """One factorisation, and what follows from it.
+
+    Attributes
+    ----------
+    rank
+        Number of pivots that are not below the cut: the rows in use.
+    pivots : (min(nv, rows),)
+        |R_kk|, falling.  With many coordinates they are taken along the graph of the loops
+        (:func:`~srm_mbs.dynamics.constraints.projection.swept_qr`), and sorted here.
+    row_squares : (rows,)
+        Squares of the columns of W.
+    """
+
+    @property
+    def rank(self) -> int: ...
+    @property
+    def pivots(self) -> FloatArray: ...
+    @property
+    def row_squares(self) -> FloatArray: ...
+
+    def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
+        """Factorise M (nv, nv), of which the upper triangle is read, None for 1, and G (rows, nv).
+
+        Raises
+        ------
+        EvaluationError
+            If M is not positive definite, or anything is not finite.
+        """
+
+    def tangential(self, w: FloatArray) -> FloatArray:
+        """(1 - P) w (nv,): the part of w that the rows in use do not see, in the metric M."""
+
+    def solve(self, g: FloatArray) -> FloatArray:
+        """E g (nv,): the shortest x in the metric M with G x = g (rows,) in the rows in use."""
+
+    def multiplier(self, white: FloatArray) -> FloatArray:
+        """Pi R^-1 Q^T white (rows,), zero in rows that are not in use: the transpose of
+        :meth:`solve` where M = 1."""
+
+    def complement(self) -> FloatArray:
+        """Orthonormal basis (nv, nv - rank) of L^T x over all x that the rows in use do not see."""
+
+
+class DenseAlgebra:
+    """:class:`RowAlgebra` by LAPACK, with pivots along ``order`` if there is one."""
+
+    def __init__(self, order: Sequence[int] = ()) -> None:
+        self._graph_order = order
+        self.rank = 0
+        self.pivots = self.row_squares = np.zeros(0)
+
+    def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
+        """See :class:`RowAlgebra`."""
+        self._U = None if M is None else cholesky(M)
+        W = np.asfortranarray(G.T) if self._U is None else whiten(self._U, np.asfortranarray(G.T))
+        self.row_squares = (W * W).sum(axis=0)
+        if not np.isfinite(self.row_squares).all():
+            raise EvaluationError("the closures are not finite")
+        floor = max(PIVOT_ZERO, cut)
+        if self._graph_order:
+            found = swept_qr(W, self._graph_order, min(W.shape), floor)
+        else:
+            found = pivoted_qr(W)
+        self._packed, self._order, self._tau, pivots = found
+        small = np.flatnonzero(pivots < floor)
+        self.rank = int(small[0]) if small.size else len(pivots)
+        self.pivots = np.sort(pivots)[::-1] if self._graph_order else pivots
+
+    def _times_q(self, x: FloatArray, transposed: bool = False) -> FloatArray:
+        """Q x or Q^T x for x (nv, k), with the reflections of the rows in use."""
+        if self.rank == 0:
+            return x
+        # dormqr(side, trans, reflections, tau, x, size of its workspace)
+        out: FloatArray = lapack.dormqr(
+            "L",
+            "T" if transposed else "N",
+            self._packed[:, : self.rank],
+            self._tau[: self.rank],
+            np.asfortranarray(x),
+            64 * x.shape[1],
+        )[0]
+        return out
+
+    def tangential(self, w: FloatArray) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        white = (w if self._U is None else self._U @ w)[:, None]
+        inside = self._times_q(white, transposed=True)
+        inside[: self.rank] = 0.0
+        return self._coloured(self._times_q(inside)[:, 0])
+
+    def solve(self, g: FloatArray) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        x = np.zeros((self._packed.shape[0], 1))
+        if self.rank:
+            R = self._packed[: self.rank, : self.rank]
+            x[: self.rank, 0] = whiten(R, g[self._order[: self.rank]])
+        return self._coloured(self._times_q(x)[:, 0])
+
+    def multiplier(self, white: FloatArray) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        out = np.zeros(self._packed.shape[1])
+        if self.rank:
+            R = self._packed[: self.rank, : self.rank]
+            inside = self._times_q(white[:, None], transposed=True)[: self.rank, 0]
+            out[self._order[: self.rank]] = unwhiten(R, inside)
+        return out
+
+    def complement(self) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        nv = self._packed.shape[0]
+        return self._times_q(np.eye(nv)[:, self.rank :])
+
+    def _coloured(self, white: FloatArray) -> FloatArray:
+        return white if self._U is None else unwhiten(self._U, white)
+
+
+class CompiledAlgebra:
+    """:class:`RowAlgebra` by the kernel: sparse where that pays."""
+
+    def __init__(self, twin: Any) -> None:
+        self._twin = twin
+        self._one: FloatArray | None = None
+
+    @property
+    def entries(self) -> int:
+        """Numbers that Q and R hold."""
+        return self._twin.entries  # type: ignore[no-any-return]
+
+    @property
+    def rank(self) -> int:
+        """See :class:`RowAlgebra`."""
+        return self._twin.rank  # type: ignore[no-any-return]
+
+    @property
+    def pivots(self) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        falling: FloatArray = np.sort(self._twin.pivots)[::-1]
+        return falling
+
+    @property
+    def row_squares(self) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        return self._twin.row_squares  # type: ignore[no-any-return]
+
+    def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
+        """See :class:`RowAlgebra`."""
+        if M is None:
+            if self._one is None:
+                self._one = np.eye(G.shape[1])
+            M = self._one
+        try:
+            self._twin.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
+        except ArithmeticError:
+            cholesky(M)  # says whether it is the mass matrix
+            raise EvaluationError("the closures are not finite") from None
+
+    def tangential(self, w: FloatArray) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        return self._twin.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
+
+    def solve(self, g: FloatArray) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        return self._twin.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
+
+    def multiplier(self, white: FloatArray) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        return self._twin.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
+
+    def complement(self) -> FloatArray:
+        """See :class:`RowAlgebra`."""
+        basis: FloatArray = self._twin.complement()
+        return basis.T
+
+
+def row_algebra(
+    pattern: BoolArray, model: pin.Model | None = None, choice: str = "auto"
+) -> RowAlgebra:
+    """The algebra of rows with entries where ``pattern`` (rows, nv) is true.
+
+    Parameters
+    ----------
+    model
+        The tree, if M is its mass matrix, and not 1.
+    choice
+        ``"dense"``: LAPACK; ``"kernel"``: the kernel; ``"auto"``: the kernel for many coordinates.
+    """
+    from srm_mbs._kernel import core
+
+    rows, nv = pattern.shape
+    parents = [-1] * nv if model is None else coordinate_parents(model)
+    order = graph_order(pattern, parents)
+    if core is None or choice == "dense" or (choice == "auto" and nv <= LARGE) or not rows:
+        return DenseAlgebra(order)
+    supports = [np.flatnonzero(p).tolist() for p in pattern]
+    return CompiledAlgebra(
+        core.Algebra(parents, supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")
+    )
+
+
+def coordinate_parents(model: pin.Model) -> list[int]:
+    """The next coordinate to the root of each velocity component (nv,); -1 at the root."""
+    parents = [-1] * int(model.nv)
+    for i in range(1, model.njoints):
+        joint, parent = model.joints[i], model.joints[int(model.parents[i])]
+        above = parent.idx_v + parent.nv - 1 if model.parents[i] else -1
+        for k in range(joint.idx_v, joint.idx_v + joint.nv):
+            parents[k], above = above, k
+    return parents
+
+
+def trees(model: pin.Model) -> list[slice]:
+    """Velocity components of each tree that stands on the ground: the blocks of M."""
+    starts = [model.joints[i].idx_v for i in range(1, model.njoints) if not model.parents[i]]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], int(model.nv)])]
+
+
+INERT = 1e-9
+"""Rows of A below this are zero, as the out-of-plane ones of a planar loop."""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """What is left of A (m, n) when singular values, or pivots, below a cut are zero.
+
+    Attributes
+    ----------
+    null : (n, n - rank)
+        Orthonormal basis of the x with A x = 0.
+    solve
+        b (m,) -> the shortest x (n,) with A x = b, as far as there is one.
+    """
+
+    null: FloatArray
+    solve: Callable[[FloatArray], FloatArray]
+
+
+def ranked(A: FloatArray, cut: float) -> Ranked:
+    """A (m, n) with everything below ``cut`` as zero."""
+    algebra = _pivoted(A, cut)
+    if algebra is not None:
+        return Ranked(algebra.complement(), algebra.solve)
+    left, size, right = np.linalg.svd(A)
+    rank = int(np.sum(size > cut))
+
+    def solve(b: FloatArray) -> FloatArray:
+        out: FloatArray = right[:rank].T @ ((left[:, :rank].T @ b) / size[:rank])
+        return out
+
+    return Ranked(right[rank:].T, solve)
+
+
+def null_basis(A: FloatArray, cut: float) -> FloatArray:
+    """Orthonormal basis (n, n - rank) of the x with A x = 0, for A (m, n) with everything below
+    ``cut`` as zero."""
+    algebra = _pivoted(A, cut)
+    if algebra is not None:
+        return algebra.complement()
+    _, size, right = np.linalg.svd(A)
+    out: FloatArray = right[int(np.sum(size > cut)) :].T
+    return out
+
+
+def shortest(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
+    """The shortest x (n,) with the least |A x - b|; what is below rcond times the largest singular
+    value is zero.  By pivots, the rows in use are satisfied and dependent ones left out."""
+    longest = float(np.sqrt((A * A).sum(axis=1).max(initial=0.0)))
+    algebra = _pivoted(A, rcond * longest)
+    if algebra is not None:
+        return algebra.solve(b)
+    out: FloatArray = np.asarray(np.linalg.lstsq(A, b, rcond=rcond)[0], dtype=np.float64)
+    return out
+
+
+def weakest(A: FloatArray, zero: float) -> float:
+    """The smallest singular value of A (m, n) above ``zero``; infinite if there is none."""
+    found = _weakest_pivoted(A, zero)
+    if found is not None:
+        return found[1]
+    size = np.linalg.svd(A, compute_uv=False)
+    return float(size[size > zero].min(initial=np.inf))
+
+
+def singular_value(A: FloatArray, k: int) -> float:
+    """The k-th largest singular value of A (m, n), k from 1."""
+    found = _weakest_pivoted(A, PIVOT_ZERO)
+    if found is not None and found[0] == k:
+        return found[1]
+    return float(np.linalg.svd(A, compute_uv=False)[k - 1])
+
+
+def _pivoted(A: FloatArray, cut: float) -> RowAlgebra | None:
+    """The factorisation of A by the kernel, if it is there and A has many columns."""
+    if A.shape[1] <= LARGE:
+        return None
+    algebra = row_algebra(A != 0.0)
+    if not isinstance(algebra, CompiledAlgebra):
+        return None
+    algebra.factor(None, A, cut)
+    return algebra
+
+
+def _weakest_pivoted(A: FloatArray, zero: float) -> tuple[int, float] | None:
+    """Rank and weakest singular value, by the factorisation of the rows that are not zero; None
+    where these depend on each other: the rows in use have other singular values."""
+    rows = A[np.sqrt((A * A).sum(axis=1)) > INERT]
+    algebra = _pivoted(rows, zero)
+    if algebra is None or not 0 < algebra.rank == len(rows):
+        return None
+    from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
+
+    n = A.shape[1]
+    # A^+ A^+T has the largest eigenvalue 1 / weakest^2.
+    inverse = LinearOperator(
+        (n, n), matvec=lambda x: algebra.solve(algebra.multiplier(np.ravel(x))), dtype=float
+    )
+    start = np.random.default_rng(0).standard_normal(n)
+    try:
+        values = eigsh(inverse, 1, which="LM", v0=start, return_eigenvectors=False)
+    except ArpackError:
+        return None
+    return algebra.rank, float(1.0 / np.sqrt(values[0]))

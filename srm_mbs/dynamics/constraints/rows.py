@@ -1,0 +1,502 @@
+r"""Closure rows on Pinocchio kinematics: g, G and Gdot v.
+
+For one closure let H be the frame with the axes of anchor b and its origin at anchor a.  In H
+
+    W = H^{-1}(V_a - V_b) = (r, w)          relative velocity; r = p' as b sees it
+    B = H^{-1}(A_a - A_b - V_b x V_a)       its rate without the joint accelerations
+
+(V, A spatial velocities and bias accelerations in world axes at the world origin), so that a
+position row g = d . p, a distance row g = |p| - L, d = p/|p|, and an alignment row g = n . m,
+m = R u, have
+
+    G  = d^T X_lin (J_a - J_b),             Gdot v = d . (B_lin + w x r),
+    G  = d^T X_lin (J_a - J_b),             Gdot v = d . (B_lin + w x r) + |d x r|^2/|p|,
+    G  = (m x n)^T X_ang (J_a - J_b),       Gdot v = n . (B_ang x m + w x (w x m)),
+
+with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row has constant
+entries c_i in G, and Gdot v = 0.
+
+Three numbers are multiplied before NumPy starts, so each row is made of plain floats, in the axes
+of the joint that carries b (the world's for a closure to the ground).  With e = R_b d and x the
+origin of anchor a, both in world axes, d^T X_lin = (e, x x e): one product with J is left for all
+rows together.  B_lin + w x r is A_a(x) - A_b(x) - 2 omega_b x r, with the classical acceleration
+A(x) = a + alpha x x + omega x (v + omega x x) of the point of a body that is at x.
+
+Three numbers as plain floats: products of them before NumPy would have started.
+
+Joint rows of closures: linear relations of joint coordinates, g = sum c_i q_i - s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.errors import EvaluationError
+from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.mechanism import Mechanism
+
+Vector = Sequence[float]
+"""Three numbers."""
+Triple = tuple[float, float, float]
+
+
+def cross3(a: Vector, b: Vector) -> Triple:
+    """a x b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def cross(a: Vector | FloatArray, b: Vector | FloatArray) -> FloatArray:
+    """a x b as an array; ``numpy.cross`` costs ten times as much on three numbers."""
+    return np.array(cross3(a, b))  # type: ignore[arg-type]
+
+
+def plus_cross(c: Vector, a: Vector, b: Vector) -> Triple:
+    """c + a x b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
+    return cx + (ay * bz - az * by), cy + (az * bx - ax * bz), cz + (ax * by - ay * bx)
+
+
+def minus(a: Vector, b: Vector) -> Triple:
+    """a - b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ax - bx, ay - by, az - bz
+
+
+def dot(a: Vector, b: Vector) -> float:
+    """a . b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ax * bx + ay * by + az * bz
+
+
+def to_world(R: Sequence[Vector], a: Vector) -> Triple:
+    """R a."""
+    x, y, z = a
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+def from_world(R: Sequence[Vector], a: Vector) -> Triple:
+    """R^T a."""
+    x, y, z = a
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+
+
+class JointRows:
+    """The kept, scaled joint rows of one closure.
+
+    Attributes
+    ----------
+    G : (count, nv)
+        Their constant Jacobian.
+    first_row, count
+        Where they stand among the rows of the mechanism.
+    support : (nv,)
+        0: the world Jacobian has no part in them.
+    """
+
+    def __init__(
+        self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
+    ) -> None:
+        kept = [(row, float(s)) for row, s, k in zip(loop.rows.joint_rows, 1.0 / scale, keep) if k]
+        self.first_row, self.count = start, len(kept)
+        self.support = np.zeros(model.nv)
+        self.G = np.zeros((self.count, model.nv))
+        # (c_i, place of q_i in q, in v) of each joint, and the offset, over the row scale.
+        self._terms: list[tuple[list[tuple[float, int, int]], float]] = []
+        for own, (row, factor) in zip(self.G, kept):
+            terms = []
+            for c, name in zip(row.coefficients, row.joints):
+                joint = model.joints[model.getJointId(name)]
+                terms.append((factor * c, int(joint.idx_q), int(joint.idx_v)))
+                own[joint.idx_v] = factor * c
+            self._terms.append((terms, factor * row.offset))
+
+    def constants(self) -> list[dict[str, Any]]:
+        """What the compiled kernel needs of each row."""
+        return [
+            {
+                "row": self.first_row + i,
+                "coefficients": np.array([c for c, _, _ in terms]),
+                "in_q": [k for _, k, _ in terms],
+                "in_v": [k for _, _, k in terms],
+                "offset": offset,
+            }
+            for i, (terms, offset) in enumerate(self._terms)
+        ]
+
+    def bind(self, data: pin.Data) -> None:
+        """Nothing of ``data`` enters."""
+
+    def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
+        """Append for each row six zeros for G, which is set apart, then g, then Gdot v = 0."""
+        for terms, offset in self._terms:
+            g = -offset
+            for c, k, _ in terms:
+                g += c * q[k]
+            out += 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, g, 0.0
+
+
+COINCIDENT = 1e-9
+"""Distance of two points, over the length that it should have, from which it has a direction."""
+
+
+def world_jacobian(data: pin.Data) -> FloatArray:
+    """The joint Jacobian (6, nv) in world axes; Pinocchio hands out (6,) where nv = 1."""
+    J: FloatArray = data.J
+    return J if J.ndim == 2 else J[:, None]
+
+
+def placement_numbers(placement: pin.SE3) -> FloatArray:
+    """Rotation, row by row, then translation (12,)."""
+    return np.concatenate([placement.rotation.ravel(), placement.translation])
+
+
+def support(model: pin.Model, joint: int) -> FloatArray:
+    """1.0 at the velocity components (nv,) that move ``joint``, else 0.0."""
+    mask = np.zeros(model.nv)
+    for ancestor in model.supports[joint]:
+        if ancestor:
+            j = model.joints[int(ancestor)]
+            mask[j.idx_v : j.idx_v + j.nv] = 1.0
+    return mask
+
+
+class _Body:
+    """Where a joint of ``data`` is and how it moves, read anew by every call.
+
+    Placement in the world; velocity and bias acceleration (with -gravity) in the joint's axes.
+    """
+
+    def __init__(self, data: pin.Data, joint: int) -> None:
+        # Pinocchio's arrays are views on data: finding one costs more than reading it.
+        placement, velocity, bias = data.oMi[joint], data.v[joint], data.a_gf[joint]
+        self.rotation = placement.rotation.tolist
+        self.origin = placement.translation.tolist
+        self.velocity = velocity.linear.tolist
+        self.spin = velocity.angular.tolist
+        self.bias = bias.linear.tolist
+        self.spin_bias = bias.angular.tolist
+
+
+class _LoopRows:
+    """The kept, scaled rows of one closure between anchors, resolved against a model."""
+
+    def __init__(
+        self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
+    ) -> None:
+        self.name = loop.name
+        (self.joint_a, self.in_a), (self.joint_b, self.in_b) = loop.resolve(model)
+        rows = loop.rows
+        k, turns = len(rows.directions), rows.blocks[1]
+        inverse = 1.0 / scale
+        self.directions = (rows.directions * inverse[:k, None])[keep[:k]]
+        # With their factor, the inverse of the row scale.
+        self._distances = [
+            (length, float(factor))
+            for length, factor, kept in zip(rows.distances, inverse[k:], keep[k:])
+            if kept
+        ]
+        pairs = rows.alignments[keep[turns]]
+        # The row scale sits in n, so that no evaluation has to divide.
+        self.alignments = [
+            (u, n) for u, n in zip(pairs[:, 0], pairs[:, 1] * inverse[turns][keep[turns], None])
+        ]
+        self.support = support(model, self.joint_a) - support(model, self.joint_b)
+        self.first_row = start
+        self.count = len(self.directions) + len(self._distances) + len(self.alignments)
+        # The same in the axes of the joints, as plain floats.
+        self._at_a: list[float] = self.in_a.translation.tolist()
+        self._at_b: list[float] = self.in_b.translation.tolist()
+        self._d: list[list[float]] = (self.directions @ self.in_b.rotation.T).tolist()
+        self._un = [
+            ((self.in_a.rotation @ u).tolist(), (self.in_b.rotation @ n).tolist())
+            for u, n in self.alignments
+        ]
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "joint_a": self.joint_a,
+            "joint_b": self.joint_b,
+            "at_a": np.array(self._at_a),
+            "at_b": np.array(self._at_b),
+            "directions": np.array(self._d, dtype=float).ravel(),
+            "distances": np.array(self._distances, dtype=float).ravel(),
+            "alignments": np.array(self._un, dtype=float).ravel(),
+            "support": self.support,
+            "first_row": self.first_row,
+        }
+
+    def bind(self, data: pin.Data) -> None:
+        """Read the bodies of ``data`` from now on."""
+        self._a, self._b = _Body(data, self.joint_a), _Body(data, self.joint_b)
+
+    def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
+        """Append for each row (force, moment) of G = (force, moment) J, then g, then Gdot v."""
+        if self._d or self._distances:
+            self._positions(with_bias, out)
+        if self._un:
+            self._alignments(with_bias, out)
+
+    def _positions(self, with_bias: bool, out: list[float]) -> None:
+        a, b, ground = self._a, self._b, self.joint_b == 0
+        Ra, at_a = a.rotation(), self._at_a
+        rx, ry, rz = to_world(Ra, at_a)
+        ox, oy, oz = a.origin()
+        x = at_b = (rx + ox, ry + oy, rz + oz)
+        if not ground:
+            Rb = b.rotation()
+            at_b = from_world(Rb, minus(x, b.origin()))
+        if with_bias:
+            spin = a.spin()
+            speed = plus_cross(a.velocity(), spin, at_a)
+            bias = plus_cross(a.bias(), a.spin_bias(), at_a)
+            bias = to_world(Ra, plus_cross(bias, spin, speed))
+            if ground:
+                bias = minus(bias, b.bias())  # the ground's is -gravity, as in every body's
+                r = to_world(Ra, speed)
+            else:
+                spin = b.spin()
+                sx, sy, sz = from_world(Rb, to_world(Ra, speed))
+                cx, cy, cz = plus_cross(b.velocity(), spin, at_b)
+                # omega_b x (carried + 2 r), r = speed - carried
+                twice = (2.0 * sx - cx, 2.0 * sy - cy, 2.0 * sz - cz)
+                r = sx - cx, sy - cy, sz - cz
+                carried = plus_cross(b.bias(), b.spin_bias(), at_b)
+                bias = minus(from_world(Rb, bias), plus_cross(carried, spin, twice))
+        else:
+            r = bias = (0.0, 0.0, 0.0)
+        p = minus(at_b, self._at_b)
+        for d in self._d:
+            e = d if ground else to_world(Rb, d)
+            out += e
+            out += cross3(x, e)
+            out += dot(d, p), dot(d, bias)
+        for length, factor in self._distances:
+            apart = math.sqrt(dot(p, p))
+            if apart < COINCIDENT * length:
+                raise EvaluationError(
+                    f"the two points of the loop {self.name!r} coincide: their distance has no "
+                    "direction"
+                )
+            by = factor / apart
+            px, py, pz = p
+            d = [by * px, by * py, by * pz]
+            e = d if ground else to_world(Rb, d)
+            across = cross3(d, r)
+            out += e
+            out += cross3(x, e)
+            out += factor * (apart - length), dot(d, bias) + dot(across, across) / (by * apart**2)
+
+    def _alignments(self, with_bias: bool, out: list[float]) -> None:
+        a, b = self._a, self._b
+        Ra, Rb = a.rotation(), b.rotation()
+        if with_bias:
+            carried = b.spin()
+            spin = from_world(Rb, to_world(Ra, a.spin()))
+            w = minus(spin, carried)
+            bias = minus(from_world(Rb, to_world(Ra, a.spin_bias())), b.spin_bias())
+            bias = minus(bias, cross3(carried, spin))
+        else:
+            w = bias = (0.0, 0.0, 0.0)
+        for u, n in self._un:
+            m = from_world(Rb, to_world(Ra, u))
+            out += 0.0, 0.0, 0.0
+            out += to_world(Rb, cross3(m, n))
+            out += dot(n, m), dot(n, plus_cross(cross3(bias, m), w, cross3(w, m)))
+
+
+class Elimination(NamedTuple):
+    """``factor`` times the row ``other`` is taken off the row ``row``, both unscaled.
+
+    Of closures between the same bodies, where no factor depends on the configuration.
+    """
+
+    row: int
+    other: int
+    factor: float
+
+
+class LoopKinematics:
+    """Rows of all closures of a mechanism.
+
+    Parameters
+    ----------
+    model, loops
+        The tree and its closures.
+    scale : (rows,)
+        Rows are divided by it; ones by default (then g is in m and rad, lengths unscaled).
+    keep : (rows,) bool
+        Rows to evaluate; all by default.
+    eliminations
+        Applied one after the other to the rows that are kept; none by default.
+
+    Attributes
+    ----------
+    g : (m,), G : (m, nv), bias : (m,)
+        Closure errors, their Jacobian in tangent coordinates, and Gdot v, after :meth:`update`.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        loops: Sequence[LoopClosure],
+        scale: FloatArray | None = None,
+        keep: BoolArray | None = None,
+        eliminations: Sequence[Elimination] = (),
+    ) -> None:
+        total = sum(loop.rows.count for loop in loops)
+        scale = np.ones(total) if scale is None else scale
+        mask = np.ones(total, dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
+        self._loops: list[_LoopRows | JointRows] = []
+        at = m = 0
+        for loop in loops:
+            rows = slice(at, at + loop.rows.count)
+            kind = JointRows if loop.rows.joint_rows else _LoopRows
+            resolved = kind(model, loop, scale[rows], mask[rows], m)
+            at = rows.stop
+            m += resolved.count
+            if resolved.count:
+                self._loops.append(resolved)
+        self._support = np.zeros((m, model.nv))
+        for resolved in self._loops:
+            first = resolved.first_row
+            self._support[first : first + resolved.count] = resolved.support
+        self._joint_rows = [loop for loop in self._loops if isinstance(loop, JointRows)]
+        self._constant = [
+            (slice(rows.first_row, rows.first_row + rows.count), rows.G)
+            for rows in self._joint_rows
+        ]
+        place = (np.cumsum(mask) - 1).tolist()
+        size = scale.tolist()
+        self._eliminations = [
+            Elimination(place[row], place[other], factor * size[other] / size[row])
+            for row, other, factor in eliminations
+        ]
+        self._allocate()
+
+    def _allocate(self) -> None:
+        m = len(self._support)
+        self._numbers = np.zeros(8 * m)
+        table = self._numbers.reshape(m, 8)
+        self._wrenches, self.g, self.bias = table[:, :6], table[:, 6], table[:, 7]
+        self.G = np.zeros(self._support.shape)
+        self._data: pin.Data | None = None
+
+    def anew(self) -> LoopKinematics:
+        """The same rows with memory of their own: anchors are not looked up again."""
+        other = copy(self)
+        other._loops = [copy(loop) for loop in self._loops]
+        other._allocate()
+        return other
+
+    def pattern(self) -> BoolArray:
+        """Which entries of G (m, nv) may differ from zero."""
+        out: BoolArray = self._support != 0.0
+        for own, entries in self._constant:
+            out[own] = entries != 0.0
+        return out
+
+    def constants(self) -> dict[str, Any]:
+        """What the compiled kernel needs of the rows: ``loops`` between anchors, ``joint_rows``."""
+        return {
+            "loops": [loop.constants() for loop in self._loops if isinstance(loop, _LoopRows)],
+            "joint_rows": [row for rows in self._joint_rows for row in rows.constants()],
+            "eliminations": [
+                (e.row, e.other, e.factor, np.flatnonzero(self._support[e.row]).tolist())
+                for e in self._eliminations
+            ],
+        }
+
+    def update(self, data: pin.Data, q: FloatArray, with_bias: bool = True) -> None:
+        """Evaluate g and G, and Gdot v unless ``with_bias`` is false, at the configuration q (nq,).
+
+        ``data`` must hold crba in the WORLD convention (placements, world Jacobian) and, for the
+        bias, nonLinearEffects (velocities, bias accelerations) at the current state.
+
+        Raises
+        ------
+        EvaluationError
+            If the points of a ``distance`` coincide.
+        """
+        if data is not self._data:
+            self._data, self._J = data, world_jacobian(data)
+            for loop in self._loops:
+                loop.bind(data)
+        numbers: list[float] = []
+        for loop in self._loops:
+            loop.evaluate(q, with_bias, numbers)
+        self._numbers[:] = numbers
+        G = self.G
+        np.dot(self._wrenches, self._J, G)
+        np.multiply(G, self._support, G)
+        for own, entries in self._constant:
+            G[own] = entries
+        for row, other, factor in self._eliminations:
+            for each in (G, self.g, self.bias):
+                each[row] -= factor * each[other]
+
+
+def all_rows(mechanism: Mechanism) -> LoopKinematics:
+    """All rows of a mechanism's closures, unscaled, with memory of their own."""
+    resolved: LoopKinematics = mechanism.derived(
+        "all_rows", lambda: LoopKinematics(mechanism.model, mechanism.loops)
+    )
+    return resolved.anew()
+
+
+def closure_errors(
+    model: pin.Model,
+    loops: Sequence[LoopClosure],
+    q: FloatArray,
+    v: FloatArray,
+    rows: LoopKinematics | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv).
+
+    ``rows``: from :func:`all_rows`, where a mechanism is at hand.
+    """
+    rows = LoopKinematics(model, loops) if rows is None else rows
+    data = workspace(model)
+    g = np.empty((len(q), len(rows.g)))
+    c = np.empty_like(g)
+    for i in range(len(q)):
+        pin.crba(model, data, q[i], pin.Convention.WORLD)
+        rows.update(data, q[i], with_bias=False)
+        g[i] = rows.g
+        c[i] = rows.G @ v[i]
+    return g, c
+
+
+def row_wrenches(loop: LoopClosure, model: pin.Model, data: pin.Data) -> FloatArray:
+    """Wrench on b, at b's origin in world axes, per unit multiplier of each row: (rows, 6).
+
+    For closures between anchors.  ``data`` must hold the joint placements.  Force (3) then moment
+    (3); a's body feels the opposite wrench at the same point.
+    """
+    Ta, Tb = (data.oMi[joint] * inside for joint, inside in loop.resolve(model))
+    gap = Ta.translation - Tb.translation
+    out = []
+    for d in loop.rows.directions:
+        force = Tb.rotation @ d
+        out.append(np.concatenate([force, cross(gap, force)]))
+    if loop.rows.distances:  # along the line through both origins
+        out.append(np.concatenate([gap / np.linalg.norm(gap), np.zeros(3)]))
+    for u, n in loop.rows.alignments:
+        moment = cross(Ta.rotation @ u, Tb.rotation @ n)
+        out.append(np.concatenate([np.zeros(3), moment]))
+    return np.array(out)

@@ -1,0 +1,507 @@
+"""Load-time analysis of the closures: row scales, structural rank, redundant rows.
+
+A walk on the closure manifold (docs/notation.md, "The walk") visits
+closed configurations from several restarts, because the start may itself be singular, and open
+random configurations alone give the wrong rank for over-constrained loops.
+
+The walk on the closure manifold that the load-time analysis makes, and its scaled rows.
+
+Source: docs/notation.md, "The walk" and "Scales of rows".
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg import lapack
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, cholesky, unwhiten, whiten
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
+from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
+from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
+from srm_mbs.errors import EvaluationError
+from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.validation import check_inertia
+
+OPEN_SAMPLES = 24
+WALK_AMPLITUDE = 0.5
+ROUNDING_ROW = 1e-12
+"""Rows of one kind whose rms stays below this part of their uncancelled terms are rounding."""
+NULL = 1e-7
+"""Pivots (of scaled rows) below this leave their direction free on the walk."""
+PARALLEL = 0.3
+"""Part of a row that is left of it without its shares in others, below which it is nearly
+parallel to them."""
+DEPENDENT = 1e-6
+"""The same, below which it follows from them."""
+CLOSING_RANK = 1e-9
+"""Pivots below this part of the largest do not close loops."""
+
+
+class Walker:
+    """Closes loops and walks on the closure manifold.
+
+    Parameters
+    ----------
+    mechanism, units
+        The mechanism, and the units in which it counts.
+
+    Attributes
+    ----------
+    scale : (rows,)
+        Scale by which rows are divided; ones until :meth:`set_scale`.
+    eliminations
+        Rows that are taken off others; none until :meth:`separate`.
+    """
+
+    def __init__(self, mechanism: Mechanism, units: Units) -> None:
+        self.model = mechanism.model
+        self.data = workspace(self.model)
+        self.units = units
+        self.row_unit = row_units(mechanism, units)
+        self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        self.closed = len(self.row_unit)
+        self.scale = np.ones(len(self._rows.g))
+        self.eliminations: tuple[Elimination, ...] = ()
+        pattern = self._pattern = self._rows.pattern()
+        self._anchored = [
+            at
+            for at, closure in enumerate(loop for loop in mechanism.loops for _ in loop.row_names)
+            if not closure.rows.joint_rows
+        ]
+        self._all = row_algebra(pattern, self.model)
+        driven = self.closed < len(self.scale)
+        self._loops = row_algebra(pattern[: self.closed], self.model) if driven else self._all
+        self._plain = row_algebra(pattern[: self.closed])
+        self._trees = trees(self.model)
+        self._factorised: FloatArray | None = None
+
+    def _evaluate(self, q: FloatArray) -> None:
+        """g and G of all rows, and M in ``data``, at q."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        self._rows.update(self.data, q, with_bias=False)
+        self._factorised = None
+
+    def _scaled(self, q: FloatArray) -> FloatArray:
+        """G (rows, nv) of the rows after the eliminations, over their scale."""
+        self._evaluate(q)
+        G = self._rows.G.copy()
+        for row, other, factor in self.eliminations:
+            G[row] -= factor * G[other]
+        G /= self.scale[:, None]
+        return G
+
+    def factorised(self, q: FloatArray) -> tuple[RowAlgebra, RowAlgebra]:
+        """The algebra of all scaled rows, and that of the loops', in the mass metric at q."""
+        if self._factorised is not q:
+            G = self._scaled(q)
+            self._all.factor(self.data.M, G, NULL)
+            if self._loops is not self._all:
+                self._loops.factor(self.data.M, G[: self.closed], NULL)
+            self._factorised = q
+        return self._all, self._loops
+
+    def close(self, q: FloatArray, iterations: int = 30) -> tuple[FloatArray, float]:
+        """Newton's iteration onto the closure manifold by shortest steps in units; q and the
+        largest error left, in row units."""
+        if not self.closed:
+            return q, 0.0
+        unit, own = self.units.coordinate, slice(self.closed)
+        for iteration in range(iterations + 1):
+            self._evaluate(q)
+            g = self._rows.g[own] / self.row_unit
+            error = float(np.abs(g).max())
+            if error < 1e-14 or iteration == iterations:
+                break
+            by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
+            try:
+                longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
+                self._plain.factor(None, by_unit, CLOSING_RANK * longest)
+            except EvaluationError:
+                break
+            q = pin.integrate(self.model, q, -self._plain.solve(g) * unit)
+        return q, error
+
+    def set_scale(self, mechanism: Mechanism, rng: np.random.Generator) -> None:
+        """Row scales from open random configurations, isotropic per closure and kind of row."""
+        squares = np.zeros_like(self.scale)
+        uncancelled = np.zeros(2)
+        for _ in range(OPEN_SAMPLES):
+            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
+            rows, _ = self.factorised(pin.integrate(self.model, mechanism.q0, spread))
+            squares += rows.row_squares
+            # What rows would measure if nothing in them cancelled: their rounding is eps of it.
+            J = world_jacobian(self.data)
+            turn = np.linalg.norm(J[3:], axis=0)
+            shift = np.linalg.norm(J[:3], axis=0) + self.units.length * turn
+            for tree in self._trees:
+                U = cholesky(self.data.M[tree, tree])
+                mobility = (whiten(U, np.eye(len(U))) ** 2).sum(axis=0)
+                uncancelled += [mobility @ each[tree] ** 2 for each in (shift, turn)]
+        squares /= OPEN_SAMPLES
+        uncancelled /= OPEN_SAMPLES
+        at = 0
+        for loop in mechanism.loops:
+            lengths, turns, joints = loop.rows.blocks
+            own = squares[at : at + loop.rows.count]
+            scale = self.scale[at : at + loop.rows.count]
+            for block, whole in zip((lengths, turns), uncancelled):
+                mean = own[block].mean() if block.stop > block.start else 0.0
+                if mean <= ROUNDING_ROW**2 * whole:
+                    mean = whole  # always satisfied: keep rounding from being scaled up to a row
+                scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
+            scale[joints] = np.sqrt(own[joints])  # constant entries: nothing cancels
+            at += loop.rows.count
+        driven = squares[at:]
+        self.scale[at:] = np.sqrt(np.where(driven > 0.0, driven, 1.0))
+
+    def distances(self, q: FloatArray) -> FloatArray:
+        """How far each scaled row (rows,) in use at q is from the span of the others in use, in
+        the mass metric; NaN for rows that are not in use.
+
+        1/||E e_i|| for row i: E e_i is the smallest velocity that changes that row alone.
+        """
+        rows, _ = self.factorised(q)
+        count = len(self.scale)
+        X = np.array([rows.solve(row) for row in np.eye(count)])
+        upper = np.triu(self.data.M)
+        M = upper + np.triu(upper, 1).T
+        size = np.sqrt(np.maximum(((X @ M) * X).sum(axis=1), 0.0))
+        # No row is further from any span than it is long; what seems to be is not in use.
+        used = size * np.sqrt(rows.row_squares) > 0.5
+        out: FloatArray = np.divide(1.0, size, out=np.full(count, np.nan), where=used)
+        return out
+
+    def separate(self, samples: Sequence[FloatArray], kept: BoolArray) -> None:
+        """Take off rows what makes them nearly parallel to others between the same bodies.
+
+        Such as those of two points next to each other that hold a hinge: their difference, which
+        holds it against turning, is small everywhere.  The last pivot then tells that a row is
+        about to depend on others only where that is smaller still, whatever the scales.
+
+        Parameters
+        ----------
+        samples
+            Closed configurations.
+        kept : (rows,) bool
+            Rows that take part.
+        """
+        groups: dict[bytes, list[int]] = {}
+        for row in self._anchored:
+            if kept[row]:
+                groups.setdefault(self._pattern[row].tobytes(), []).append(row)
+        parts = []
+        for q in samples:
+            white = self._scaled(q).T
+            for tree in self._trees:
+                white[tree] = whiten(cholesky(self.data.M[tree, tree]), white[tree])
+            parts.append(white)
+        scales = self.scale.tolist()
+        found: list[Elimination] = []
+        for rows in groups.values():
+            W = np.concatenate([white[:, rows] for white in parts])
+            size = np.linalg.norm(W, axis=0)
+            basis: list[int] = []
+            for k in (lapack.dgeqp3(W)[1] - 1).tolist():
+                shares = np.linalg.lstsq(W[:, basis], W[:, k], rcond=None)[0]
+                left = W[:, k] - W[:, basis] @ shares
+                length = np.linalg.norm(left)
+                if not length > DEPENDENT * size[k]:
+                    continue
+                if length < PARALLEL * size[k]:
+                    W[:, k] = left
+                    row = rows[k]
+                    found += [
+                        Elimination(row, rows[j], share * scales[row] / scales[rows[j]])
+                        for j, share in zip(basis, shares.tolist())
+                    ]
+                basis.append(k)
+        self.eliminations = tuple(found)
+        self._factorised = None
+
+    def balance(self, samples: Sequence[FloatArray]) -> None:
+        """Scale each row by its usual distance from the span of the others.
+
+        Where the rows of one closure differ much in size, as those that hold a slender body do,
+        their common scale makes some of them small everywhere.  A pivot that vanishes is the last
+        one only once it is smaller still.  Against its own distance every row is about 1 unless
+        it is about to depend on others, whatever the sizes and directions of those.
+        """
+        scale = self.scale.copy()
+        for i, distances in enumerate(np.array([self.distances(q) for q in samples]).T):
+            known = distances[np.isfinite(distances)]
+            if known.size:
+                scale[i] *= np.median(known)
+        self.scale = scale
+        self._factorised = None
+
+    def _isotropic(self, white: FloatArray) -> FloatArray:
+        """L^-T white (nv,), where M was evaluated last: no direction preferred in its metric."""
+        out = np.empty_like(white)
+        for tree in self._trees:
+            out[tree] = unwhiten(cholesky(self.data.M[tree, tree]), white[tree])
+        return out
+
+    def step(self, q: FloatArray, direction: FloatArray, reach: float) -> FloatArray | None:
+        """A closed configuration about ``reach`` units from q along ``direction``; None if none."""
+        size = np.abs(direction / self.units.coordinate).max()
+        if not size > 0.0:
+            return None
+        move = direction * (reach / size)
+        for _ in range(8):
+            closed, error = self.close(pin.integrate(self.model, q, move))
+            if error < 1e-11:
+                return closed
+            move = 0.5 * move
+        return None
+
+    def walk(
+        self,
+        start: FloatArray,
+        rng: np.random.Generator,
+        restarts: int,
+        steps: int,
+        first: FloatArray | None = None,
+    ) -> Iterator[FloatArray]:
+        """Closed configurations of ``restarts`` random walks of ``steps`` steps from ``start``.
+
+        The first steps of two of them go along the velocity ``first`` (nv,) and against it, unless
+        it is zero.
+        """
+        along = [] if first is None or not np.abs(first).max() > 0.0 else [first, -first]
+        for restart in range(restarts):
+            q = start
+            for k in range(steps):
+                # Drives take no part: they lead along the closed configurations, wherever that is.
+                _, rows = self.factorised(q)
+                if rows.rank == self.model.nv:
+                    break
+                direction = rows.tangential(self._isotropic(rng.standard_normal(self.model.nv)))
+                if k == 0 and restart < len(along):
+                    direction = along[restart]
+                closed = self.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
+                if closed is not None:
+                    q = closed
+                    yield q
+
+
+log = logging.getLogger(__name__)
+
+RESTARTS = 10
+WALK_STEPS = 12
+STRUCTURAL_PIVOT = 1e-6
+"""A pivot (of scaled rows) above this counts as independent."""
+ZERO_ROW = 1e-9
+"""A scaled row that stays below this in every closed sample is zero."""
+BLUNT = 0.1
+"""A last structural pivot whose usual size is below this is told apart from zero too late."""
+BALANCING_SAMPLES = 12
+"""Closed configurations in which rows are measured against each other."""
+RANK_GAP = 1e3
+"""Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Constant facts about the closures and drives of a mechanism.
+
+    Attributes
+    ----------
+    row_names
+        Names of all rows, ``loop.row``, then those of the drives.
+    row_scale : (rows,)
+        Every row is divided by its scale: the rms of ||L^-1 G^T row|| over open configurations,
+        averaged over the rows of one kind in a closure; where that leaves the last pivot small
+        everywhere, the row's usual distance from the span of the others.
+    kept : (rows,) bool
+        False for rows that are zero on every closed sample; the solve leaves them out.  Rows of
+        drives are always kept.
+    rank
+        Structural rank: the largest number of pivots above 1e-6 over the closed samples.
+    loop_rank
+        The same of the loops alone.
+    sigma_ref
+        Median of the last structural pivot over the samples of that rank.
+    units
+        Units of the coordinates at q0.
+    samples
+        Number of closed configurations visited.
+    notes
+        Sentences for the user, such as a weak gap between structural and redundant pivots.
+    eliminations
+        Rows that are taken off others, in this order, where rows of closures between the same
+        bodies are nearly parallel.
+    """
+
+    row_names: tuple[str, ...]
+    row_scale: FloatArray
+    kept: BoolArray
+    rank: int
+    loop_rank: int
+    sigma_ref: float
+    units: Units
+    samples: int
+    notes: tuple[str, ...]
+    eliminations: tuple[Elimination, ...] = ()
+
+    def at(self, mechanism: Mechanism) -> Structure:
+        """The same facts with the units of ``mechanism``, which differs in its start only."""
+        return replace(self, units=coordinate_units(mechanism, mechanism.q0, mechanism.v0))
+
+    @property
+    def redundant_rows(self) -> tuple[str, ...]:
+        """Names of the rows that the solve leaves out."""
+        return tuple(name for name, keep in zip(self.row_names, self.kept) if not keep)
+
+    @property
+    def pivoted_redundancy(self) -> int:
+        """Number of further redundant rows, chosen by pivoting at every evaluation."""
+        return int(np.sum(self.kept)) - self.rank
+
+
+def _closed(mechanism: Mechanism, walker: Walker, rng: np.random.Generator) -> Iterator[FloatArray]:
+    """The closed configurations that the analysis looks at."""
+    start, error = walker.close(mechanism.q0, iterations=100)
+    if error < 1e-11:
+        yield start
+    else:
+        start = np.array(mechanism.q0)
+    yield from walker.walk(start, rng, RESTARTS, WALK_STEPS, mechanism.v0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Closed configurations and, there, the pivots (n, k) of all rows, those (n, l) of the loops
+    alone, and the largest norms (rows,) of rows."""
+
+    configurations: list[FloatArray]
+    pivots: FloatArray
+    of_loops: FloatArray
+    largest: FloatArray
+
+    def ranks(self) -> IndexArray:
+        """The number (n,) of independent rows in each."""
+        ranks: IndexArray = (self.pivots > STRUCTURAL_PIVOT).sum(axis=1)
+        return ranks
+
+    def last_pivots(self, rank: int) -> FloatArray:
+        """The last structural pivot in the configurations of that rank."""
+        last: FloatArray = self.pivots[self.ranks() == rank, rank - 1]
+        return last
+
+
+def _sampled(walker: Walker, configurations: Iterable[FloatArray]) -> _Samples:
+    rows, closed_rows, nv = len(walker.scale), walker.closed, walker.model.nv
+    visited: list[FloatArray] = []
+    pivots: list[FloatArray] = []
+    of_loops: list[FloatArray] = []
+    largest = np.zeros(rows)
+    for q in configurations:
+        every, loops = walker.factorised(q)
+        np.maximum(largest, np.sqrt(every.row_squares), out=largest)
+        visited.append(q)
+        pivots.append(every.pivots)
+        of_loops.append(loops.pivots)
+
+    def stacked(found: list[FloatArray], count: int) -> FloatArray:
+        return np.array(found) if found else np.zeros((0, min(count, nv)))
+
+    return _Samples(visited, stacked(pivots, rows), stacked(of_loops, closed_rows), largest)
+
+
+def _balanced(walker: Walker, samples: _Samples, rank: int) -> _Samples:
+    """``samples`` after :meth:`Walker.separate` and :meth:`Walker.balance`; as they are, with
+    their scale, if that does not raise the last pivot or makes more rows independent."""
+    regular = np.flatnonzero(samples.ranks() == rank)
+    chosen = regular[:: -(-len(regular) // BALANCING_SAMPLES)]
+    scale = walker.scale
+    measured = [samples.configurations[i] for i in chosen]
+    walker.separate(measured, samples.largest > ZERO_ROW)
+    walker.balance(measured)
+    again = _sampled(walker, samples.configurations)
+    before = float(np.median(samples.last_pivots(rank)))
+    if int(again.ranks().max()) == rank and np.median(again.last_pivots(rank)) > before:
+        return again
+    walker.scale, walker.eliminations = scale, ()
+    return samples
+
+
+def row_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """Names of all rows: ``loop.row``, then those of the drives."""
+    names = [name for loop in mechanism.loops for name in loop.row_names]
+    return (*names, *(drive.name for drive in in_order_of_rows(mechanism.drives)))
+
+
+def analyse(mechanism: Mechanism) -> Structure:
+    """Row scales, structural rank, reference pivot and zero rows of ``mechanism``.
+
+    Deterministic: the walk uses a fixed seed.  Source: docs/notation.md, "The walk".
+
+    Raises
+    ------
+    InputError
+        If a joint moves no inertia.
+    EvaluationError
+        If the mass matrix is not positive definite where the walk evaluates it.
+    """
+    check_inertia(mechanism.model)
+    units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
+    names = row_names(mechanism)
+    if not names:
+        return Structure((), np.ones(0), np.ones(0, bool), 0, 0, 1.0, units, 0, ())
+    rng = np.random.default_rng(0)
+    walker = Walker(mechanism, units)
+    walker.set_scale(mechanism, rng)
+    samples = _sampled(walker, _closed(mechanism, walker, rng))
+    notes: list[str] = []
+    if not samples.configurations:
+        notes.append(
+            "no closed configuration was found: the loops do not close near the initial guess"
+        )
+        kept = np.ones(len(names), dtype=bool)
+        rank = min(len(names), mechanism.model.nv)
+        closed = min(walker.closed, mechanism.model.nv)
+        return Structure(names, walker.scale, kept, rank, closed, 1.0, units, 0, tuple(notes))
+    kept = samples.largest > ZERO_ROW
+    kept[walker.closed :] = True
+    loop_rank = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
+    rank = int(samples.ranks().max())
+    if rank and np.median(samples.last_pivots(rank)) < BLUNT:
+        samples = _balanced(walker, samples, rank)
+    sigma_ref = float(np.median(samples.last_pivots(rank))) if rank else 1.0
+    if rank < loop_rank + len(mechanism.drives):
+        driven = ", ".join(repr(drive.name) for drive in mechanism.drives)
+        notes.append(
+            f"the drives ({driven}) prescribe motions that follow from the closures or from each "
+            "other: they must agree, and their forces are those of least norm"
+        )
+    if 0 < rank < samples.pivots.shape[1]:
+        weakest = float(samples.last_pivots(rank).min())
+        redundant = max(float(samples.pivots[:, rank:].max()), PIVOT_ZERO)
+        if weakest < RANK_GAP * redundant:
+            notes.append(
+                f"the rank {rank} of the closures is uncertain: smallest independent pivot "
+                f"{weakest:.1e}, largest redundant pivot {redundant:.1e}"
+            )
+            log.warning("%s: %s", mechanism.name, notes[-1])
+    visited = len(samples.configurations)
+    return Structure(
+        names,
+        walker.scale,
+        kept,
+        rank,
+        loop_rank,
+        sigma_ref,
+        units,
+        visited,
+        tuple(notes),
+        walker.eliminations,
+    )

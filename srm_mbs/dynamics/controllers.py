@@ -1,0 +1,76 @@
+"""Controllers: functions of the user that return generalised forces, called and checked.
+
+Forces held between samples, as a digital controller holds its outputs.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import ControllerError
+
+
+class HeldForce:
+    """Generalised forces that are constant from one sample to the next.
+
+    A controller (:mod:`srm_mbs.dynamics.controllers`): called at any time of a run, also after it,
+    it returns what acted then; right-continuous.
+    """
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+        self.values: list[FloatArray] = []
+
+    def hold(self, t: float, force: FloatArray) -> None:
+        """``force`` (nv,), N and N m, acts from ``t`` (s) on, which is later than all before."""
+        self.times.append(t)
+        self.values.append(force)
+
+    def only(self, force: FloatArray) -> None:
+        """``force`` (nv,) acts at all times."""
+        self.times, self.values = [-math.inf], [force]
+
+    def __call__(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """The force (nv,) at ``t``."""
+        if t >= self.times[-1]:
+            return self.values[-1]
+        return self.values[max(0, bisect_right(self.times, t) - 1)]
+
+
+Controller = Callable[[float, FloatArray, FloatArray], Any]
+"""(t, q, v) -> generalised forces tau (nv,), N and N m."""
+
+
+def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+    """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v`` and may
+    return the same array every time.
+
+    Raises
+    ------
+    ControllerError
+        If it raises, or returns anything but nv finite numbers.
+    """
+    try:
+        tau = np.array(controller(t, q.copy(), v.copy()), dtype=float, order="C")
+    except Exception as error:
+        raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
+    trouble = unusable(tau, len(v))
+    if trouble:
+        raise ControllerError(
+            f"the controller returned {trouble} at t = {t:.6g} s; it must return {len(v)} finite "
+            "generalised forces"
+        )
+    return tau
+
+
+def unusable(given: FloatArray, size: int) -> str:
+    """What is wrong with an array that should be ``size`` finite numbers; empty if nothing is."""
+    if given.shape != (size,):
+        return f"an array of shape {given.shape}"
+    return "" if np.isfinite(given).all() else "values that are not finite"

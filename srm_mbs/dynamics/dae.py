@@ -1,0 +1,531 @@
+r"""A semi-explicit DAE of index 2 as a system.
+
+    x' = f(t, x) - B(t, x) y,    0 = g(t, x),    yhat = B y = E (G f + g_t),    E = B (GB)^-1.
+
+The answers of an evaluated point are in :mod:`srm_mbs.dynamics.dae`.
+
+The algebra of a DAE at one point: E = B (GB)^-1, P = E G, rank and sigma.
+
+Column-pivoted QR of the scaled G^T = Q_G R_G and B = Q_B R_B; with C = Q_G^T Q_B,
+
+    E r = Q_B C^-1 R_G^-T r,    P w = Q_B C^-1 Q_G^T w,
+
+so that where rows of G, or columns of B, become dependent only the cosines of the angles in C are
+divided by: P stays bounded there (thesis, (2.4)), which products with (GB)^-1 would not.
+
+Terms of one evaluated point of a semi-explicit DAE, :mod:`srm_mbs.dynamics.dae`.
+
+One sweep of the SRM: y_s = y_{s-1} + T g/eps, x_s' = f - B y_s, (2.2) of the thesis with T = I or
+(GB)^T; and for T = (GB)^-1 the form (2.4), which carries yhat = B y instead of y,
+
+    yhat_s = P yhat_{s-1} + E g/eps,    P = E G,
+
+and passes isolated singularities of G B, where P and yhat stay bounded and y need not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr
+from srm_mbs.dynamics.system import Terms, Zone
+from srm_mbs.errors import CallbackError, EvaluationError, InputError
+from srm_mbs.model.dae import SemiExplicitDAE
+
+
+class ObliqueProjection:
+    """Factorisation of G and B at one point; reused.
+
+    Parameters
+    ----------
+    rows : (ny,), columns : (ny,)
+        Typical norms of the rows of G and the columns of B.
+    reference : (3,)
+        Typical ``sizes``; 1 if not known.
+
+    Attributes
+    ----------
+    factorisations
+        How many factorisations were done.
+    sizes : (3,)
+        The last pivot of the scaled G^T, that of the scaled B, and the smallest cosine in C.
+    sigma
+        The smallest of these three numbers over its reference.
+    rank
+        Number of directions in use.
+    """
+
+    def __init__(
+        self,
+        rows: FloatArray,
+        columns: FloatArray,
+        reference: FloatArray | None = None,
+    ) -> None:
+        self.rows, self.columns = rows, columns
+        self.reference = np.ones(3) if reference is None else reference
+        self.factorisations = 0
+        self.size = len(rows)
+        self.rank = self.size
+        self.sigma = np.inf
+        self.weak = False
+
+    def factor(self, G: FloatArray, B: FloatArray, threshold: float | None) -> None:
+        """Factorise G (ny, nx) and B (nx, ny).
+
+        ``threshold`` drops the directions in which G or B is below ``threshold`` times its
+        reference (the zone); ``None`` uses all.
+
+        Raises
+        ------
+        EvaluationError
+            If G or B is not finite, or G B is singular though neither G nor B loses rank.
+        """
+        self.factorisations += 1
+        ny = self.size
+        if not (np.isfinite(G).all() and np.isfinite(B).all()):
+            raise EvaluationError("G or B is not finite")
+        packed, order, tau, g_pivots = pivoted_qr(np.asfortranarray((G / self.rows[:, None]).T))
+        packed_b, _, tau_b, b_pivots = pivoted_qr(np.asfortranarray(B / self.columns))
+        floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold)
+        rank = ny
+        while rank and not (
+            g_pivots[rank - 1] > floor * self.reference[0]
+            and b_pivots[rank - 1] > floor * self.reference[1]
+        ):
+            rank -= 1
+        self.rank, self.weak = rank, rank < ny
+        self.order = order[:rank]
+        self.R = packed[:rank, :rank]
+        self.Q_G = lapack.dorgqr(packed[:, :rank], tau[:rank])[0] if rank else packed[:, :0]
+        self.Q_B = lapack.dorgqr(packed_b[:, :rank], tau_b[:rank])[0] if rank else packed_b[:, :0]
+        left, cosines, right = np.linalg.svd(self.Q_G.T @ self.Q_B)
+        cosine = float(cosines[-1]) if rank else 1.0
+        if cosine < PIVOT_ZERO:
+            raise EvaluationError(
+                "G B is singular though neither G nor B loses rank: x' does not stay bounded there"
+            )
+        self.inverse = (right.T / cosines) @ left.T
+        self.sizes = np.array([g_pivots[ny - 1], b_pivots[ny - 1], cosine])
+        self.sigma = float((self.sizes / self.reference).min())
+
+    def lift(self, residual: FloatArray) -> FloatArray:
+        """E r (nx,) for ``residual`` r (ny,): B (GB)^-1 r."""
+        if self.rank == 0:
+            return np.zeros(self.Q_B.shape[0])
+        scaled = (residual / self.rows)[self.order]
+        z = lapack.dtrtrs(self.R, scaled, lower=0, trans=1)[0]
+        lifted: FloatArray = self.Q_B @ (self.inverse @ z)
+        return lifted
+
+    def project(self, w: FloatArray) -> FloatArray:
+        """P w (nx,)."""
+        projected: FloatArray = self.Q_B @ (self.inverse @ (self.Q_G.T @ w))
+        return projected
+
+
+class DaeTerms:
+    """Terms of one evaluated point."""
+
+    def __init__(self, system: DaeSystem) -> None:
+        self._system = system
+        self._p = system.projection
+        self.t = 0.0
+        self.x = self.f = self.B = self.G = np.zeros(0)
+        self.predicted: FloatArray | None = None
+        self._g: FloatArray | None = None
+
+    def load(self, t: float, x: FloatArray, f: FloatArray, B: FloatArray, G: FloatArray) -> None:
+        """The values at a new point."""
+        self.t, self.x, self.f, self.B, self.G = t, x, f, B, G
+        self._g = None
+
+    @property
+    def sigma(self) -> float:
+        return self._p.sigma
+
+    @property
+    def rank(self) -> int:
+        return self._p.rank
+
+    @property
+    def weak(self) -> bool:
+        return self._p.weak
+
+    @property
+    def held(self) -> bool:
+        return False
+
+    def normals(self) -> FloatArray:
+        return np.zeros((len(self.x), 0))
+
+    def _residual(self) -> FloatArray:
+        if self._g is None:
+            self._g = self._system.call("g", self.t, self.x)
+        return self._g
+
+    def _gamma(self) -> FloatArray:
+        return self.G @ self.f + self._system.time_derivative(self.t, self.x)
+
+    def _completed(self, strong: FloatArray) -> FloatArray:
+        """The strong part of yhat plus (1 - P_s) yhat_pred."""
+        if self.predicted is None:
+            return strong
+        return strong + self.predicted - self._p.project(self.predicted)
+
+    def rate(self) -> FloatArray:
+        return self.f - self.multiplier()
+
+    def multiplier(self) -> FloatArray:
+        return self._completed(self._p.lift(self._gamma()))
+
+    def prediction(self) -> FloatArray:
+        if self._system.carries_yhat:
+            return self.multiplier()
+        if not self.weak:
+            y = np.linalg.solve(self.G @ self.B, self._gamma())
+            return y.astype(np.float64, copy=False)
+        return self._system.factor_of(self.multiplier(), self.B)
+
+    def project(self, w: FloatArray) -> FloatArray:
+        return self._p.project(w)
+
+    def gap(self) -> float:
+        return 0.0
+
+    def correction(self) -> FloatArray:
+        return self._p.lift(self._residual())
+
+    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
+        g = self._residual()
+        if self._system.carries_yhat:
+            yhat = self._completed(self._p.project(previous) + self._p.lift(g) / eps)
+            return self.f - yhat, yhat
+        with np.errstate(over="ignore", invalid="ignore"):  # of sweeps that are unstable
+            scaled = g if self._system.T == "identity" else (self.G @ self.B).T @ g
+            y = previous + scaled / eps
+            rate = self.f - self.B @ y
+        if not (np.isfinite(rate).all() and np.isfinite(y).all()):
+            raise EvaluationError("the multiplier of a sweep grows beyond all numbers")
+        return rate, y
+
+
+PROBES = 24
+"""Points around the start at which the typical sizes of G and B are measured."""
+PROBE_DISTANCE = 0.1
+"""Their distance, in units of max(1, |x|)."""
+DIFFERENCE = 1e-6
+"""Step of the finite differences that check G and g_t, relative to x and to the run."""
+WRONG_DERIVATIVE = 1e-3
+"""Relative difference from which a derivative is called wrong."""
+
+
+class DaeSystem:
+    """A :class:`~srm_mbs.model.dae.SemiExplicitDAE` behind the contract of the stepping.
+
+    Parameters
+    ----------
+    problem
+        The equations.
+    t0, x0
+        Start of the run; x0 (nx,).
+    t_end
+        End of the run.
+    T
+        ``"identity"``, ``"transpose"`` or ``"inverse"``: what the sweeps multiply g by.
+
+    Raises
+    ------
+    InputError
+        If a function fails at the start, shapes do not fit, G or g_t is not the derivative of g,
+        or G B is singular everywhere.
+    """
+
+    has_constraints = True
+
+    def __init__(
+        self,
+        problem: SemiExplicitDAE,
+        t0: float,
+        x0: FloatArray,
+        t_end: float,
+        T: str = "identity",
+    ) -> None:
+        self.problem = problem
+        self.T = T
+        self.evaluations = 0
+        self.nx = len(x0)
+        self._unit = np.maximum(1.0, np.abs(x0))
+        self.ny = self._count_rows(t0, x0)
+        self.shapes = {
+            "f": (self.nx,),
+            "B": (self.nx, self.ny),
+            "g": (self.ny,),
+            "G": (self.ny, self.nx),
+            "g_t": (self.ny,),
+        }
+        self.tangent_size = self.nx
+        self.multiplier_part = slice(0, self.nx)
+        self.carries_yhat = T == "inverse"
+        self.multiplier_size = self.nx if self.carries_yhat else self.ny
+        self._check_values(t0, x0)
+        self.projection = self._measured(t0, x0)
+        self._terms = DaeTerms(self)
+        self._check_jacobian(t0, x0)
+        self.predicts = self._time_derivative_known(t0, x0, t_end)
+
+    @property
+    def factorisations(self) -> int:
+        """How often G and B were factorised."""
+        return self.projection.factorisations
+
+    # --- the user's functions -----------------------------------------------------------------
+
+    def _accepted(self, name: str) -> tuple[tuple[int, ...], ...]:
+        """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1."""
+        shape = self.shapes[name]
+        if self.ny > 1 or name == "f":
+            return (shape,)
+        return (shape, ()) if len(shape) == 1 else (shape, (self.nx,))
+
+    def call(self, name: str, t: float, x: FloatArray) -> FloatArray:
+        """The value of the user's function ``name`` in the shape of the contract.
+
+        Raises
+        ------
+        CallbackError
+            If it raises, or returns another shape.
+        EvaluationError
+            If it returns values that are not finite.
+        """
+        try:
+            returned = getattr(self.problem, name)(t, x.copy())
+            if np.iscomplexobj(returned):
+                raise TypeError("complex values")
+            value = np.array(returned, dtype=float)
+        except Exception as error:
+            raise CallbackError(f"{name} raised {error!r} at t = {t:.6g}") from error
+        if value.shape not in self._accepted(name):
+            raise CallbackError(
+                f"{name} returned shape {value.shape} at t = {t:.6g}; "
+                f"it must return {self.shapes[name]}"
+            )
+        if not np.isfinite(value).all():
+            raise EvaluationError(f"{name} returned values that are not finite at t = {t:.6g}")
+        return value.reshape(self.shapes[name])
+
+    def time_derivative(self, t: float, x: FloatArray) -> FloatArray:
+        """g_t (ny,); 0 where none is given."""
+        return np.zeros(self.ny) if self.problem.g_t is None else self.call("g_t", t, x)
+
+    def _count_rows(self, t: float, x: FloatArray) -> int:
+        try:
+            value = np.asarray(self.problem.g(t, x.copy()), dtype=float)
+        except Exception as error:
+            raise InputError(
+                f"g raised {error!r} at the start",
+                element="g",
+                remedy="Give a function of (t, x) that returns (ny,) values",
+            ) from error
+        if value.ndim > 1 or not 1 <= value.size <= self.nx:
+            raise InputError(
+                f"g returns shape {value.shape} for {self.nx} states",
+                element="g",
+                remedy="Return (ny,) values with 1 <= ny <= nx",
+            )
+        return int(value.size)
+
+    def _check_values(self, t: float, x: FloatArray) -> None:
+        for name in self.shapes:
+            if name == "g_t" and self.problem.g_t is None:
+                continue
+            try:
+                self.call(name, t, x)
+            except (CallbackError, EvaluationError) as error:
+                raise InputError(
+                    f"at the start, {error}",
+                    element=name,
+                    remedy=f"Give a function of (t, x) that returns {self.shapes[name]} numbers",
+                ) from error
+
+    def _measured(self, t: float, x: FloatArray) -> ObliqueProjection:
+        """The projection, with the typical sizes of G and B around the start."""
+        rng = np.random.default_rng(0)
+        pairs = [(self.call("G", t, x), self.call("B", t, x))]
+        for _ in range(PROBES):
+            probe = x + PROBE_DISTANCE * self._unit * rng.uniform(-1.0, 1.0, self.nx)
+            try:
+                with np.errstate(all="ignore"):
+                    pairs.append((self.call("G", t, probe), self.call("B", t, probe)))
+            except (CallbackError, EvaluationError):
+                continue  # outside the domain of the functions; the start itself counts
+        rows = np.sqrt(np.mean([np.sum(G**2, axis=1) for G, _ in pairs], axis=0))
+        columns = np.sqrt(np.mean([np.sum(B**2, axis=0) for _, B in pairs], axis=0))
+        for name, sizes, what in (("G", rows, "row"), ("B", columns, "column")):
+            if not (sizes > 0.0).all():
+                raise InputError(
+                    f"{what} {int(np.argmin(sizes))} of {name} vanishes around the start",
+                    element=name,
+                    remedy="Give equations of index 2: G B regular",
+                )
+        measured = ObliqueProjection(rows, columns)
+        sizes_seen = []
+        for G, B in pairs:
+            try:
+                measured.factor(G, B, None)
+            except EvaluationError:
+                continue
+            if not measured.weak:
+                sizes_seen.append(measured.sizes)
+        if 2 * len(sizes_seen) < len(pairs):
+            raise InputError(
+                "G B is singular at the start and around it",
+                element="G",
+                remedy="Give equations of index 2: G B regular but for isolated points",
+            )
+        reference = np.median(sizes_seen, axis=0)
+        return ObliqueProjection(rows, columns, reference)
+
+    def _check_jacobian(self, t: float, x: FloatArray) -> None:
+        """Refuse a G that is not dg/dx: everything else would look right and be wrong."""
+        G = self.call("G", t, x)
+        for i in range(self.nx):
+            step = np.zeros(self.nx)
+            step[i] = DIFFERENCE * self._unit[i]
+            try:
+                slope = (self.call("g", t, x + step) - self.call("g", t, x - step)) / (2 * step[i])
+            except (CallbackError, EvaluationError):
+                continue  # g ends here; nothing to compare with
+            wrong = np.abs(slope - G[:, i]) > WRONG_DERIVATIVE * np.maximum(
+                self.projection.rows, np.abs(slope)
+            )
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                raise InputError(
+                    f"G[{row}, {i}] = {G[row, i]:.6g} at the start, but dg/dx there is "
+                    f"{slope[row]:.6g} by finite differences",
+                    element="G",
+                    remedy="Return the derivative of g with respect to x from G",
+                )
+
+    def _time_derivative_known(self, t0: float, x: FloatArray, t_end: float) -> bool:
+        """Whether g_t is given, or g does not depend on t."""
+        span = t_end - t0
+        if self.problem.g_t is None:
+            here = self.call("g", t0, x)
+            scale = self.projection.rows * self._unit.max()
+            for fraction in (1e-3, 0.17, 0.61, 1.0):
+                try:
+                    moved = self.call("g", t0 + fraction * span, x) - here
+                except (CallbackError, EvaluationError):
+                    continue
+                if (np.abs(moved) > 1e-12 * scale).any():
+                    return False
+            return True
+        dt = DIFFERENCE * span
+        try:
+            g0, g1, g2 = (self.call("g", t0 + k * dt, x) for k in range(3))
+        except (CallbackError, EvaluationError):
+            return True  # nothing to compare with
+        given = self.call("g_t", t0, x)
+        slope = (4.0 * g1 - 3.0 * g0 - g2) / (2.0 * dt)
+        scale = np.maximum(np.abs(slope), self.projection.rows * self._unit.max() / span)
+        if (np.abs(slope - given) > WRONG_DERIVATIVE * scale).any():
+            raise InputError(
+                f"g_t = {given} at the start, but dg/dt there is {slope} by finite differences",
+                element="g_t",
+                remedy="Return the partial derivative of g with respect to t from g_t",
+            )
+        return True
+
+    # --- the contract -------------------------------------------------------------------------
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+        """Factorise G and B at ``state``; see :class:`~srm_mbs.dynamics.system.System`."""
+        self.evaluations += 1
+        if not np.isfinite(state).all():
+            raise EvaluationError("the state is not finite")
+        f, B, G = (self.call(name, t, state) for name in ("f", "B", "G"))
+        self.projection.factor(G, B, None if zone is None else zone.threshold)
+        terms = self._terms
+        terms.load(t, state, f, B, G)
+        terms.predicted = None
+        if self.projection.weak and zone is not None:
+            terms.predicted = zone.predict(t)
+            if terms.predicted is None:
+                raise EvaluationError(
+                    "the solution stays next to a singularity of G B for longer than its "
+                    "multiplier can be predicted"
+                )
+        return terms
+
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """x + dx."""
+        return state + delta
+
+    def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
+        """``rate`` itself."""
+        return rate
+
+    def rate_change(self, delta: FloatArray) -> FloatArray:
+        """0: no state is another one's rate."""
+        return np.zeros_like(delta)
+
+    def size(self, delta: FloatArray) -> float:
+        """max |dx|; see :class:`~srm_mbs.dynamics.system.System`."""
+        return float(np.abs(delta).max())
+
+    def reachable(self, start: FloatArray, end: FloatArray) -> bool:
+        """True: there is one chart."""
+        return True
+
+    def difference(
+        self, start: FloatArray, end: FloatArray, near: FloatArray | None = None
+    ) -> FloatArray:
+        """end - start; see :class:`~srm_mbs.dynamics.system.System`."""
+        return end - start
+
+    def magnitudes(self, state: FloatArray) -> FloatArray:
+        """|x|."""
+        return np.abs(state)
+
+    def closure_gap(self, t: float, state: FloatArray) -> float:
+        """max |g| over the typical row of G and the size of x: a relative error of x."""
+        g = self.call("g", t, state)
+        return float(np.max(np.abs(g) / self.projection.rows)) / max(
+            1.0, float(np.abs(state).max())
+        )
+
+    def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:
+        """Eigenvalues (ny,) of G B T: the rates at which sweeps reduce g, times eps."""
+        if self.T == "inverse":
+            return np.ones(self.ny, dtype=np.complex128)
+        product = self.call("G", t, state) @ self.call("B", t, state)
+        if self.T == "transpose":
+            product = product @ product.T
+        return np.linalg.eigvals(product).astype(np.complex128)
+
+    def step_limit(self, state: FloatArray) -> float:
+        """No limit."""
+        return np.inf
+
+    # --- multipliers --------------------------------------------------------------------------
+
+    def factor_of(self, yhat: FloatArray, B: FloatArray) -> FloatArray:
+        """y (ny,) of least norm with B y = ``yhat``."""
+        return np.linalg.lstsq(B, yhat, rcond=None)[0].astype(np.float64, copy=False)
+
+    def multiplier_at(self, t: float, state: FloatArray) -> FloatArray:
+        """y (ny,) by the exact prediction; of least norm where B loses rank."""
+        terms: Any = self.evaluate(t, state)
+        return self.factor_of(terms.multiplier(), terms.B)
+
+    def uncarried(self, t: float, state: FloatArray, carried: FloatArray) -> FloatArray:
+        """y (ny,) of what sweeps carry."""
+        if not self.carries_yhat:
+            return carried
+        return self.factor_of(carried, self.call("B", t, state))

@@ -1,0 +1,459 @@
+"""Generalised forces of the force elements, from the kinematics of one evaluation.
+
+The elements on joints are in ``joint_forces``, those on links in ``link_forces``; here are the
+functions of the user, and all elements of a mechanism together.
+
+What the evaluators of force elements share: anchors, wrenches, numbers over time.
+
+A wrench W = (f, m) in world axes about the world origin that acts on body a, and -W on body b, is
+
+    tau = (J_a - J_b)^T W
+
+with J the world-frame joint Jacobian: all elements between bodies are reduced to that.  Velocities
+are spatial, in world axes at the world origin; that of a point p is v_lin + w x p.
+
+Evaluators of the force elements on links: springs between points, wrenches, bushings.
+
+Evaluators of the force elements on one joint: torques, springs, limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import Any, Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.projection import cholesky, whiten
+from srm_mbs.dynamics.constraints.rows import (
+    COINCIDENT,
+    cross,
+    placement_numbers,
+    support,
+    world_jacobian,
+)
+from srm_mbs.dynamics.controllers import unusable
+from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.forces import (
+    Bushing,
+    ForceElement,
+    JointTorque,
+    LimitSpring,
+    SpringDamper,
+    TorsionSpring,
+    UserForce,
+    Wrench,
+)
+from srm_mbs.model.laws import Law
+from srm_mbs.model.mechanism import Mechanism
+
+
+class Evaluator(Protocol):
+    """One element, resolved against a model.  ``data`` holds placements, velocities and J."""
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        """Add the element's generalised forces at t (s) to ``tau`` (nv,)."""
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        """Its potential energy (J); ``data`` need hold the placements only."""
+
+    def constants(self) -> dict[str, Any]:
+        """What the compiled kernel needs of it; ``kind`` numbers the kinds as forces.hpp does."""
+
+
+class HeldAnchor:
+    """An anchor: a frame on a body."""
+
+    def __init__(self, model: pin.Model, anchor: Anchor) -> None:
+        self.joint, self.inside = anchor.resolve(model)
+        self.support = support(model, self.joint)
+
+    def constants(self) -> tuple[int, FloatArray]:
+        """Joint, and placement in its axes as numbers, for the compiled kernel."""
+        return self.joint, placement_numbers(self.inside)
+
+    def placement(self, data: pin.Data) -> pin.SE3:
+        """Of the frame in the world."""
+        return data.oMi[self.joint] * self.inside if self.joint else self.inside
+
+    def velocity(self, data: pin.Data) -> pin.Motion:
+        """Spatial velocity of the body, in world axes at the world origin."""
+        joint = self.joint
+        return data.oMi[joint].act(data.v[joint]) if joint else pin.Motion.Zero()
+
+
+def about_origin(force: FloatArray, moment: FloatArray, point: FloatArray) -> FloatArray:
+    """The wrench (6,) of a force at ``point`` and a moment, about the world origin."""
+    return np.concatenate([force, moment + cross(point, force)])
+
+
+def point_velocity(body: pin.Motion, point: FloatArray) -> FloatArray:
+    """Velocity (3,) of ``point``, in world axes, that moves with ``body``."""
+    out: FloatArray = body.linear + cross(body.angular, point)
+    return out
+
+
+class OverTime:
+    """Numbers (n,) that laws multiply over time: none, one for all of them, or one for each."""
+
+    def __init__(self, numbers: FloatArray, law: Law | Sequence[Law] | None) -> None:
+        self._numbers = numbers
+        laws = () if law is None else (law,) if isinstance(law, Law) else law
+        self._curves = [each.curve() for each in laws]
+
+    def at(self, t: float) -> FloatArray:
+        """The numbers at t (s)."""
+        if not self._curves:
+            return self._numbers
+        factors = [curve(t)[0] for curve in self._curves]
+        return self._numbers * (factors[0] if len(factors) == 1 else np.array(factors))
+
+    def constants(self) -> dict[str, Any]:
+        """Numbers and curves, for the compiled kernel."""
+        curves = [curve.constants() for curve in self._curves]
+        return {"numbers": self._numbers.astype(float), "curves": curves}
+
+
+class SpringDamperEvaluator:
+    """A :class:`~srm_mbs.model.forces.SpringDamper`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: SpringDamper) -> None:
+        self.name = force.name
+        self.a, self.b = HeldAnchor(model, force.a), HeldAnchor(model, force.b)
+        self.support = self.a.support - self.b.support
+        self.stiffness, self.damping = force.stiffness, force.damping
+        self.rest_length = float(force.rest_length or 0.0)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        at_a = self.a.placement(data).translation
+        at_b = self.b.placement(data).translation
+        apart = at_a - at_b
+        length = sqrt(apart @ apart)
+        if length < COINCIDENT * self.rest_length:
+            raise EvaluationError(
+                f"the two points of the force {self.name!r} coincide: its direction is not "
+                "determined"
+            )
+        # k (l - l0) apart/l, without dividing where l = l0 = 0.
+        force = -self.stiffness * apart
+        if self.rest_length:
+            force *= 1.0 - self.rest_length / length
+        if self.damping:
+            rate = point_velocity(self.a.velocity(data), at_a)
+            rate -= point_velocity(self.b.velocity(data), at_b)
+            # Points that meet move along the line that joins them.
+            along = apart * ((apart / length) @ rate / length) if length else rate
+            force -= self.damping * along
+        tau += (world_jacobian(data).T @ about_origin(force, np.zeros(3), at_a)) * self.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        apart = self.a.placement(data).translation - self.b.placement(data).translation
+        return 0.5 * self.stiffness * (sqrt(apart @ apart) - self.rest_length) ** 2
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 0,
+            "a": self.a.constants(),
+            "b": self.b.constants(),
+            "support": self.support,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "rest": self.rest_length,
+        }
+
+
+class WrenchEvaluator:
+    """A :class:`~srm_mbs.model.forces.Wrench`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: Wrench) -> None:
+        self.at = HeldAnchor(model, force.at)
+        self.turns = force.frame == "link"
+        self.wrench = OverTime(np.array([*force.force, *force.moment]), force.law)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        at = self.at.placement(data)
+        numbers = self.wrench.at(t)
+        force, moment = numbers[:3], numbers[3:]
+        if self.turns:
+            force, moment = at.rotation @ force, at.rotation @ moment
+        wrench = about_origin(force, moment, at.translation)
+        tau += (world_jacobian(data).T @ wrench) * self.at.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.0
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 3,
+            "a": self.at.constants(),
+            "support": self.at.support,
+            "turns": self.turns,
+        } | self.wrench.constants()
+
+
+class BushingEvaluator:
+    """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: Bushing) -> None:
+        self.a, self.b = HeldAnchor(model, force.a), HeldAnchor(model, force.b)
+        self.support = self.a.support - self.b.support
+        self.stiffness, self.damping = np.array(force.stiffness), np.array(force.damping)
+        self.damped = bool(np.any(self.damping))
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        Ta, Tb = self.a.placement(data), self.b.placement(data)
+        relative = Tb.actInv(Ta)
+        turn = pin.log3(relative.rotation)
+        # dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
+        L = pin.Jlog3(relative.rotation)
+        force = self.stiffness[:3] * relative.translation
+        moment = self.stiffness[3:] * turn
+        if self.damped:
+            # b's axes and origin move along: what is left is the motion seen from b.
+            W = self.a.velocity(data) - self.b.velocity(data)
+            rate = Tb.rotation.T @ point_velocity(W, Ta.translation)
+            spin = L.T @ (Tb.rotation.T @ W.angular)
+            force = force + self.damping[:3] * rate
+            moment = moment + self.damping[3:] * spin
+        wrench = about_origin(-(Tb.rotation @ force), -(Tb.rotation @ (L @ moment)), Ta.translation)
+        tau += (world_jacobian(data).T @ wrench) * self.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        relative = self.b.placement(data).actInv(self.a.placement(data))
+        moved = np.concatenate([relative.translation, pin.log3(relative.rotation)])
+        return 0.5 * float(self.stiffness @ (moved * moved))
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 4,
+            "a": self.a.constants(),
+            "b": self.b.constants(),
+            "support": self.support,
+            "numbers": np.concatenate([self.stiffness, self.damping]).astype(float),
+        }
+
+
+class JointTorqueEvaluator:
+    """A :class:`~srm_mbs.model.forces.JointTorque`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: JointTorque) -> None:
+        joint = model.joints[model.getJointId(force.joint)]
+        self.own = slice(joint.idx_v, joint.idx_v + joint.nv)
+        self.torque = OverTime(np.atleast_1d(np.array(force.torque, dtype=float)), force.law)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        tau[self.own] += self.torque.at(t)
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.0
+
+    def constants(self) -> dict[str, Any]:
+        return {"kind": 1, "in_v": self.own.start} | self.torque.constants()
+
+
+class TorsionSpringEvaluator:
+    """A :class:`~srm_mbs.model.forces.TorsionSpring`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: TorsionSpring) -> None:
+        joint = model.joints[model.getJointId(force.joint)]
+        self.in_q, self.in_v = joint.idx_q, joint.idx_v
+        self.stiffness, self.damping = force.stiffness, force.damping
+        self.rest_angle = force.rest_angle
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        turned = q[self.in_q] - self.rest_angle
+        tau[self.in_v] -= self.stiffness * turned + self.damping * v[self.in_v]
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.5 * self.stiffness * float(q[self.in_q] - self.rest_angle) ** 2
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 2,
+            "in_q": self.in_q,
+            "in_v": self.in_v,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "rest": self.rest_angle,
+        }
+
+
+class LimitSpringEvaluator:
+    """A :class:`~srm_mbs.model.forces.LimitSpring`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: LimitSpring) -> None:
+        joint = model.joints[model.getJointId(force.joint)]
+        self.in_q, self.in_v = joint.idx_q, joint.idx_v
+        self.stiffness, self.damping = force.stiffness, force.damping
+        self.lower, self.upper, self.depth = force.resolved(model)
+
+    def _beyond(self, q: FloatArray) -> float:
+        position = float(q[self.in_q])
+        return max(position - self.upper, 0.0) + min(position - self.lower, 0.0)
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        beyond = self._beyond(q)
+        if beyond == 0.0:
+            return
+        x = min(abs(beyond) / self.depth, 1.0)
+        contact = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+        tau[self.in_v] -= contact * (self.stiffness * beyond + self.damping * v[self.in_v])
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        """The integral of k d S(d / depth)."""
+        beyond, depth = abs(self._beyond(q)), self.depth
+        x = min(beyond / depth, 1.0)
+        inside = depth**2 * x**5 * (2.0 + x * (6.0 / 7.0 * x - 2.5))
+        return self.stiffness * (inside + 0.5 * max(beyond**2 - depth**2, 0.0))
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": 5,
+            "in_q": self.in_q,
+            "in_v": self.in_v,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "numbers": np.array([self.lower, self.upper, self.depth]),
+        }
+
+
+class _UserForceEvaluator:
+    """A :class:`~srm_mbs.model.forces.UserForce`, resolved against a model."""
+
+    def __init__(self, model: pin.Model, force: UserForce) -> None:
+        self.name, self.function = force.name, force.function
+        self.at = None if force.at is None else HeldAnchor(model, force.at)
+        self.size = model.nv if force.at is None else 6
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        try:
+            given = np.asarray(self.function(t, q.copy(), v.copy()), dtype=float)
+        except Exception as error:
+            raise ControllerError(
+                f"the force {self.name!r} raised {error!r} at t = {t:.6g} s"
+            ) from error
+        trouble = unusable(given, self.size)
+        if trouble:
+            raise ControllerError(
+                f"the force {self.name!r} returned {trouble} at t = {t:.6g} s; it must return "
+                f"{self.size} finite numbers"
+            )
+        if self.at is None:
+            tau += given
+            return
+        wrench = about_origin(given[:3], given[3:], self.at.placement(data).translation)
+        tau += (world_jacobian(data).T @ wrench) * self.at.support
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.0
+
+    def constants(self) -> dict[str, Any]:
+        raise TypeError("the compiled kernel calls back for it")
+
+
+def friction_time(mechanism: Mechanism) -> float:
+    """Shortest time (s) in which friction stops a slow joint of the open tree at q0.
+
+    1 over the largest eigenvalue of M^-1 diag(F)/v_s; infinite without friction.  Steps of
+    explicit schemes stay below a few times it while a joint rests.
+
+    Raises
+    ------
+    EvaluationError
+        If the mass matrix is not positive definite.
+    """
+    model = mechanism.model
+    rough = np.flatnonzero(model.friction)
+    if not rough.size:
+        return np.inf
+    U = cholesky(pin.crba(model, workspace(model), mechanism.q0))
+    roots = np.zeros((model.nv, rough.size), order="F")
+    roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / mechanism.friction_speed)
+    return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)
+
+
+_EVALUATORS = {
+    SpringDamper: SpringDamperEvaluator,
+    JointTorque: JointTorqueEvaluator,
+    TorsionSpring: TorsionSpringEvaluator,
+    Wrench: WrenchEvaluator,
+    Bushing: BushingEvaluator,
+    LimitSpring: LimitSpringEvaluator,
+    UserForce: _UserForceEvaluator,
+}
+
+
+def resolved_forces(mechanism: Mechanism) -> ForceKinematics | None:
+    """The force elements of ``mechanism``, resolved once; None if it has none."""
+    forces: ForceKinematics | None = mechanism.derived(
+        "forces",
+        lambda: ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None,
+    )
+    return forces
+
+
+class ForceKinematics:
+    """All force elements of a mechanism.
+
+    Parameters
+    ----------
+    model, forces
+        The tree and its elements.
+    """
+
+    def __init__(self, model: pin.Model, forces: Sequence[ForceElement]) -> None:
+        self._model, self._nv = model, model.nv
+        self._elements: list[Evaluator] = [
+            _EVALUATORS[type(force)](model, force) for force in forces
+        ]
+
+    def generalised(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """tau (nv,) in N and N m at q (nq,), v (nv,) and t (s).
+
+        ``data`` must hold placements, velocities and the world Jacobian at that state: of crba in
+        the WORLD convention and nonLinearEffects, or of forwardKinematics and
+        computeJointJacobians.
+
+        Raises
+        ------
+        EvaluationError
+            If the points of a spring with a rest length coincide.
+        ControllerError
+            If a function of the user raises, or returns anything but finite numbers.
+        """
+        tau = np.zeros(self._nv)
+        for element in self._elements:
+            element.add(tau, data, q, v, t)
+        return tau
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        """Potential energy (J) of springs and bushings; ``data`` must hold the placements."""
+        return sum(element.energy(data, q) for element in self._elements)
+
+    @property
+    def calls(self) -> bool:
+        """Whether there are functions of the user among the elements."""
+        return any(isinstance(element, _UserForceEvaluator) for element in self._elements)
+
+    def called(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """tau (nv,) of those functions alone; ``data`` is a workspace."""
+        pin.forwardKinematics(self._model, data, q, v)
+        pin.computeJointJacobians(self._model, data, q)
+        tau = np.zeros(self._nv)
+        for element in self._elements:
+            if isinstance(element, _UserForceEvaluator):
+                element.add(tau, data, q, v, t)
+        return tau
+
+    def constants(self) -> list[dict[str, Any]]:
+        """What the compiled kernel needs of each element but the functions of the user."""
+        return [
+            element.constants()
+            for element in self._elements
+            if not isinstance(element, _UserForceEvaluator)
+        ]

@@ -1,0 +1,520 @@
+r"""Mechanisms as systems: the evaluation of a stage, without closures and with them.
+
+    q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),   f = tau - nle(q, v),
+
+s the motion of the drives, 0 in the rows of the loops; tau the applied forces.  States and their
+moves are in ``manifold``, the applied forces and the energy in ``mechanics``, the answers of an
+evaluated stage in ``mechanism_terms``.  Only these, ``loops``, ``driven``, ``forces`` and the
+load-time analysis call Pinocchio algorithms.
+
+Terms of one stage of a mechanism: what a method asks of it, in tangent coordinates.
+
+The systems (:mod:`srm_mbs.dynamics.multibody`) fill them in; the algebra of the closures is in
+:mod:`srm_mbs.dynamics.constraints.projection`.
+
+What open and closed mechanisms share besides their states: applied forces, energy, counts.
+
+The forces tau are those of the controller, joint damping and friction, and force elements.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg import blas
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
+from srm_mbs.dynamics.controllers import Controller, HeldForce, called
+from srm_mbs.dynamics.forces import resolved_forces
+from srm_mbs.dynamics.manifold import Manifold
+from srm_mbs.dynamics.scaling import constraint_units
+from srm_mbs.dynamics.system import Terms, Zone
+from srm_mbs.errors import EvaluationError
+from srm_mbs.model.mechanism import Mechanism
+
+_largest = blas.idamax
+
+
+class OpenTerms:
+    """Terms of a mechanism without closures: the acceleration, and no algebra."""
+
+    sigma = np.inf
+    rank = 0
+    weak = False
+    held = False
+
+    def __init__(self, nv: int) -> None:
+        self._rate = np.zeros(2 * nv)
+        self._nv = nv
+
+    def normals(self) -> FloatArray:
+        return np.zeros((self._nv, 0))
+
+    def rate(self) -> FloatArray:
+        return self._rate
+
+    def multiplier(self) -> FloatArray:
+        return np.zeros(self._nv)
+
+    def project(self, w: FloatArray) -> FloatArray:
+        return np.zeros(self._nv)
+
+    def gap(self) -> float:
+        return 0.0
+
+    def correction(self) -> FloatArray:
+        return np.zeros(2 * self._nv)
+
+    def prediction(self) -> FloatArray:
+        return np.zeros(self._nv)
+
+    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
+        return self._rate, np.zeros(self._nv)
+
+
+class ClosedTerms:
+    """Terms of one stage of a closed-loop mechanism."""
+
+    def __init__(
+        self,
+        projection: Projection,
+        loops: LoopKinematics | DrivenKinematics,
+        gap_scale: FloatArray,
+    ) -> None:
+        self._p = projection
+        self._loops = loops
+        self._pushed = loops.pushed if isinstance(loops, DrivenKinematics) else None
+        self._gap_scale = gap_scale
+        self.v = np.zeros(0)
+        self.predicted: FloatArray | None = None
+        self.sigma = projection.sigma
+        self.weak = projection.weak
+
+    @property
+    def rank(self) -> int:
+        return self._p.rank
+
+    def _completed(self, white: FloatArray) -> FloatArray:
+        """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
+        if self.predicted is None:
+            return white
+        p = self._p
+        prediction = p.U @ self.predicted
+        return white + prediction - p.Q @ (p.Q.T @ prediction)
+
+    @property
+    def held(self) -> bool:
+        return self._p.held is not None
+
+    def normals(self) -> FloatArray:
+        if self._pushed is not None:
+            return np.zeros((self.v.size, 0))
+        return self._p.normals()
+
+    def _white_multiplier(self) -> FloatArray:
+        return self._completed(self._p.white_multiplier)
+
+    def rate(self) -> FloatArray:
+        p = self._p
+        nv = self.v.size
+        white = p.white_multiplier if self.predicted is None else self._white_multiplier()
+        out = np.empty(2 * nv)
+        out[:nv] = self.v
+        out[nv:] = unwhiten(p.U, p.white_force - white)
+        return out
+
+    def multiplier(self) -> FloatArray:
+        return self._p.unwhiten(self._white_multiplier())
+
+    def prediction(self) -> FloatArray:
+        return self.multiplier()
+
+    def project(self, w: FloatArray) -> FloatArray:
+        return self._p.project(w)
+
+    def _white_rates(self, w: FloatArray, s: float = 1.0) -> FloatArray:
+        """L^T (P w - s E s'): with w = v and s = 1 that of the rates that violate G v = s'."""
+        p = self._p
+        white = p.white_project(w)
+        return white if self._pushed is None else white - s * p.normal(self._pushed[p.order])
+
+    def gap(self) -> float:
+        gaps = self._loops.g * self._gap_scale
+        return abs(float(gaps.item(_largest(gaps))))
+
+    def correction(self) -> FloatArray:
+        p = self._p
+        nv = self.v.size
+        right = np.empty((nv, 2), order="F")
+        right[:, 0] = p.normal(self._loops.g[p.order])
+        right[:, 1] = self._white_rates(self.v)
+        return p.unwhiten(right).ravel(order="F")
+
+    def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
+        p = self._p
+        nv = self.v.size
+        right = np.empty((nv, 3), order="F")
+        right[:, 0] = p.normal(self._loops.g[p.order])
+        right[:, 1] = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
+        right[:, 2] = p.white_force - right[:, 1]
+        back = p.unwhiten(right)
+        rate = np.concatenate([self.v - back[:, 0] / eps, back[:, 2]])
+        return rate, back[:, 1]
+
+
+_NO_ROWS = np.zeros(0)
+
+
+class Mechanics(Manifold):
+    """A mechanism and the controller that acts on it, whatever its closures."""
+
+    carries_yhat = True
+    predicts = True
+
+    def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
+        super().__init__(mechanism)
+        self.multiplier_part = slice(self.nv, 2 * self.nv)
+        self.multiplier_size = self.nv
+        self.evaluations = 0
+        self._controller = controller
+        damping, friction = self.model.damping, self.model.friction
+        self._damping = damping.copy() if np.count_nonzero(damping) else None
+        self._friction = friction.copy() if np.count_nonzero(friction) else None
+        self._friction_speed = mechanism.friction_speed
+        self._forces = resolved_forces(mechanism)
+        self._first, self._last = -np.inf, np.inf
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Terms and workspaces share memory, which copies of them would not.
+        return type(self), (self.mechanism, self._controller)
+
+    # Made when the reference first evaluates: the compiled kernel has its own.
+    @cached_property
+    def data(self) -> pin.Data:
+        """Pinocchio's workspace."""
+        return workspace(self.model)
+
+    @property
+    def controlled(self) -> bool:
+        """Whether a controller acts."""
+        return self._controller is not None
+
+    @property
+    def calls_forces(self) -> bool:
+        """Whether force elements are functions of the user."""
+        return self._forces is not None and self._forces.calls
+
+    def called_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) of the Python functions that act: the controller, unless its
+        output is held, and those among the force elements."""
+        tau = np.zeros(self.nv) if self.held is not None else self.controlled_force(t, q, v)
+        if self._forces is not None and self._forces.calls:
+            tau = tau + self._forces.called(self.data, q, v, t)
+        return tau
+
+    @property
+    def held(self) -> HeldForce | None:
+        """The controller, if it is one whose output is held between samples."""
+        return self._controller if isinstance(self._controller, HeldForce) else None
+
+    def count(self, evaluations: int, factorisations: int) -> None:
+        """Count what the compiled kernel did for this system."""
+        self.evaluations += evaluations
+
+    def between(self, first: float, last: float) -> None:
+        """Evaluate at times within [``first``, ``last``] (s) only, the nearer of them for others:
+        on one side of a breakpoint, whatever ``evaluate`` is given."""
+        self._first, self._last = first, last
+
+    def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) of the controller, as :func:`called` returns them."""
+        if self._controller is None:
+            return np.zeros(self.nv)
+        return called(self._controller, t, q, v)
+
+    def damping_force(self, v: FloatArray) -> FloatArray:
+        """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
+        if self._damping is None:
+            return np.zeros(v.shape)
+        out: FloatArray = -self._damping * v
+        return out
+
+    def friction_force(self, v: FloatArray) -> FloatArray:
+        """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
+        if self._friction is None:
+            return np.zeros(v.shape)
+        out: FloatArray = -self._friction * np.tanh(v / self._friction_speed)
+        return out
+
+    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
+        """Controller, joint damping and joint friction (nv,); None if there is none of them."""
+        force = None if self._damping is None else self.damping_force(v)
+        if self._friction is not None:
+            rubbing = self.friction_force(v)
+            force = rubbing if force is None else force + rubbing
+        if self._controller is None:
+            return force
+        tau = self.controlled_force(t, q, v)
+        return tau if force is None else tau + force
+
+    def constants(self) -> dict[str, Any]:
+        """Everything that does not change, for the compiled kernel
+        (:mod:`srm_mbs.integration.kernel`)."""
+        fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
+        return fixed | self.constants_of_start()
+
+    def constants_of_start(self) -> dict[str, Any]:
+        """Those among :meth:`constants` that depend on the start, or that the model may change."""
+        return {
+            "unit": self._unit,
+            "gap_scale": _NO_ROWS,
+            "damping": self._damping,
+            "friction": self._friction,
+        }
+
+    def _constants(self) -> dict[str, Any]:
+        """Those that do not depend on the start."""
+        return {
+            "loops": [],
+            "joint_rows": [],
+            "eliminations": [],
+            "drives": [],
+            "rows": 0,
+            "structural_rank": 0,
+            "sigma_ref": 1.0,
+            "algebra": "auto",
+            "order": [],
+            "pivot_share": PIVOT_SHARE,
+            "pivot_window": PIVOT_WINDOW,
+            "friction_speed": float(self._friction_speed),
+            "forces": [] if self._forces is None else self._forces.constants(),
+            "coincident": COINCIDENT,
+        } | self.chart_constants()
+
+    def kinetic_energy(self, q: FloatArray, v: FloatArray) -> float:
+        """Kinetic energy (J), rotors on the joints (armature) included."""
+        energy = float(pin.computeKineticEnergy(self.model, self.data, q, v))
+        # Pinocchio's mass matrix has the armature, its energy does not.
+        return energy + 0.5 * float(self.model.armature @ (v * v))
+
+    def energy(self, state: FloatArray) -> float:
+        """Kinetic plus potential energy (J), of gravity and springs."""
+        q, v = self.split(state)
+        energy = self.kinetic_energy(q, v)
+        energy += float(pin.computePotentialEnergy(self.model, self.data, q))
+        return energy if self._forces is None else energy + self._forces.energy(self.data, q)
+
+
+_WORLD = pin.Convention.WORLD
+_sum_of_sizes = blas.dasum
+_OVERFLOW = 1e100
+"""Size of a state from which products of its rates may overflow."""
+
+
+class OpenSystem(Mechanics):
+    """A mechanism without effective closures: plain ``aba``."""
+
+    has_constraints = False
+    factorisations = 0
+
+    def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
+        super().__init__(mechanism, controller)
+        self._zero = np.zeros(self.nv)
+        self._terms = OpenTerms(self.nv)
+
+    def closure_gap(self, t: float, state: FloatArray) -> float:
+        """0: there is no closure."""
+        return 0.0
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+        """v' = aba(q, v, tau); see :class:`~srm_mbs.dynamics.system.System`."""
+        self.evaluations += 1
+        t = min(max(t, self._first), self._last)
+        q, v = state[: self.nq], state[self.nq :]
+        force = self.applied_force(t, q, v)
+        if self._forces is not None:
+            pin.forwardKinematics(self.model, self.data, q, v)
+            pin.computeJointJacobians(self.model, self.data)
+            elements = self._forces.generalised(self.data, q, v, t)
+            force = elements if force is None else force + elements
+        rate = self._terms.rate()
+        rate[: self.nv] = v
+        rate[self.nv :] = pin.aba(
+            self.model, self.data, q, v, self._zero if force is None else force
+        )
+        if not np.isfinite(rate).all():
+            raise EvaluationError("the acceleration is not finite")
+        return self._terms
+
+
+class ClosedSystem(Mechanics):
+    """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
+
+    has_constraints = True
+
+    def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
+        super().__init__(mechanism, controller)
+        self.structure = mechanism.structure
+        self._gap_scale: FloatArray = mechanism.at_start("gap_scale", self._gap_scales)
+        self._order: tuple[int, ...] = mechanism.derived("order", self._graph_order)
+        self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
+
+    def _graph_order(self) -> tuple[int, ...]:
+        """The rows in use along the graph of the loops, if there are many coordinates."""
+        if self.nv <= LARGE:  # not worth asking for
+            return ()
+        return graph_order(self.loops.pattern(), coordinate_parents(self.model))
+
+    def _resolved_loops(self) -> LoopKinematics:
+        mechanism, structure = self.mechanism, self.structure
+        scale, kept = structure.row_scale, structure.kept
+        return LoopKinematics(self.model, mechanism.loops, scale, kept, structure.eliminations)
+
+    def _gap_scales(self) -> FloatArray:
+        structure = self.structure
+        unit = constraint_units(self.mechanism, structure.units)
+        scale: FloatArray = (structure.row_scale / unit)[structure.kept]
+        return scale
+
+    @cached_property
+    def loops(self) -> LoopKinematics | DrivenKinematics:
+        """The rows of closures and drives that are in use, with memory of their own."""
+        if self._driven is not None:
+            return self._driven
+        resolved: LoopKinematics = self.mechanism.derived("loops", self._resolved_loops)
+        return resolved.anew()
+
+    @cached_property
+    def _driven(self) -> DrivenKinematics | None:
+        """Those rows, if there are drives."""
+        mechanism, structure = self.mechanism, self.structure
+        if not mechanism.drives:
+            return None
+        curves = mechanism.drive_curves
+        scale, kept = structure.row_scale, structure.kept
+        return DrivenKinematics(
+            self.model,
+            mechanism.loops,
+            mechanism.drives,
+            curves,
+            scale,
+            kept,
+            structure.eliminations,
+        )
+
+    @cached_property
+    def _mass_matrix(self) -> FloatArray:
+        M: FloatArray = self.data.M  # a view on what crba writes
+        return M
+
+    @cached_property
+    def _terms(self) -> ClosedTerms:
+        return ClosedTerms(self.projection, self.loops, self._gap_scale)
+
+    def constants(self) -> dict[str, Any]:
+        """As for open mechanisms, and the closures."""
+        own = super().constants()
+        return own if self._driven is None else own | {"drives": self._driven.moving()}
+
+    def constants_of_start(self) -> dict[str, Any]:
+        """As for open mechanisms, and the scales of the closures."""
+        return super().constants_of_start() | {"gap_scale": self._gap_scale}
+
+    def _constants(self) -> dict[str, Any]:
+        own = {
+            "rows": len(self.loops.g),
+            "structural_rank": self.structure.rank,
+            "sigma_ref": self.structure.sigma_ref,
+            "order": list(self._order),
+        }
+        return super()._constants() | self.loops.constants() | own
+
+    def count(self, evaluations: int, factorisations: int) -> None:
+        """Count what the compiled kernel did for this system."""
+        super().count(evaluations, factorisations)
+        self.projection.factorisations += factorisations
+
+    @property
+    def factorisations(self) -> int:
+        """How often the constraint algebra was factorised."""
+        return self.projection.factorisations
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+        """Factorise M and G at ``state``; see :class:`~srm_mbs.dynamics.system.System`.
+
+        crba in the WORLD convention leaves placements and the world Jacobian in ``data``,
+        nonLinearEffects the velocities and bias accelerations: the closures need no further call.
+        """
+        self.evaluations += 1
+        # First, because LAPACK may factorise what is not finite without reporting it.
+        if not _sum_of_sizes(state) < _OVERFLOW:
+            raise EvaluationError("the state is not finite, or overflows")
+        t = min(max(t, self._first), self._last)
+        model, data, nq = self.model, self.data, self.nq
+        q, v = state[:nq], state[nq:]
+        pin.crba(model, data, q, _WORLD)
+        f = -pin.nonLinearEffects(model, data, q, v)
+        force = self.applied_force(t, q, v)
+        if force is not None:
+            f += force
+        if self._forces is not None:
+            f += self._forces.generalised(data, q, v, t)
+        loops = self.loops
+        self._update(t, q)
+        projection = self.projection
+        threshold = None if zone is None else zone.threshold
+        projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
+        terms = self._terms
+        terms.v = v
+        terms.sigma = projection.sigma
+        terms.weak = projection.weak
+        terms.predicted = None
+        if projection.weak and zone is not None:
+            terms.predicted = zone.predict(t)
+            if terms.predicted is None:
+                if zone.normals is None:
+                    raise EvaluationError(
+                        "the motion stays next to a singular configuration with too little "
+                        "momentum to tell its branch"
+                        if self._driven is None
+                        else "the drives keep the motion next to a singular configuration, or "
+                        "lead to one that it cannot pass"
+                    )
+                projection.hold(zone.normals)
+        return terms
+
+    def closure_gap(self, t: float, state: FloatArray) -> float:
+        """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""
+        g, _ = self.residuals(state, t)
+        return float(np.max(np.abs(g) * self._gap_scale))
+
+    def _update(self, t: float, q: FloatArray, with_bias: bool = True) -> None:
+        """The rows at t and q, for which ``data`` has the kinematics."""
+        self.loops.update(self.data, q, with_bias)
+        if self._driven is not None:
+            self._driven.move_to(t)
+
+    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Scaled g - s (m,) and G v - s' (m,) of the kept rows at the time t (s)."""
+        q, v = self.split(state)
+        pin.crba(self.model, self.data, q, _WORLD)
+        self._update(t, q, with_bias=False)
+        rates = self.loops.G @ v
+        return self.loops.g.copy(), rates if self._driven is None else rates - self._driven.pushed
+
+
+def make_system(
+    mechanism: Mechanism, controller: Controller | None = None
+) -> OpenSystem | ClosedSystem:
+    """The cheapest system that is right for ``mechanism``."""
+    if mechanism.structure.rank == 0:
+        return OpenSystem(mechanism, controller)
+    return ClosedSystem(mechanism, controller)

@@ -1,0 +1,225 @@
+"""Units of the coordinates: what "one" means for an angle, a length and a rate.
+
+Tolerances and step rules use them, so that the same mechanism in millimetres, with other masses
+or on another time scale, takes the same steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
+from srm_mbs.dynamics.constraints.rows import world_jacobian
+from srm_mbs.dynamics.forces import resolved_forces
+from srm_mbs.errors import EvaluationError
+from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.mechanism import Mechanism
+
+ROUNDING = 1e-12
+"""Accelerations below this part of the largest are rounding of zero; and so is a scene diagonal
+below this part of the distance from the origin, or of the largest radius of gyration."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Characteristic sizes of a mechanism.
+
+    Attributes
+    ----------
+    length
+        Scene diagonal (m): bounding box of joints, centres of mass and anchors at q0; 1 where they
+        are all at one point.
+    coordinate : (nv,)
+        1 rad for angles, ``length`` for translations.
+    rate
+        Characteristic rate (1/s): sqrt(g / length); without gravity the median of the initial
+        rates over their units, as far as they are not zero; at rest that of sqrt(|a| / unit), with
+        the accelerations a that the force elements give the open tree; 1 if there are none.  A
+        median, so that a fast rotor does not loosen what is asked of the slow rest.
+    """
+
+    length: float
+    coordinate: FloatArray
+    rate: float
+
+
+def row_angles(mechanism: Mechanism) -> BoolArray:
+    """Which closure rows (rows,) are in rad; the others are in m.
+
+    Joint rows are in the unit of their first joint.
+    """
+    angles: BoolArray = mechanism.derived("row_angles", lambda: _row_angles(mechanism))
+    return angles
+
+
+def _row_angles(mechanism: Mechanism) -> BoolArray:
+    model = mechanism.model
+    out: list[bool] = []
+    for loop in mechanism.loops:
+        lengths, alignments, _ = loop.rows.blocks
+        out += [False] * lengths.stop + [True] * (alignments.stop - alignments.start)
+        for row in loop.rows.joint_rows:
+            out.append(joint_turns(model, row.joints[0]))
+    return np.array(out, dtype=bool)
+
+
+def joint_turns(model: pin.Model, name: str) -> bool:
+    """Whether the coordinate of a joint with one degree of freedom is an angle."""
+    return bool(turning_coordinates(model)[model.joints[model.getJointId(name)].idx_v])
+
+
+def turning_coordinates(model: pin.Model) -> BoolArray:
+    """Which velocity components (nv,) are in rad/s; the others are in m/s."""
+    data = workspace(model)
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    return _turning(data)
+
+
+def counted_turns(model: pin.Model) -> BoolArray:
+    """Which velocity components (nv,) belong to angles that count turns in q, while a whole turn
+    leads back to the same place: those of hinges and universal joints, not those of screws."""
+    out: BoolArray = np.zeros(model.nv, dtype=bool)
+    joints = [(i, joint) for i, joint in enumerate(model.joints) if i and joint.nq == joint.nv]
+    turning = turning_coordinates(model)
+    data = workspace(model)
+    start = pin.neutral(model)
+    pin.forwardKinematics(model, data, start)
+    before = {i: data.liMi[i].copy() for i, _ in joints}
+    for k in range(max((joint.nv for _, joint in joints), default=0)):  # one of each at a time
+        q = start.copy()
+        moved = [(i, joint.idx_v + k) for i, joint in joints if k < joint.nv]
+        q[[model.joints[i].idx_q + k for i, _ in moved]] += 2.0 * np.pi
+        pin.forwardKinematics(model, data, q)
+        for i, component in moved:
+            out[component] = turning[component] and data.liMi[i].isApprox(before[i], 1e-9)
+    return out
+
+
+def constraint_angles(mechanism: Mechanism) -> BoolArray:
+    """Which rows (rows,) are in rad, those of the drives after those of the loops."""
+    driven = [
+        drive.joint is not None and joint_turns(mechanism.model, drive.joint)
+        for drive in in_order_of_rows(mechanism.drives)
+    ]
+    return np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
+
+
+def row_dimensions(mechanism: Mechanism) -> tuple[str, ...]:
+    """Units that closure errors have, drives included: "m", "rad" or both, in this order."""
+    angles = constraint_angles(mechanism)
+    return tuple(unit for unit, own in (("m", ~angles), ("rad", angles)) if own.any())
+
+
+def _turning(data: pin.Data) -> BoolArray:
+    """Which velocity components (nv,) turn something, by the Jacobian in ``data``."""
+    out: BoolArray = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
+    return out
+
+
+def row_units(mechanism: Mechanism, units: Units) -> FloatArray:
+    """Units of the closure rows (rows,): the scene diagonal (m) for lengths, 1 rad for alignments.
+
+    A joint row is as large as its largest term, |c_i| times the unit of joint i, so that neither
+    the rounding of a large ratio nor the pitch of a screw makes it impossible to close.  Closure
+    errors over these are pure numbers, whatever the unit of length.
+    """
+    model = mechanism.model
+    out: list[float] = []
+    for loop in mechanism.loops:
+        lengths, alignments, _ = loop.rows.blocks
+        out += [units.length] * lengths.stop + [1.0] * (alignments.stop - alignments.start)
+        for row in loop.rows.joint_rows:
+            joints = (model.joints[model.getJointId(name)] for name in row.joints)
+            terms = zip(row.coefficients, joints)
+            out.append(max(abs(c) * float(units.coordinate[j.idx_v]) for c, j in terms))
+    return np.array(out)
+
+
+def constraint_units(mechanism: Mechanism, units: Units) -> FloatArray:
+    """Units of all rows (rows,), those of the drives after those of the loops."""
+    model = mechanism.model
+    driven = [
+        units.length
+        if drive.joint is None
+        else units.coordinate[model.joints[model.getJointId(drive.joint)].idx_v]
+        for drive in in_order_of_rows(mechanism.drives)
+    ]
+    return np.concatenate([row_units(mechanism, units), driven])
+
+
+def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
+    """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
+    model = mechanism.model
+    data = workspace(model)
+    pin.computeJointJacobians(model, data, q)
+    points = []
+    for joint in range(1, model.njoints):
+        points.append(data.oMi[joint].translation.copy())
+        if model.inertias[joint].mass > 0.0:
+            points.append(data.oMi[joint].act(model.inertias[joint].lever))
+    for joint, point in mechanism.derived("anchors", lambda: _anchors(mechanism)):
+        points.append(data.oMi[joint].act(point))
+    corners = np.array(points) if points else np.zeros((1, 3))
+    diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
+    known_to = ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
+    length = diagonal if diagonal > known_to else 1.0
+    coordinate = np.where(_turning(data), 1.0, length)
+    rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
+    if rate == 0.0:
+        rates = np.abs(v) / coordinate
+        if not rates.any() and mechanism.forces:
+            pulled = np.abs(_acceleration_by_forces(mechanism, q)) / coordinate
+            rates = np.sqrt(np.where(pulled > ROUNDING * pulled.max(), pulled, 0.0))
+        rates = rates[rates > 0.0]
+        rate = float(np.median(rates)) if rates.size else 1.0
+    return Units(length, coordinate, rate)
+
+
+def _gyration(model: pin.Model) -> float:
+    """The largest radius of gyration (m) of a body about its centre of mass."""
+    return max(
+        (
+            # Rounding of what was lumped or shifted may leave a point mass with a negative trace.
+            float(np.sqrt(max(np.trace(body.inertia), 0.0) / body.mass))
+            for body in model.inertias.tolist()
+            if body.mass > 0.0
+        ),
+        default=0.0,
+    )
+
+
+def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
+    """Joint, and origin (3,) in its axes, of every anchor of a closure."""
+    found = []
+    driven = [anchor for drive in mechanism.drives for anchor in (drive.a, drive.b)]
+    for anchors in (*(loop.anchors for loop in mechanism.loops), driven):
+        for anchor in anchors:
+            if anchor is None:
+                continue
+            joint, placement = anchor.resolve(mechanism.model)
+            found.append((joint, placement.translation.copy()))
+    return found
+
+
+def _acceleration_by_forces(mechanism: Mechanism, q: FloatArray) -> FloatArray:
+    """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
+    model = mechanism.model
+    forces = resolved_forces(mechanism)
+    data = workspace(model)
+    rest = np.zeros(model.nv)
+    if forces is None:
+        return rest
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    pin.nonLinearEffects(model, data, q, rest)
+    try:
+        tau = forces.generalised(data, q, rest, 0.0)
+        U = cholesky(data.M)
+    except EvaluationError:  # a run from here says why
+        return rest
+    out: FloatArray = unwhiten(U, whiten(U, tau))
+    return out

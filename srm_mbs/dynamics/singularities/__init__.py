@@ -1,0 +1,1 @@
+"""Singular configurations: their local analysis, and the branches through them."""

@@ -1,0 +1,1 @@
+"""Files that describe mechanisms, read and written: TOML, URDF, SDF, MJCF, Gepetto."""

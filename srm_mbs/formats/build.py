@@ -1,0 +1,275 @@
+"""From a description and its URDF to an assembled mechanism."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.assembly.assemble import assemble
+from srm_mbs.assembly.position import limit_springs
+from srm_mbs.dynamics.forces import friction_time
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.formats.toml.description import Description, parse_description
+from srm_mbs.formats.toml.schema import LimitSpringEntry, TorqueEntry, TorsionSpringEntry
+from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
+from srm_mbs.model.coordinates import set_position, set_rate
+from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.model.validation import check_inertia, undetermined_joint
+
+log = logging.getLogger(__name__)
+
+
+def _joints_that_must_move(description: Description) -> list[tuple[str, Sequence[str]]]:
+    """Keys of the elements that act on joints, and the names there."""
+    return [
+        *(
+            (f"force[{i}].joint", [force.joint])
+            for i, force in enumerate(description.force)
+            if isinstance(force, TorqueEntry | TorsionSpringEntry | LimitSpringEntry)
+        ),
+        *((f"loop[{i}].joints", loop.joints or []) for i, loop in enumerate(description.loop)),
+        *((f"drive[{i}].joint", [d.joint]) for i, d in enumerate(description.drive) if d.joint),
+    ]
+
+
+def _check_joint_names(description: Description, model: pin.Model, file: str) -> None:
+    """Refuse names in [initial] and lock that are no moving joints."""
+    known = tuple(model.names)[1:]
+    places: list[tuple[str, Sequence[str]]] = [
+        ("lock", description.lock),
+        ("initial.q", list(description.initial.q)),
+        ("initial.v", list(description.initial.v)),
+        ("initial.guess", list(description.initial.guess)),
+        *_joints_that_must_move(description),
+    ]
+    for where, names in places:
+        for name in names:
+            if name not in known:
+                raise InputError(
+                    f"there is no moving joint {name!r}",
+                    file=file,
+                    element=where,
+                    remedy=f"Known: {', '.join(known)}",
+                )
+    for where, names in _joints_that_must_move(description):
+        for name in names:
+            if name in description.lock:
+                raise InputError(
+                    f"joint {name!r} is locked",
+                    file=file,
+                    element=where,
+                    remedy=f"Remove the {where.partition('[')[0]}, or the joint from lock",
+                )
+    for i, name in enumerate(description.lock):
+        if name in description.lock[:i]:
+            raise InputError(
+                f"joint {name!r} is named twice", file=file, element="lock", remedy="Keep one"
+            )
+    for name in description.initial.q:
+        if name in description.initial.guess:
+            raise InputError(
+                f"joint {name!r} is held in initial.q and guessed in initial.guess",
+                file=file,
+                element="initial.guess",
+                remedy="Keep one of the two",
+            )
+
+
+@contextmanager
+def _element(where: str) -> Iterator[None]:
+    """Name the key of the description in errors that do not name one."""
+    try:
+        yield
+    except InputError as error:
+        error.element = error.element or where
+        raise
+
+
+def _check_frames(description: Description, model: pin.Model) -> None:
+    """Refuse an anchor's frame name that means two different frames, say a joint's and a link's."""
+    for where, anchor in description.anchors():
+        if anchor.frame is None:
+            continue
+        first, *others = [f for f in model.frames if f.name == anchor.frame] or [None]
+        for other in others:
+            if other.parentJoint != first.parentJoint or not other.placement.isApprox(
+                first.placement, 1e-12
+            ):
+                raise InputError(
+                    f"the name {anchor.frame!r} belongs to a joint and to another joint's link",
+                    element=f"{where}.frame",
+                    remedy="Rename one of them in the URDF, or write link = instead of frame =",
+                )
+
+
+def _without_locked(
+    description: Description, model: pin.Model, file: str
+) -> tuple[pin.Model, dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The model without the locked joints, and q, v and guess of those that remain."""
+    initial = description.initial
+    q, v, guess = dict(initial.q), dict(initial.v), dict(initial.guess)
+    if not description.lock:
+        return model, q, v, guess
+    whole = Mechanism(model)
+    frozen = np.array(whole.q0)
+    for name in description.lock:
+        for where, values in (("initial.q", q), ("initial.guess", guess)):
+            if name in values:
+                with _element(where):
+                    set_position(whole, frozen, name, values.pop(name))
+        rate = np.zeros(model.nv)
+        with _element("initial.v"):
+            set_rate(whole, rate, name, v.pop(name, np.zeros(whole.joint(name).nv)))
+        if rate.any():
+            raise InputError(
+                f"joint {name!r} is locked but has an initial rate",
+                file=file,
+                element="initial.v",
+                remedy="Remove the rate, or the joint from lock",
+            )
+    return lock_joints(model, list(description.lock), frozen), q, v, guess
+
+
+def _friction_note(mechanism: Mechanism) -> tuple[str, ...]:
+    try:
+        time = friction_time(mechanism)
+    except EvaluationError:  # in gimbal lock, which is reported elsewhere
+        return ()
+    if time == np.inf:
+        return ()
+    return (
+        "joint friction F acts as F tanh(v/v_s) with v_s = "
+        f"{mechanism.friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
+        f"{6.0 * time:.0e} s, in proportion to v_s: set it with friction_speed",
+    )
+
+
+def unassembled(
+    description: Description, source: Source, notes: Sequence[str] = (), tables: bool = True
+) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
+    """The mechanism with the guess as its q0, and the held positions and rates by joint.
+
+    Parameters
+    ----------
+    description, source
+        The parsed description, and the texts it was parsed from.
+    notes
+        Sentences of the translator that wrote them.
+    tables
+        Whether to read the drives and forces that may need tables from other files.
+
+    Raises
+    ------
+    InputError
+        Naming file, element and remedy.
+    """
+    file = source.path
+    built = build_urdf(
+        source.urdf, source.urdf_path, source.base, description.lock, description.coupled_joints()
+    )
+    built.model.gravity.linear = np.array(source.gravity)
+    _check_joint_names(description, built.model, file)
+    model, q, v, guess = _without_locked(description, built.model, file)
+    check_inertia(model, source.urdf_path)
+    _check_frames(description, model)
+    tree = Mechanism(model)
+    start = np.array(tree.q0)
+    for where, values in (("initial.guess", guess), ("initial.q", q)):
+        for name, value in values.items():
+            with _element(where):
+                set_position(tree, start, name, value)
+    for name, value in v.items():
+        with _element("initial.v"):
+            set_rate(tree, np.zeros(model.nv), name, value)
+    defaults = description.simulation
+    mechanism = Mechanism(
+        model,
+        description.closures(),
+        q0=start,
+        forces=description.force_elements(Path(file).parent if tables else None),
+        drives=description.drives(Path(file).parent) if tables else (),
+        friction_speed=description.friction_speed,
+        name=description.name or model.name,
+        source=source,
+        defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
+        notes=(*notes, *built.notes),
+    )
+    mechanism = replace(mechanism, notes=mechanism.notes + _friction_note(mechanism))
+    if description.limits == "spring":
+        mechanism = _with_limit_springs(mechanism)
+    return mechanism, q, v
+
+
+def _with_limit_springs(mechanism: Mechanism) -> Mechanism:
+    springs = limit_springs(mechanism)
+    values = ", ".join(f"{s.joint} {s.stiffness:.3g} and {s.damping:.3g}" for s in springs)
+    note = (
+        "springs act at the joint limits, stiffness (N m/rad, N/m) and damping (per second): "
+        f"{values}; give [[force]] entries of type limit_spring for others"
+        if springs
+        else "no joint has limits at which a spring could act"
+    )
+    return replace(mechanism, forces=(*mechanism.forces, *springs), notes=(*mechanism.notes, note))
+
+
+def rebuild(source: Source) -> Mechanism:
+    """The mechanism of a saved run without its drives; its q0 is the guess of the description, not
+    assembled."""
+    description = parse_description(source.description, source.path)
+    return unassembled(description, source, tables=False)[0]
+
+
+def _in_gimbal_lock(source: Source, why: str) -> InputError:
+    return InputError(
+        f"where the loops are closed the accelerations are not determined: {why}",
+        file=source.path,
+        element="initial",
+        remedy="Give another guess, or inertia to massless links whose axes may be in line there "
+        "(gimbal lock)",
+    )
+
+
+def assembled(description: Description, source: Source, notes: Sequence[str] = ()) -> Mechanism:
+    """The mechanism with its loops closed; parameters as in :func:`unassembled`.
+
+    Raises
+    ------
+    InputError, AssemblyError
+        As :func:`srm_mbs.load`.
+    """
+    mechanism, q, v = unassembled(description, source, notes)
+    try:
+        state = assemble(mechanism, q, v)
+        # What was analysed stays if nothing changed; the walk goes along the velocity, too.
+        if np.array_equal(state.q, mechanism.q0) and np.array_equal(state.v, mechanism.v0):
+            mechanism = mechanism.with_state(state.q, state.v)
+        else:  # a fresh mechanism: its structure is analysed from the assembled state
+            mechanism = replace(mechanism, q0=state.q, v0=state.v)
+        _ = mechanism.structure
+    except AssemblyError as error:
+        if description.lock:
+            error.remedy = f"{error.remedy}. Locked, so that they cannot help: " + ", ".join(
+                map(repr, description.lock)
+            )
+        raise
+    except EvaluationError as error:
+        raise _in_gimbal_lock(source, str(error)) from error
+    joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
+    if joint is not None:
+        raise _in_gimbal_lock(
+            source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"
+        )
+    log.info(
+        "%s: %d degrees of freedom, rank %d",
+        mechanism.name,
+        mechanism.degrees_of_freedom,
+        mechanism.structure.rank,
+    )
+    return mechanism

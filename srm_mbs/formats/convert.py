@@ -1,0 +1,117 @@
+"""``convert``: a file of any format as our description with its URDF beside it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import tomli_w
+
+from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.formats.build import unassembled
+from srm_mbs.formats.load import Overrides, read
+from srm_mbs.formats.xml import parse_urdf
+
+log = logging.getLogger(__name__)
+
+
+def convert(
+    path: str | Path, out: str | Path, *, cut: Sequence[str] = (), force: bool = False
+) -> tuple[Path, Path, tuple[str, ...]]:
+    """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
+
+    What is written is the translation that :func:`srm_mbs.load` makes, not the assembled state.
+
+    Parameters
+    ----------
+    path, cut
+        As for :func:`srm_mbs.load`.
+    out
+        The description to write, ``.toml``; the URDF gets the same name with ``.urdf``.
+    force
+        Whether files that exist are overwritten.
+
+    Returns
+    -------
+    description, urdf, notes
+        The paths written, and sentences about what was approximated or ignored.
+
+    Raises
+    ------
+    InputError
+        For input that cannot be read, or output that exists or cannot be written.
+    """
+    description = Path(out)
+    if description.suffix.lower() != ".toml":
+        raise InputError(
+            f"the suffix {description.suffix!r} is not .toml", file=str(out), remedy="Use .toml"
+        )
+    urdf = description.with_suffix(".urdf")
+    reading = read(path, Overrides(cut=tuple(cut)))
+    source = reading.source
+    try:
+        mechanism, _, _ = unassembled(reading.description, source, reading.notes)
+    except InputError as error:
+        raise error.located(source.path) from error.__cause__
+    inputs = {Path(name).resolve() for name in (path, source.path, source.urdf_path)}
+    for target in (description, urdf):
+        if target.resolve() in inputs:
+            raise InputError(
+                "it is an input of the conversion", file=str(target), remedy="Give another name"
+            )
+        if target.exists() and not force:
+            raise InputError(
+                "the file exists", file=str(target), remedy="Give another name, or --force"
+            )
+    entries = tomllib.loads(source.description) | {"urdf": urdf.name}
+    _move_tables(entries, Path(source.path), description)
+    tree = _with_meshes_from(source.urdf, Path(source.urdf_path), urdf)
+    try:
+        urdf.write_text(tree, encoding="utf-8")
+        description.write_text(tomli_w.dumps(entries), encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"it cannot be written: {error.strerror}",
+            file=str(error.filename or out),
+            remedy=CHECK_WRITING,
+        ) from error
+    log.info("written: %s and %s", description, urdf)
+    return description, urdf, mechanism.notes
+
+
+def _seen_from(name: str, original: Path, written: Path) -> str:
+    """The relative path ``name`` beside ``original`` as seen from beside ``written``."""
+    target = (original.parent / name).resolve()
+    return Path(os.path.relpath(target, written.parent.resolve())).as_posix()
+
+
+def _move_tables(entries: Any, original: Path, written: Path) -> None:
+    """Correct, in place, the relative paths of the tables that laws are read from."""
+    if isinstance(entries, list):
+        for entry in entries:
+            _move_tables(entry, original, written)
+    elif isinstance(entries, dict):
+        for key, value in entries.items():
+            if key == "table" and isinstance(value, str) and not Path(value).is_absolute():
+                entries[key] = _seen_from(value, original, written)
+            else:
+                _move_tables(value, original, written)
+
+
+def _with_meshes_from(text: str, original: Path, written: Path) -> str:
+    """The URDF ``text`` with the relative paths of its mesh files as seen from ``written``."""
+    root = parse_urdf(text, str(original))
+    changed = False
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if not name or urlsplit(name).scheme or Path(name).is_absolute():
+            continue
+        mesh.set("filename", _seen_from(name, original, written))
+        changed = True
+    return ET.tostring(root, encoding="unicode") + "\n" if changed else text

@@ -1,0 +1,204 @@
+"""``robot.yaml`` beside ``robot.urdf``: loops as Gepetto's example-parallel-robots describe them.
+
+Parallel lists, whose names are frames and joints of the URDF:
+
+* ``closed_loop``, pairs of frames, and ``type``: ``6d`` makes the frames coincide, ``3d`` their
+  origins;
+* ``joint_name`` and ``joint_type``: joints that are of another type than the URDF says,
+  ``SPHERICAL``, ``UJOINT_XY`` (two angles, about x, then about the turned y; likewise the other
+  pairs), ``FIXED`` (held at zero);
+* ``name_mot``: the joints with motors, which is only noted.
+"""
+
+from __future__ import annotations
+
+import re
+import reprlib  # of nested anchors and aliases: repr would write out all of them
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+from srm_mbs.errors import InputError
+from srm_mbs.formats.translation import Options, Translation
+from srm_mbs.formats.urdf import loops as urdf_loops
+from srm_mbs.formats.xml import parse_urdf
+
+KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+PAIRED = {"closed_loop": "type", "joint_name": "joint_type"}
+"""Lists of the same length."""
+CLOSURES = {"3d": "point", "6d": "frame"}
+UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])\Z")
+AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
+REPLACEABLE = ("revolute", "continuous", "prismatic", "floating", "planar")
+
+
+def recognises(_: Path, text: str) -> bool:
+    """Whether a text has one of the keys at the beginning of a line."""
+    return re.search(rf"^({'|'.join(KEYS)})\s*:", text, re.MULTILINE) is not None
+
+
+def translate(text: str, file: str, options: Options) -> Translation:
+    """The URDF beside the YAML ``file``, its joints of the right types, and the closures.
+
+    Raises
+    ------
+    InputError
+        Naming the file and key at fault.
+    """
+    lists = _read(text, file)
+    urdf_path = _urdf_beside(Path(file))
+    try:
+        urdf = urdf_path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"it cannot be read: {error}",
+            file=str(urdf_path),
+            remedy="Put a readable URDF in UTF-8 there",
+        ) from error
+    plain = urdf_loops.translate(urdf, str(urdf_path), options)
+    root = parse_urdf(plain.urdf, str(urdf_path))
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    frames = {*joints, *(link.get("name", "") for link in root.findall("link"))}
+    fixed = []
+    for name, kind in zip(lists["joint_name"], lists["joint_type"]):
+        if name not in joints:
+            raise _unknown("joint_name", "joint", name, joints, file)
+        if _retype(joints[name], name, kind, file):
+            fixed.append(name)
+    loops = []
+    for pair, kind in zip(lists["closed_loop"], lists["type"]):
+        for name in pair:
+            if name not in frames:
+                raise _unknown("closed_loop", "frame", name, frames, file)
+        a, b = ({"frame": name} for name in pair)
+        closure = CLOSURES[kind.lower()]
+        loops.append({"name": "_".join(pair), "type": closure, "a": a, "b": b})
+    entries = dict(plain.entries)
+    entries["loop"] = [*entries.get("loop", ()), *loops]
+    if fixed:
+        entries["lock"] = fixed
+    notes = list(plain.notes)
+    motors = lists["name_mot"]
+    if motors:
+        notes.append(
+            f"joints with motors (name_mot), which exert nothing here: {', '.join(motors)}"
+        )
+    missing = [name for name in motors if name not in joints]
+    if missing:
+        notes.append(f"name_mot names no joints of the URDF: {', '.join(missing)}")
+    ET.indent(root)
+    written = ET.tostring(root, encoding="unicode") + "\n"
+    return Translation(written, entries, tuple(notes), urdf_file=str(urdf_path))
+
+
+def _fault(file: str, element: str, problem: str, remedy: str) -> InputError:
+    return InputError(problem, file=file, element=element, remedy=remedy)
+
+
+def _unknown(key: str, what: str, name: str, known: Any, file: str) -> InputError:
+    return _fault(
+        file, key, f"the URDF has no {what} {name!r}", f"Known: {', '.join(sorted(known))}"
+    )
+
+
+def _read(text: str, file: str) -> dict[str, list[Any]]:
+    """The lists by key, of equal length where they belong together; empty where there is none."""
+    import yaml
+
+    try:
+        raw = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        where = " ".join(str(error).split())
+        raise _fault(file, "", f"this is not valid YAML: {where}", "Correct the file") from error
+    if not isinstance(raw, dict):
+        raise _fault(file, "", "it holds no keys", f"Give {', '.join(KEYS)}")
+    for key in raw:
+        if key not in KEYS:
+            raise _fault(file, str(key), "this key is unknown", f"Known: {', '.join(KEYS)}")
+    lists: dict[str, list[Any]] = {}
+    for key in KEYS:
+        value = raw.get(key)
+        value = [] if value is None else value
+        if not isinstance(value, list):
+            raise _fault(file, key, "a list is wanted", "Write [...]")
+        lists[key] = value
+    for key, other in PAIRED.items():
+        if len(lists[key]) != len(lists[other]):
+            raise _fault(
+                file,
+                other,
+                f"it has {len(lists[other])} entries, {key} has {len(lists[key])}",
+                "Give both the same length",
+            )
+    for pair in lists["closed_loop"]:
+        if not isinstance(pair, list) or len(pair) != 2 or not all(map(_is_name, pair)):
+            raise _fault(
+                file,
+                "closed_loop",
+                f"{reprlib.repr(pair)} is not a pair of frames",
+                'Write ["first", "second"]',
+            )
+    for key in ("type", "name_mot", "joint_name", "joint_type"):
+        for entry in lists[key]:
+            if not _is_name(entry):
+                raise _fault(file, key, f"{reprlib.repr(entry)} is not text", "Put it in quotes")
+    for kind in lists["type"]:
+        if kind.lower() not in CLOSURES:
+            raise _fault(file, "type", f"there is no type {kind!r}", "Known: 3d, 6d")
+    for name in lists["joint_name"]:
+        if lists["joint_name"].count(name) > 1:
+            raise _fault(file, "joint_name", f"{name!r} is given twice", "Keep one")
+    return lists
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
+def _urdf_beside(path: Path) -> Path:
+    """The URDF of the same name, else robot.urdf, else the only one in the folder."""
+    for candidate in (path.with_suffix(".urdf"), path.with_name("robot.urdf")):
+        if candidate.is_file():
+            return candidate
+    found = sorted(path.parent.glob("*.urdf"))
+    if len(found) != 1:
+        raise _fault(
+            str(path),
+            "",
+            f"there is no {path.with_suffix('.urdf').name!r} and no 'robot.urdf' beside it",
+            "Put the URDF there; it describes the links and joints",
+        )
+    return found[0]
+
+
+def _retype(joint: Element, name: str, kind: str, file: str) -> bool:
+    """Give ``joint`` the type that the YAML says; whether it is to be held instead."""
+    old = joint.get("type")
+    if old not in REPLACEABLE:
+        raise _fault(
+            file, "joint_type", f"the joint {name!r} is of type {old!r}: it stays", "Remove it"
+        )
+    if kind == "FIXED":
+        return True
+    universal = UNIVERSAL.match(kind)
+    if kind != "SPHERICAL" and universal is None:
+        raise _fault(
+            file,
+            "joint_type",
+            f"there is no type {kind!r}",
+            "Known: SPHERICAL, FIXED, UJOINT_XY and the other pairs of X, Y, Z",
+        )
+    for tag in ("axis", "limit"):
+        for node in joint.findall(tag):
+            joint.remove(node)
+    if universal is None:
+        joint.set("type", "spherical")
+        return False
+    first, second = universal.groups()
+    if first == second:
+        raise _fault(file, "joint_type", f"the axes of {kind!r} are in line", "Give different ones")
+    joint.set("type", "universal")
+    SubElement(joint, "axis", xyz=AXES[first])
+    SubElement(joint, "axis2", xyz=AXES[second])
+    return False

@@ -1,0 +1,1 @@
+"""Graphs of joints with loops, cut into a spanning tree and closures."""

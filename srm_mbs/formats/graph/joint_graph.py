@@ -1,0 +1,287 @@
+"""Bodies and joints of a file, as a graph, and the spanning tree that is simulated.
+
+Other formats describe joints between any two bodies.  The choice of the tree follows one rule:
+of each loop the joint with the most freedom is cut, since it adds the fewest closure rows and
+leaves the fewest joint coordinates; among those the one farthest from the root, so that the tree
+stays shallow.  A joint that carries what no closure has (friction, a screw, a coupling) is cut
+only if nothing else is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.model.anchors import WORLD
+
+Direction = tuple[float, float, float]
+
+FREEDOM = {
+    "fixed": 0,
+    "revolute": 1,
+    "prismatic": 1,
+    "screw": 1,
+    "universal": 2,
+    "spherical": 3,
+    "floating": 6,
+}
+"""Degrees of freedom of the types of joint."""
+UNLIMITED = 1e16
+"""What SDF writes for "no limit"; limits do not act."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One rigid body.
+
+    Attributes
+    ----------
+    name
+        Unique.
+    inertia
+        Mass (kg), centre of mass (m) and inertia (kg m^2) in the body's frame; None: massless.
+    visuals
+        ``<visual>`` elements of URDF, in the body's frame.
+    """
+
+    name: str
+    inertia: pin.Inertia | None = None
+    visuals: tuple[Element, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint between two bodies; its frames on the two coincide where its position is zero.
+
+    Attributes
+    ----------
+    name, type
+        ``type`` is a key of :data:`FREEDOM`.
+    parent, child
+        Names of bodies; ``world`` is the ground.
+    in_parent, in_child
+        Placement of the joint's frame in the two bodies' frames.
+    axis, second_axis
+        Unit vectors in the joint's frame; the second is that of a universal joint and turns with
+        the child.
+    pitch
+        Of a screw: metres along the axis per turn.
+    lower, upper, effort, speed
+        Limits, in SI units.
+    damping, friction
+        N m s/rad and N m, or N s/m and N.
+    stiffness, rest
+        Of a spring on the joint's coordinate: N m/rad or N/m, and the position where it is relaxed.
+    armature
+        Inertia of the motor that adds to the joint's own: kg m^2 or kg.
+    coupled
+        Whether the joint's position is used elsewhere, so that it should not be cut.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    in_parent: pin.SE3 = field(default_factory=pin.SE3.Identity)
+    in_child: pin.SE3 = field(default_factory=pin.SE3.Identity)
+    axis: Direction = (1.0, 0.0, 0.0)
+    second_axis: Direction | None = None
+    pitch: float = 0.0
+    lower: float = -UNLIMITED
+    upper: float = UNLIMITED
+    effort: float = UNLIMITED
+    speed: float = UNLIMITED
+    damping: float = 0.0
+    friction: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    armature: float = 0.0
+    coupled: bool = False
+
+    @property
+    def kept(self) -> bool:
+        """Whether a closure could not replace it."""
+        return bool(self.coupled or self.friction or self.armature or self.type == "screw")
+
+    def reversed(self) -> Joint:
+        """The same motion with parent and child exchanged.
+
+        Of one-degree joints also the coordinate is the same: the parent turns about the negative
+        axis against the child.  Of a universal joint the two angles change places.
+        """
+        first, second = _negative(self.axis), self.second_axis
+        if second is not None:
+            first, second = _negative(second), first
+        values = {key: getattr(self, key) for key in self.__dataclass_fields__}
+        values |= {
+            "parent": self.child,
+            "child": self.parent,
+            "in_parent": self.in_child,
+            "in_child": self.in_parent,
+            "axis": first,
+            "second_axis": second,
+        }
+        return Joint(**values)
+
+
+def _negative(axis: Direction) -> Direction:
+    x, y, z = (-np.array(axis) + 0.0).tolist()
+    return (x, y, z)
+
+
+@dataclass(frozen=True)
+class SpanningTree:
+    """The joints of the tree, from the root outwards, and those that are cut.
+
+    Attributes
+    ----------
+    joints
+        Each joint's parent is nearer to the root than its child.
+    reversed
+        Names of the tree's joints whose parent and child changed places.
+    cut
+        As the file has them.
+    """
+
+    joints: tuple[Joint, ...]
+    reversed: tuple[str, ...]
+    cut: tuple[Joint, ...]
+
+
+class NoTreeError(Exception):
+    """The joints that the user wants cut do not leave a tree; ``joint`` is at fault."""
+
+    def __init__(self, joint: str, problem: str, remedy: str) -> None:
+        super().__init__(problem)
+        self.joint, self.problem, self.remedy = joint, problem, remedy
+
+
+def _neighbours(joints: Sequence[Joint]) -> dict[str, list[tuple[str, Joint]]]:
+    out: dict[str, list[tuple[str, Joint]]] = {}
+    for joint in joints:
+        out.setdefault(joint.parent, []).append((joint.child, joint))
+        out.setdefault(joint.child, []).append((joint.parent, joint))
+    return out
+
+
+def distances(joints: Sequence[Joint], root: str) -> dict[str, int]:
+    """Joints between ``root`` and each body that it is connected with, nearest first."""
+    near = _neighbours(joints)
+    found, queue = {root: 0}, [root]
+    for body in queue:  # the queue grows on the way
+        for other, _ in near.get(body, ()):
+            if other not in found:
+                found[other] = found[body] + 1
+                queue.append(other)
+    return found
+
+
+def _joiner() -> Callable[[Joint], bool]:
+    """A function that joins the bodies of a joint, and says whether they were apart."""
+    leader: dict[str, str] = {}
+
+    def find(body: str) -> str:
+        while (up := leader.setdefault(body, body)) != body:
+            leader[body] = body = leader[up]
+        return body
+
+    def join(joint: Joint) -> bool:
+        one, other = find(joint.parent), find(joint.child)
+        leader[other] = one
+        return one != other
+
+    return join
+
+
+def spanning_tree(joints: Sequence[Joint], root: str, cut: Sequence[str] = ()) -> SpanningTree:
+    """A spanning tree of the joints, which connect all bodies with ``root``.
+
+    A minimal spanning tree (Kruskal's algorithm) by: what a closure cannot replace, freedom,
+    distance from the root, place in the file.
+
+    Parameters
+    ----------
+    joints
+        The graph's edges.
+    root
+        The root body.
+    cut
+        Names of the joints to cut; empty: by the rule above.
+
+    Raises
+    ------
+    NoTreeError
+        If cutting ``cut`` does not leave a tree.
+    """
+    depth = distances(joints, root)
+
+    def cost(joint: Joint) -> tuple[bool, int, int]:
+        where = depth[joint.parent] + depth[joint.child]
+        return (not joint.kept, FREEDOM[joint.type], where)
+
+    join = _joiner()
+    candidates = [joint for joint in joints if joint.name not in cut]
+    chosen = {joint.name for joint in sorted(candidates, key=cost) if join(joint)}
+    if cut:
+        _check_cut(joints, candidates, chosen, cut, root)
+    tree = [joint for joint in joints if joint.name in chosen]
+    order, turned = [], []
+    near, queue, seen = _neighbours(tree), [root], {root}
+    for body in queue:
+        for other, joint in near.get(body, ()):
+            if other in seen:
+                continue
+            seen.add(other)
+            queue.append(other)
+            if joint.parent != body:
+                joint = joint.reversed()
+                turned.append(joint.name)
+            order.append(joint)
+    return SpanningTree(
+        tuple(order), tuple(turned), tuple(j for j in joints if j.name not in chosen)
+    )
+
+
+def _check_cut(
+    joints: Sequence[Joint],
+    candidates: Sequence[Joint],
+    chosen: set[str],
+    cut: Sequence[str],
+    root: str,
+) -> None:
+    known = [joint.name for joint in joints]
+    proposal = "Left out, cut is " + repr([j.name for j in spanning_tree(joints, root).cut])
+    for name in cut:
+        if name not in known:
+            raise NoTreeError(
+                name, f"there is no joint {name!r} to cut", f"Known: {', '.join(known)}"
+            )
+    for joint in candidates:
+        if joint.name not in chosen:
+            raise NoTreeError(
+                joint.name,
+                f"cutting {', '.join(map(repr, cut))} leaves a loop through joint {joint.name!r}",
+                f"Cut one joint of each loop. {proposal}",
+            )
+    reached = distances(candidates, root)
+    for joint in joints:
+        for body in (joint.parent, joint.child):
+            if body not in reached:
+                raise NoTreeError(
+                    joint.name,
+                    f"cutting {', '.join(map(repr, cut))} separates {body!r} from {root!r}",
+                    f"Cut one joint of each loop only. {proposal}",
+                )
+
+
+def components(bodies: Mapping[str, Body], joints: Sequence[Joint]) -> Iterator[list[str]]:
+    """Bodies that joints connect, in the order of the file; that of the ground has ``world``."""
+    left = dict.fromkeys((WORLD, *bodies))
+    while left:
+        found = distances(joints, next(iter(left)))
+        yield [body for body in left if body in found]
+        left = {body: None for body in left if body not in found}

@@ -1,0 +1,458 @@
+"""From a graph of joints to a URDF tree, the closures of the joints cut, and their springs.
+
+Bodies and joints as the text of a URDF, in the dialect of ``docs/formats.md``.
+
+A joint that closes a loop: the closure that leaves the same freedom.
+
+Every format with loops names its joint types a little differently; they meet here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.formats.graph.joint_graph import (
+    Body,
+    Joint,
+    NoTreeError,
+    SpanningTree,
+    components,
+    spanning_tree,
+)
+from srm_mbs.formats.translation import Translation
+from srm_mbs.model.anchors import WORLD
+
+JOINT_FRAME = "::joint_frame"
+"""Added to a joint's name: the massless link at the joint where its child's frame is elsewhere."""
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Numbers as URDF writes them, with every digit."""
+    return " ".join(repr(float(value) + 0.0) for value in values)
+
+
+def rpy(rotation: FloatArray) -> tuple[float, float, float]:
+    """Fixed-axis roll, pitch and yaw (rad) of a rotation (3, 3), accurate at any pitch.
+
+    Near pitch = pi/2 the roll is ill-conditioned; pitch and yaw are therefore read off the
+    rotation without that roll, so that the errors cancel.
+    """
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    rest = rotation @ pin.rpy.rpyToMatrix(-roll, 0.0, 0.0)
+    return roll, math.atan2(-rest[2, 0], rest[2, 2]), math.atan2(-rest[0, 1], rest[1, 1])
+
+
+def is_identity(placement: pin.SE3) -> bool:
+    """Whether a placement moves nothing by more than rounding."""
+    return bool(placement.isIdentity(1e-13))
+
+
+def origin(parent: Element, placement: pin.SE3) -> None:
+    """Add ``<origin>`` to an element, unless it is the identity."""
+    if not is_identity(placement):
+        SubElement(
+            parent,
+            "origin",
+            xyz=numbers(placement.translation),
+            rpy=numbers(rpy(placement.rotation)),
+        )
+
+
+def anchor(link: str, placement: pin.SE3) -> dict[str, Any]:
+    """An anchor of a description."""
+    out: dict[str, Any] = {"link": link}
+    if not is_identity(placement):
+        out["xyz"] = [float(x) + 0.0 for x in placement.translation]
+        out["rpy"] = [float(x) + 0.0 for x in rpy(placement.rotation)]
+    return out
+
+
+def _inertial(link: Element, inertia: pin.Inertia) -> None:
+    node = SubElement(link, "inertial")
+    origin(node, pin.SE3(np.eye(3), inertia.lever))
+    SubElement(node, "mass", value=numbers([inertia.mass]))
+    moments = inertia.inertia
+    entries = {
+        "i" + "xyz"[i] + "xyz"[j]: numbers([moments[i, j]]) for i in range(3) for j in range(i, 3)
+    }
+    SubElement(node, "inertia", entries)
+
+
+def _joint(robot: Element, joint: Joint, child: str) -> None:
+    node = SubElement(robot, "joint", name=joint.name, type=joint.type)
+    origin(node, joint.in_parent)
+    SubElement(node, "parent", link=joint.parent)
+    SubElement(node, "child", link=child)
+    if joint.type not in ("fixed", "floating", "spherical"):
+        SubElement(node, "axis", xyz=numbers(joint.axis))
+    if joint.second_axis is not None:
+        SubElement(node, "axis2", xyz=numbers(joint.second_axis))
+    if joint.type == "screw":
+        SubElement(node, "thread_pitch", value=numbers([joint.pitch]))
+    if joint.type in ("revolute", "prismatic", "screw"):
+        limits = {"lower": joint.lower, "upper": joint.upper}
+        limits |= {"effort": joint.effort, "velocity": joint.speed}
+        SubElement(node, "limit", {key: numbers([value]) for key, value in limits.items()})
+    dynamics = {"damping": joint.damping, "friction": joint.friction, "armature": joint.armature}
+    acting = {key: numbers([value]) for key, value in dynamics.items() if value}
+    if acting:
+        SubElement(node, "dynamics", acting)
+
+
+def urdf_text(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> str:
+    """Text of a URDF.
+
+    A link keeps the frame that the file gave it.  Where the joint that carries it is elsewhere,
+    a massless link stands at the joint, and the link is fixed to that.
+
+    Parameters
+    ----------
+    name
+        Of the robot.
+    bodies
+        Every body; the ground (``world``) is added where a joint starts from it.
+    joints
+        A tree: every body but one is the child of one joint.
+    """
+    robot = Element("robot", name=name or "robot")
+    if any(joint.parent == WORLD for joint in joints):
+        SubElement(robot, "link", name=WORLD)
+    for body in bodies:
+        link = SubElement(robot, "link", name=body.name)
+        if body.inertia is not None:
+            _inertial(link, body.inertia)
+        link.extend(body.visuals)
+    for joint in joints:
+        back = joint.in_child.inverse()
+        if joint.type == "fixed":
+            merged = Joint(joint.name, "fixed", joint.parent, joint.child, joint.in_parent * back)
+            _joint(robot, merged, joint.child)
+        elif is_identity(joint.in_child):
+            _joint(robot, joint, joint.child)
+        else:
+            frame = joint.name + JOINT_FRAME
+            SubElement(robot, "link", name=frame)
+            _joint(robot, joint, frame)
+            held = Joint(frame + "::fixed", "fixed", frame, joint.child, back)
+            _joint(robot, held, joint.child)
+    indent(robot)
+    return tostring(robot, encoding="unicode") + "\n"
+
+
+CLOSURE_OF = {
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "hinge": "revolute",
+    "prismatic": "prismatic",
+    "cylindrical": "cylindrical",
+    "planar": "planar",
+    "universal": "universal",
+    "spherical": "point",
+    "ball": "point",
+    "fixed": "frame",
+}
+"""Joint types of all formats, and the closure of the same freedom."""
+WITH_AXIS = ("revolute", "prismatic", "cylindrical", "planar")
+ROTATION_SEEN = ("frame", "prismatic")
+"""Closures for which the turn of a about the axis matters."""
+PARALLEL = 1e-9
+
+
+def placement(xyz: Sequence[float], rpy: Sequence[float]) -> pin.SE3:
+    """Placement of a URDF <origin>; m and rad."""
+    return pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
+
+
+def closure(
+    kind: str,
+    name: str,
+    parent: tuple[str, pin.SE3],
+    child: tuple[str, pin.SE3],
+    axis: Sequence[float] | None = None,
+    child_axis: Sequence[float] | None = None,
+    *,
+    fault: Callable[[str, str], Exception],
+) -> dict[str, Any]:
+    """The ``[[loop]]`` of a joint of type ``kind`` between two links.
+
+    The child is a of the closure, the parent is b: the axis is given in the joint's frame on the
+    parent, as URDF and SDF do.
+
+    Parameters
+    ----------
+    kind
+        Joint type in the words of its format.
+    name
+        Of the closure.
+    parent, child
+        Link and, in its frame, the joint's frame.
+    axis, child_axis : (3,)
+        Direction in the frame on the parent and, if it is given separately, in that on the child;
+        for a universal joint the two axes of the cross.  x by default.
+    fault
+        Makes the exception of a problem and its remedy.
+
+    Raises
+    ------
+    Exception
+        What ``fault`` makes, for a type without closure, or axes that do not fit together.
+    """
+    type_ = CLOSURE_OF.get(kind)
+    if type_ is None:
+        raise fault(
+            f"there is no closure for a joint of type {kind!r}",
+            f"Known: {', '.join(CLOSURE_OF)}; or cut the loop at another joint",
+        )
+    direction = _unit((1.0, 0.0, 0.0) if axis is None else axis, fault)
+    other = direction if child_axis is None else _unit(child_axis, fault)
+    at = child[1]
+    out: dict[str, Any] = {"name": name, "type": type_}
+    if type_ == "universal":
+        if child_axis is None:
+            raise fault("a universal joint needs two axes", "Give both")
+        out |= {"axis_a": other.tolist(), "axis_b": direction.tolist()}
+    elif type_ in WITH_AXIS:
+        out["axis"] = direction.tolist()
+        if np.linalg.norm(other - direction) > PARALLEL:
+            if type_ in ROTATION_SEEN:
+                raise fault(
+                    f"the axes of a {kind} joint in its two frames differ",
+                    "Turn one of the frames so that the axis has the same components in both",
+                )
+            # About the axis itself the child is free to turn.
+            turn = pin.Quaternion.FromTwoVectors(direction, other).matrix()
+            at = at * pin.SE3(turn, np.zeros(3))
+    return out | {"a": anchor(child[0], at), "b": anchor(*parent)}
+
+
+def bushing(
+    name: str,
+    kind: str,
+    parent: tuple[str, pin.SE3],
+    child: tuple[str, pin.SE3],
+    axis: Sequence[float],
+    *,
+    stiffness: float = 0.0,
+    damping: float = 0.0,
+    rest: float = 0.0,
+) -> dict[str, Any]:
+    """The ``[[force]]`` that acts as spring and damper of a revolute or prismatic joint.
+
+    It acts in the one direction that the joint leaves free; ``parent``, ``child`` and ``axis`` are
+    those of :func:`closure`, ``rest`` is where the spring is relaxed (rad, m).
+    """
+    # x of both anchors along the axis; b moves on to where the spring is relaxed.
+    turn = pin.SE3(
+        pin.Quaternion.FromTwoVectors(np.array([1.0, 0.0, 0.0]), np.array(axis)).matrix(),
+        np.zeros(3),
+    )
+    relaxed = pin.SE3.Identity()
+    direction = 0
+    if CLOSURE_OF[kind] == "prismatic":
+        relaxed.translation = np.array([rest, 0.0, 0.0])
+    else:
+        relaxed.rotation = pin.rpy.rpyToMatrix(rest, 0.0, 0.0)
+        direction = 3
+    out: dict[str, Any] = {
+        "type": "bushing",
+        "name": name,
+        "a": anchor(child[0], child[1] * turn),
+        "b": anchor(parent[0], parent[1] * turn * relaxed),
+    }
+    for key, value in (("stiffness", stiffness), ("damping", damping)):
+        if value:
+            out[key] = [value if i == direction else 0.0 for i in range(6)]
+    return out
+
+
+def _unit(axis: Sequence[float], fault: Callable[[str, str], Exception]) -> FloatArray:
+    direction = np.array(axis, dtype=float)
+    length = float(np.linalg.norm(direction))
+    if length == 0.0:
+        raise fault("its axis is zero", "Give a direction")
+    out: FloatArray = direction / length
+    return out
+
+
+MODEL_FRAME = "__model__"
+"""Massless root link of a floating robot: the frame in which the file places its bodies."""
+
+
+class GraphTranslator:
+    """Translates bodies and joints of one file; raises :class:`InputError` at the first fault.
+
+    Parameters
+    ----------
+    file, name
+        Of the file, for messages, and of the robot.
+    bodies
+        By name, in the order of the file.
+    placements
+        Of the bodies in the world where every joint's position is zero.
+    joints
+        Between them.
+    root
+        The body that floats if nothing connects it with the ground.
+    free
+        Names for the joints by which bodies move freely beside others.
+    """
+
+    def __init__(
+        self,
+        file: str,
+        name: str,
+        bodies: Mapping[str, Body],
+        placements: Mapping[str, pin.SE3],
+        joints: Sequence[Joint],
+        root: str,
+        free: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self.file, self.name = file, name
+        self.bodies, self.placements = dict(bodies), placements
+        self.joints = list(joints)
+        self.root, self.free = root, free
+        self.notes: list[str] = []
+
+    def translate(self, cut: Sequence[str] = ()) -> Translation:
+        """The tree and the entries ``base``, ``loop`` and ``force``.
+
+        Parameters
+        ----------
+        cut
+            Names of the joints to cut; empty: chosen by :func:`spanning_tree`.
+        """
+        base, root = self._rooted()
+        try:
+            tree = spanning_tree(self.joints, root, cut)
+        except NoTreeError as error:
+            raise InputError(
+                error.problem, file=self.file, element="cut", remedy=error.remedy
+            ) from error
+        entries: dict[str, Any] = {"base": base} if base != "fixed" else {}
+        loops = [self._closure(joint) for joint in tree.cut]
+        forces = [
+            force
+            for joint in self.joints
+            for force in (self._bushing(joint) if joint in tree.cut else self._spring(joint))
+        ]
+        if loops:
+            entries["loop"] = loops
+        if forces:
+            entries["force"] = forces
+        self._tell(tree)
+        urdf = urdf_text(self.name, self.bodies.values(), tree.joints)
+        return Translation(urdf, entries, tuple(self.notes))
+
+    def _rooted(self) -> tuple[str, str]:
+        """Base and root body; bodies that hang on nothing get a floating joint to the ground."""
+        parts = [part for part in components(self.bodies, self.joints) if part != [WORLD]]
+        free = [part for part in parts if WORLD not in part]
+        if len(parts) == 1 and free:
+            root = self.root
+            if is_identity(self.placements[root]):
+                return "floating", root
+            frame = Body(MODEL_FRAME)
+            self.bodies = {MODEL_FRAME: frame, **self.bodies}
+            self.joints.insert(
+                0,
+                Joint(f"{MODEL_FRAME}::{root}", "fixed", MODEL_FRAME, root, self.placements[root]),
+            )
+            return "floating", MODEL_FRAME
+        for part in free:
+            known = next((body for body in part if body in self.free), None)
+            body = known or (self.root if self.root in part else part[0])
+            name = self.free.get(body, f"{body}::free")
+            self.joints.append(Joint(name, "floating", WORLD, body, self.placements[body]))
+            if known is None:
+                self.notes.append(
+                    f"nothing connects {body!r} with the ground: it moves freely by the joint "
+                    f"{name!r}"
+                )
+        return "fixed", WORLD
+
+    def _refuse_cut(self, joint: Joint, why: str) -> InputError:
+        return InputError(
+            f"it closes a loop and has {why}, which no closure has",
+            file=self.file,
+            element=f"joint {joint.name!r}",
+            remedy="Name another joint of the loop in cut",
+        )
+
+    def _closure(self, joint: Joint) -> dict[str, Any]:
+        """The closure for a joint that is cut."""
+        for value, why in (
+            (joint.friction, "friction"),
+            (joint.armature, "armature"),
+            (joint.type == "screw", "a thread"),
+            (joint.coupled, "a coupling to another joint"),
+        ):
+            if value:
+                raise self._refuse_cut(joint, why)
+        return closure(
+            joint.type,
+            joint.name,
+            (joint.parent, joint.in_parent),
+            (joint.child, joint.in_child),
+            joint.axis,
+            joint.second_axis,
+            fault=lambda problem, remedy: InputError(
+                problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy
+            ),
+        )
+
+    def _bushing(self, joint: Joint) -> list[dict[str, Any]]:
+        """Spring and damper of a joint that is cut, in the one direction that it leaves free."""
+        if not (joint.stiffness or joint.damping):
+            return []
+        if joint.type not in ("revolute", "prismatic"):
+            raise self._refuse_cut(joint, "damping or a spring")
+        return [
+            bushing(
+                f"{joint.name}::spring",
+                joint.type,
+                (joint.parent, joint.in_parent),
+                (joint.child, joint.in_child),
+                joint.axis,
+                stiffness=joint.stiffness,
+                damping=joint.damping,
+                rest=joint.rest,
+            )
+        ]
+
+    def _spring(self, joint: Joint) -> list[dict[str, Any]]:
+        """The spring of a joint of the tree; its damping is in the URDF."""
+        if not joint.stiffness:
+            return []
+        return [
+            {
+                "type": "torsion_spring",
+                "name": f"{joint.name}::spring",
+                "joint": joint.name,
+                "stiffness": joint.stiffness,
+                "rest_angle": joint.rest,
+            }
+        ]
+
+    def _tell(self, tree: SpanningTree) -> None:
+        if tree.cut:
+            names = ", ".join(repr(joint.name) for joint in tree.cut)
+            self.notes.append(f"the joints {names} close loops: they are cut and became closures")
+        turned = [
+            repr(joint.name)
+            for joint in tree.joints
+            if joint.name in tree.reversed and joint.type in ("universal", "spherical", "floating")
+        ]
+        if turned:
+            self.notes.append(
+                f"in the tree the joints {', '.join(turned)} start from their child: their "
+                "coordinates are those of the parent against the child"
+            )

@@ -1,0 +1,238 @@
+"""Geoms of MJCF: the inertia that they give their body, and what is drawn of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, origin
+from srm_mbs.formats.mjcf.attributes import GEOMS, MjcfValues, z_along
+
+DENSITY = 1000.0
+"""kg/m^3, MuJoCo's default."""
+SIZES = {"sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3}
+"""How many sizes each solid shape needs; radii and half lengths, m."""
+ALONG = ("capsule", "cylinder", "ellipsoid", "box")
+"""Shapes that may be given by two ends."""
+MASSLESS = ("plane", "hfield")
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A mesh of ``<asset>``: its file as the model names it, its scale (3,), how MuJoCo finds its
+    inertia; empty if it is moved first; and where the axes of the file lie in those of the mesh."""
+
+    file: str
+    scale: FloatArray
+    inertia: str
+    axes: pin.SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Geom:
+    """A shape in its body's frame; ``sizes`` (3,) as MuJoCo has them."""
+
+    kind: str
+    placement: pin.SE3
+    sizes: FloatArray
+    mass: float | None
+    density: float
+    group: int
+    where: str
+    given: Mapping[str, str]
+
+
+def read_geom(
+    values: MjcfValues, node: Element, childclass: str, around: pin.SE3, body: str
+) -> Geom:
+    """One ``<geom>``, in the frame ``around`` of its body.
+
+    Raises
+    ------
+    InputError
+        Naming the geom.
+    """
+    where = f"body {body!r}, geom {node.get('name', '')!r}"
+    given = values.resolved(node, childclass, where)
+    kind = values.choice(given, "type", GEOMS, where)
+    if "mesh" in given and "type" not in given:
+        kind = "mesh"
+    placement = values.placement(given, where)
+    sizes = np.zeros(3)
+    needed = SIZES.get(kind, 0)
+    text = given.get("size", "")
+    found = values.numbers(text, (1, 2, 3), where, "size") if text.split() else np.zeros(0)
+    if needed:
+        ends = given.get("fromto")
+        if ends is not None:
+            if kind not in ALONG:
+                raise values.fault(where, f"a {kind} takes no fromto", "Give pos and size")
+            both = values.numbers(ends, 6, where, "fromto")
+            along = both[:3] - both[3:]  # as MuJoCo turns it
+            half = 0.5 * float(np.linalg.norm(along))
+            turn = z_along(values.direction(along, where, "fromto"))
+            placement = pin.SE3(turn, 0.5 * (both[:3] + both[3:]))
+            wide = found[:1] if needed == 2 else np.repeat(found[:1], 2)
+            found = np.append(wide, half)
+        if len(found) < needed or (found[:needed] <= 0.0).any():
+            raise values.fault(where, f"a {kind} needs {needed} positive size(s)", "Give size")
+        sizes[:needed] = found[:needed]
+    mass = values.number(given, "mass", -1.0, where) if "mass" in given else None
+    if mass is not None and mass < 0.0:
+        raise values.fault(where, "its mass is negative", "Give a mass >= 0")
+    density = values.number(given, "density", DENSITY, where)
+    if density < 0.0:
+        raise values.fault(where, "its density is negative", "Give a density >= 0")
+    if values.flag(given, "shellinertia", False, where):
+        raise values.fault(where, "shellinertia is not read by this version", "Give <inertial>")
+    group = int(values.number(given, "group", 0, where))
+    return Geom(kind, around * placement, sizes, mass, density, group, where, given)
+
+
+def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], file: str) -> pin.Inertia | None:
+    """Inertia of a solid shape in its body's frame; None without mass.
+
+    Raises
+    ------
+    InputError
+        For a shape whose inertia is not computed here.
+    """
+    if geom.kind in MASSLESS or geom.mass == 0.0 or (geom.mass is None and geom.density == 0.0):
+        return None
+    if geom.kind == "mesh":
+        own = _enclosed(geom, meshes.get(geom.given.get("mesh", "")), file)
+    elif geom.kind in SIZES:
+        volume, moments = _solid(geom.kind, geom.sizes)
+        own = pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
+    else:
+        raise InputError(
+            f"the inertia of a {geom.kind} is not computed by this version",
+            file=file,
+            element=geom.where,
+            remedy="Give the body an <inertial>",
+        )
+    density = geom.density if geom.mass is None else geom.mass / own.mass
+    return geom.placement.act(pin.Inertia(density * own.mass, own.lever, density * own.inertia))
+
+
+def _enclosed(geom: Geom, mesh: Mesh | None, file: str) -> pin.Inertia:
+    """Of the solid of density 1 that the triangles of a mesh enclose: inertia="exact"."""
+    if mesh is None or mesh.inertia != "exact":
+        raise InputError(
+            "the inertia of a mesh is read from its triangles only, and only if MuJoCo does so too",
+            file=file,
+            element=geom.where,
+            remedy='Give the body an <inertial>, or the <mesh file=...> inertia="exact"',
+        )
+    import coal  # type: ignore[import-untyped]
+
+    path = Path(file).parent / mesh.file
+    try:
+        shape = coal.MeshLoader().load(str(path), mesh.scale)
+        volume = float(shape.computeVolume())
+        about = np.array(shape.computeMomentofInertiaRelatedToCOM())
+        centre = np.array(shape.computeCOM())
+    except Exception as error:  # Boost.Python raises whatever the C++ reader throws
+        raise InputError(
+            f"the mesh file {str(path)!r} cannot be read: {error}",
+            file=file,
+            element=geom.where,
+            remedy="Give the body an <inertial>",
+        ) from error
+    if not volume > 0.0:
+        raise InputError(
+            f"the triangles of {str(path)!r} enclose no volume",
+            file=file,
+            element=geom.where,
+            remedy="Give the body an <inertial>",
+        )
+    return pin.Inertia(volume, centre, about)
+
+
+def _solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:
+    """Volume (m^3), and moments per mass (3,) m^2 about the centre."""
+    a, b, c = sizes
+    match kind:
+        case "sphere":
+            return 4.0 / 3.0 * math.pi * a**3, np.full(3, 0.4 * a**2)
+        case "ellipsoid":
+            squares = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
+            return 4.0 / 3.0 * math.pi * a * b * c, squares / 5.0
+        case "box":
+            squares = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
+            return 8.0 * a * b * c, squares / 3.0
+        case "cylinder":
+            across = (3.0 * a**2 + 4.0 * b**2) / 12.0
+            return 2.0 * math.pi * a**2 * b, np.array([across, across, 0.5 * a**2])
+        case _:  # a capsule: a cylinder of half length b between two half balls
+            middle, ends = 2.0 * math.pi * a**2 * b, 4.0 / 3.0 * math.pi * a**3
+            volume = middle + ends
+            # A half ball's centre is 3 a/8 from its flat side.
+            apart = 0.4 * a**2 + b**2 + 0.75 * a * b
+            across = middle * (3.0 * a**2 + 4.0 * b**2) / 12.0 + ends * apart
+            axial = middle * 0.5 * a**2 + ends * 0.4 * a**2
+            return volume, np.array([across, across, axial]) / volume
+
+
+def visuals_of(
+    values: MjcfValues,
+    geom: Geom,
+    meshes: Mapping[str, Mesh],
+    colours: Mapping[str, str],
+) -> list[Element]:
+    """``<visual>`` elements of URDF; none, with a remark, for a shape that URDF does not have.
+
+    Parameters
+    ----------
+    values, geom
+        The file and the shape.
+    meshes
+        Those of ``<asset>``, by name.
+    colours
+        Red, green, blue, opacity of the materials of ``<asset>``, by name.
+    """
+    at, (a, b, c) = geom.placement, geom.sizes
+    shapes: list[tuple[str, dict[str, str], pin.SE3]] = []
+    match geom.kind:
+        case "sphere":
+            shapes = [("sphere", {"radius": numbers([a])}, at)]
+        case "box":
+            shapes = [("box", {"size": numbers([2 * a, 2 * b, 2 * c])}, at)]
+        case "cylinder" | "capsule":
+            tube = {"radius": numbers([a]), "length": numbers([2 * b])}
+            shapes = [("cylinder", tube, at)]
+            if geom.kind == "capsule":
+                shapes += [
+                    (
+                        "sphere",
+                        {"radius": numbers([a])},
+                        at * pin.SE3(np.eye(3), np.array([0.0, 0.0, end])),
+                    )
+                    for end in (-b, b)
+                ]
+        case "mesh" if geom.given.get("mesh") in meshes:
+            mesh = meshes[geom.given["mesh"]]
+            own = {"filename": mesh.file, "scale": numbers(mesh.scale)}
+            shapes = [("mesh", own, at * mesh.axes)]
+        case kind:
+            values.remark(f"a geom of the type {kind} is not drawn", geom.where)
+    rgba = geom.given.get("rgba") or colours.get(geom.given.get("material", ""))
+    out = []
+    for tag, attributes, place in shapes:
+        visual = Element("visual")
+        origin(visual, place)
+        SubElement(SubElement(visual, "geometry"), tag, attributes)
+        if rgba is not None:
+            colour = values.numbers(rgba, 4, geom.where, "rgba")
+            material = SubElement(visual, "material", name="")
+            SubElement(material, "color", rgba=numbers(colour))
+        out.append(visual)
+    return out

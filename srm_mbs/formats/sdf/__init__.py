@@ -1,0 +1,1 @@
+"""SDF (Simulation Description Format)."""

@@ -1,0 +1,1 @@
+"""The TOML description of a mechanism."""

@@ -1,0 +1,390 @@
+"""A whole mechanism description, and the closures, forces and drives that its entries ask for.
+
+Laws as descriptions write them: a type, and the keys of that type.
+
+From the text of a description to its tables, and the words for what is wrong in it.
+
+Unknown keys, wrong types and non-finite numbers become one :class:`InputError` that names the
+file, the key and the remedy.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import ValidationError
+
+from srm_mbs.errors import InputError
+from srm_mbs.formats.csv_table import read_table, table_columns
+from srm_mbs.formats.toml.schema import (
+    FORCE_ENTRIES,
+    AnchorEntry,
+    ForceEntry,
+    LoopEntry,
+    StrictEntry,
+    TopEntry,
+    TorqueEntry,
+    WrenchEntry,
+)
+from srm_mbs.formats.translation import MODEL_KEYS
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
+from srm_mbs.model.drives import Drive
+from srm_mbs.model.forces import FORCE_TYPES, ForceElement
+from srm_mbs.model.laws import LAW_TYPES, Law, Polynomial, Table
+
+TABLE_KEYS = ("table", "time", "value")
+"""Keys of a table in a file: its path, and the names of its columns, by default t and value."""
+LAW_KEYS = (
+    "type",
+    *dict.fromkeys(key.name for kind in LAW_TYPES.values() for key in fields(kind)),  # type: ignore[arg-type]
+    *TABLE_KEYS,
+)
+"""All keys that laws have."""
+
+
+def law_from(entry: Mapping[str, Any], folder: Path) -> Law:
+    """The law of ``entry``, keys and their values, None for those that are not given; a table is
+    read from ``folder``.
+
+    Raises
+    ------
+    InputError
+        For an unknown type, a key that the type needs or does not take, or a malformed table.
+    """
+    kind = LAW_TYPES.get(entry["type"])
+    if kind is None:
+        raise InputError(
+            f"there is no law of type {entry['type']!r}",
+            remedy=f"Known: {', '.join(LAW_TYPES)}",
+        )
+    given = {key: entry[key] for key in LAW_KEYS[1:] if entry[key] is not None}
+    keys = fields(kind)  # type: ignore[arg-type]
+    accepted = [*(key.name for key in keys), *(TABLE_KEYS if kind is Table else ())]
+    for key in given:
+        if key not in accepted:
+            raise InputError(
+                f"a law of type {kind.type!r} takes no {key}",
+                remedy=f"Known: {', '.join(accepted)}",
+            )
+    if kind is Table and "table" in given:
+        if "t" in given or "values" in given:
+            raise InputError(
+                "the values are given twice", remedy="Give table, or t and values, not both"
+            )
+        columns = (given.get("time", "t"), given.get("value", "value"))
+        t, values = read_table(folder / given["table"], columns).T.tolist()
+        return Table(t, values)
+    for key in TABLE_KEYS[1:]:
+        if key in given:
+            raise InputError(
+                f"{key} names a column, but there is no table", remedy='Give table = "file.csv"'
+            )
+    missing = [key.name for key in keys if key.default is MISSING and key.name not in given]
+    if missing:
+        raise InputError(
+            f"a law of type {kind.type!r} needs {' and '.join(missing)}",
+            remedy='Give them, or table = "file.csv"' if kind is Table else "Add it",
+        )
+    return kind(**given)
+
+
+COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+"""Columns of the table of a wrench; those that are not there are zero."""
+
+
+def with_law(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The keys of a torque or wrench with its law made, in place of ``table``, ``time`` and
+    ``value``.
+
+    Raises
+    ------
+    InputError
+        If law and table are both given, neither of them nor a torque, or a table is malformed.
+    """
+    out = {key: value for key, value in values.items() if key not in TABLE_KEYS}
+    table, time = values.get("table"), values.get("time")
+    named = [key for key in TABLE_KEYS[1:] if values.get(key) is not None]
+    if values["law"] is not None:
+        if table is not None or named:
+            raise InputError("law and table are given", remedy="Give one of them")
+        out["law"] = law_from(values["law"], folder)
+    elif table is None:
+        if named:
+            raise InputError(
+                f"{named[0]} names a column, but there is no table",
+                remedy='Give table = "file.csv"',
+            )
+        if values["type"] == "torque" and values["torque"] is None:
+            raise InputError("there is no torque", remedy="Give torque, law or table")
+    elif values["type"] == "torque":
+        columns = (time or "t", values["value"] or "value")
+        out["law"] = Table(*read_table(folder / table, columns).T.tolist())
+    else:
+        there = [name for name in COMPONENTS if name in table_columns(folder / table)]
+        if not there:
+            raise InputError(
+                f"the table has none of the columns {', '.join(COMPONENTS)}",
+                file=str(folder / table),
+                remedy="Name the columns of force and moment in the first line",
+            )
+        t, *columns_read = read_table(folder / table, (time or "t", *there)).T.tolist()
+        laws = {name: Table(t, column) for name, column in zip(there, columns_read)}
+        out["law"] = tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
+    return out
+
+
+class Description(TopEntry):
+    """A whole description: the keys of :class:`~srm_mbs.formats.toml.schema.TopEntry`."""
+
+    @property
+    def model_file(self) -> tuple[str, str]:
+        """Key and path of the file that holds the links and joints."""
+        return next((key, name) for key in MODEL_KEYS if (name := getattr(self, key)) is not None)
+
+    def closures(self) -> tuple[LoopClosure, ...]:
+        """The loop closures.
+
+        Raises
+        ------
+        InputError
+            For an unknown type, a wrong axis, or an anchor without link or frame.
+        """
+        out = []
+        for i, entry in enumerate(self.loop):
+            with _labelled("loop", i, entry.name) as label:
+                out.append(LoopClosure(**_with_anchors(label, entry)))
+        return tuple(out)
+
+    def coupled_joints(self) -> frozenset[str]:
+        """Names of the joints that take part in a coupling."""
+        return frozenset(name for entry in self.loop for name in entry.joints or ())
+
+    def anchors(self) -> Iterator[tuple[str, AnchorEntry]]:
+        """Every anchor with its key, ``loop[0].a`` for example."""
+        entries: list[tuple[str, Iterable[tuple[str, Any]]]] = [
+            *((f"loop[{i}]", entry) for i, entry in enumerate(self.loop)),
+            *((f"force[{i}]", entry) for i, entry in enumerate(self.force)),
+            *((f"drive[{i}]", entry) for i, entry in enumerate(self.drive)),
+        ]
+        for where, entry in entries:
+            for key, value in entry:
+                if isinstance(value, AnchorEntry):
+                    yield f"{where}.{key}", value
+
+    def force_elements(self, folder: Path | None) -> tuple[ForceElement, ...]:
+        """The force elements; tables are read from ``folder``, None leaves out those that have one.
+
+        Raises
+        ------
+        InputError
+            For a value that an element cannot take, an anchor without link or frame, or a table
+            that cannot be read.
+        """
+        out = []
+        for i, entry in enumerate(self.force):
+            with _labelled("force", i, entry.name) as label:
+                values = _with_anchors(label, entry)
+                law = values.get("law")
+                if law is not None:
+                    values["law"] = {key: getattr(law, key) for key in LAW_KEYS}
+                if folder is None and (values.get("law") or values.get("table")):
+                    continue
+                if isinstance(entry, TorqueEntry | WrenchEntry):
+                    values = with_law(values, folder or Path())
+                out.append(FORCE_TYPES[values.pop("type")](**values))
+        return tuple(out)
+
+    def drives(self, folder: Path) -> tuple[Drive, ...]:
+        """The drives; tables are read from ``folder``, unless their paths are absolute.
+
+        Raises
+        ------
+        InputError
+            For a law or value that a drive cannot take, or a table that cannot be read.
+        """
+        out = []
+        for i, entry in enumerate(self.drive):
+            with _labelled("drive", i, entry.name or entry.joint or "") as label:
+                anchors = {
+                    side: None if given is None else _anchor(label, side, given)
+                    for side, given in (("a", entry.a), ("b", entry.b))
+                }
+                out.append(
+                    Drive(
+                        law_from({key: getattr(entry, key) for key in LAW_KEYS}, folder),
+                        joint=entry.joint,
+                        axis=entry.axis,
+                        distance=entry.distance,
+                        absolute=entry.absolute,
+                        name=entry.name,
+                        **anchors,
+                    )
+                )
+        return tuple(out)
+
+
+@contextmanager
+def _labelled(kind: str, index: int, name: str) -> Iterator[str]:
+    """Call an element by its name or number in errors that do not name it yet."""
+    label = f"{kind} {name!r}" if name else f"{kind}[{index}]"
+    try:
+        yield label
+    except InputError as error:
+        if not (error.element or "").startswith(kind):
+            error.element = f"{label}: {error.element}" if error.element else label
+        raise
+
+
+def _anchor(label: str, side: str, given: AnchorEntry) -> Anchor:
+    try:
+        return Anchor(given.link, given.frame, _triple(given.xyz), _triple(given.rpy))
+    except InputError as error:
+        what = "" if error.element == "anchor" else f": {error.element}"
+        error.element = f"{label}, anchor {side}{what}"
+        raise
+
+
+def _with_anchors(label: str, entry: LoopEntry | ForceEntry) -> dict[str, Any]:
+    """The keys of an element, its anchors made."""
+    return {
+        key: _anchor(label, key, value) if isinstance(value, AnchorEntry) else value
+        for key, value in entry
+    }
+
+
+def _triple(values: list[float]) -> tuple[float, float, float]:
+    x, y, z = values
+    return (x, y, z)
+
+
+PROBLEMS: dict[str, tuple[str | None, str]] = {
+    "string_type": ("a text is wanted", "Put it in quotes"),
+    "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
+    "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "model_attributes_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "number": (None, "Give a finite number"),
+    "greater_than": (None, "Give a positive number"),
+    "too_short": (None, "Give the right number of values"),
+    "too_long": (None, "Give the right number of values"),
+    "literal_error": (None, "Choose one of those"),
+    "bool_type": ("true or false is wanted", "Write true or false without quotes"),
+}
+"""By pydantic's type of error: the problem (None: pydantic's own words) and the remedy."""
+
+
+def parse_description(text: str, file: str) -> Description:
+    """Parse and check the TOML ``text`` of ``file``.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key or line, and the remedy.
+    """
+    try:
+        raw = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
+        raise InputError(
+            f"this is not valid TOML: {error}",
+            file=file,
+            remedy="Correct it there; text stands in quotes, lists in [ ]",
+        ) from error
+    try:
+        description = Description.model_validate(raw)
+    except ValidationError as error:
+        key, problem, remedy = _explain(error)
+        if key == "format":
+            remedy = "Write: format = 1"
+        raise InputError(problem, file=file, element=key, remedy=remedy) from error
+    given = [key for key in MODEL_KEYS if getattr(description, key) is not None]
+    if len(given) != 1:
+        raise InputError(
+            f"{' and '.join(given)} are both given" if given else "this key is missing",
+            file=file,
+            element=given[0] if given else "urdf",
+            remedy=f"Give one of {', '.join(MODEL_KEYS)}",
+        )
+    for i, entry in enumerate(description.loop):
+        if entry.type not in CLOSURE_TYPES:
+            raise InputError(
+                f"there is no closure type {entry.type!r}",
+                file=file,
+                element=f"loop[{i}].type",
+                remedy=f"Known: {', '.join(CLOSURE_TYPES)}",
+            )
+        for side in "ab":
+            if side in CLOSURE_TYPES[entry.type].needs and getattr(entry, side) is None:
+                raise InputError(
+                    "this key is missing", file=file, element=f"loop[{i}].{side}", remedy="Add it"
+                )
+    return description
+
+
+def _location(error: Any) -> tuple[int | str, ...]:
+    """Where an error is, without the type of force that pydantic puts behind its number."""
+    location: tuple[int | str, ...] = error["loc"]
+    if location[:1] == ("force",) and len(location) > 2 and location[2] in FORCE_TYPES:
+        return (*location[:2], *location[3:])
+    return location
+
+
+def _key_path(location: tuple[int | str, ...]) -> str:
+    path = ""
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        else:
+            path += f".{part}" if path else part
+    return path
+
+
+def _known_keys(location: tuple[int | str, ...]) -> str:
+    """Keys of the table that holds ``location``, a location of pydantic's."""
+    table: type[StrictEntry] = Description
+    if location[0] == "force" and len(location) > 2:
+        table = FORCE_ENTRIES[str(location[2])]
+    for part in location[:-1]:
+        if isinstance(part, int) or part not in table.model_fields:
+            continue
+        annotation = table.model_fields[part].annotation
+        for choice in (annotation, *get_args(annotation)):
+            if isinstance(choice, type) and issubclass(choice, StrictEntry):
+                table = choice
+    return ", ".join(table.model_fields)
+
+
+def _explain(error: ValidationError) -> tuple[str, str, str]:
+    """Key, problem and remedy of the first thing that is wrong."""
+    first = error.errors()[0]
+    location = _location(first)
+    key = _key_path(location)
+    if first["type"] == "extra_forbidden":
+        name = str(location[-1])
+        return key, f"unknown key {name!r}", f"Known: {_known_keys(first['loc'])}"
+    if first["type"] == "union_tag_not_found":
+        return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"
+    if first["type"] == "union_tag_invalid":
+        tag = first["input"]["type"]
+        known = f"Known: {', '.join(FORCE_TYPES)}"
+        return f"{key}.type", f"there is no force type {_shown(tag)}", known
+    if first["type"] == "missing":
+        return key, "this key is missing", "Add it"
+    message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+    problem, remedy = PROBLEMS.get(first["type"], (None, "Correct the value"))
+    if location[0] == "initial" and first["type"] == "number":
+        remedy = "Give a finite number, or a list of them for a joint with several coordinates"
+    return key, f"{problem or message}, not {_shown(first.get('input'))}", remedy
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no integer of more than 4300 digits
+        return "this one"
+    return text if len(text) < 60 else text[:57] + "..."

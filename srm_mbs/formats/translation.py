@@ -1,0 +1,109 @@
+"""What every reader of another format makes: a URDF tree and the entries of our description.
+
+The readers translate; from there on one path leads to the mechanism, whatever the file was, and
+``srm-mbs convert`` writes just this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user wants of a translation.
+
+    Attributes
+    ----------
+    cut
+        Names of the joints at which loops of a graph of joints are to be cut.
+    own
+        The description that names the file, as ``tomllib`` gives it; empty if none does.
+    """
+
+    cut: tuple[str, ...] = ()
+    own: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Translation:
+    """A file of another format in ours.
+
+    Attributes
+    ----------
+    urdf
+        Text of a URDF without loops, in the dialect of ``docs/formats.md``.
+    entries
+        Keys and values of a description (:mod:`srm_mbs.formats.toml.description`) as ``tomllib``
+        would give them: ``loop``, ``force``, ``initial``, ``base``, ``gravity``, ...; without
+        ``format`` and ``urdf``.
+    notes
+        Sentences about what was approximated or ignored, and why.
+    urdf_file
+        The file that the URDF came from, if it is another one than that translated.
+    """
+
+    urdf: str
+    entries: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    urdf_file: str = ""
+
+
+LISTS = ("lock", "loop", "force", "drive")
+"""Keys of which a description and the file that it names both give some: all of them count."""
+TABLES = ("simulation",)
+"""Tables that are merged key by key."""
+MODEL_KEYS = ("urdf", "sdf", "mjcf")
+"""Keys of a description that name a file of another format."""
+
+
+def merged(own: Mapping[str, Any], entries: Mapping[str, Any], urdf: str) -> dict[str, Any]:
+    """The description ``own`` (as ``tomllib`` gives it) with the entries of the file it names.
+
+    Loops, forces and drives of both count; of everything else the description's own counts.
+
+    Parameters
+    ----------
+    own, entries
+        The description, and :attr:`Translation.entries`.
+    urdf
+        File name of the translated URDF, written into the description.
+    """
+    dropped = (*MODEL_KEYS, "format", "cut")
+    out: dict[str, Any] = {"format": 1}
+    if "name" in own or "name" in entries:
+        out["name"] = own.get("name") or entries.get("name", "")
+    out["urdf"] = urdf
+    for key in dict.fromkeys((*own, *entries)):
+        if key in dropped or key in out:
+            continue
+        if key in LISTS:
+            theirs = entries.get(key, ())
+            if key == "lock":
+                theirs = [name for name in theirs if name not in own.get(key, ())]
+            out[key] = [*own.get(key, ()), *theirs]
+        elif key in TABLES:
+            out[key] = {**entries.get(key, {}), **own.get(key, {})}
+        elif key == "initial":
+            out[key] = _merged_initial(own.get(key, {}), entries.get(key, {}))
+        else:
+            out[key] = own[key] if key in own else entries[key]
+    return out
+
+
+def _merged_initial(own: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Joint by joint; a position that the description gives replaces a held or guessed one."""
+    placed = {*own.get("q", ()), *own.get("guess", ())}
+    out: dict[str, Any] = {}
+    for part in ("q", "v", "guess"):
+        theirs = {
+            joint: value
+            for joint, value in entries.get(part, {}).items()
+            if part == "v" or joint not in placed
+        }
+        values = {**theirs, **own.get(part, {})}
+        if values:
+            out[part] = values
+    return out

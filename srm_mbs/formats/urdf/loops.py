@@ -1,0 +1,268 @@
+"""Loops inside a URDF: taken out of it and written as closures of a description.
+
+* the loop elements of other tools (:mod:`srm_mbs.formats.urdf.loop_elements`,
+  :mod:`srm_mbs.formats.urdf.loop_elements`);
+* a child link with two parents: the second joint becomes a closure of its freedom, closed at the
+  joint's zero;
+* ``<mimic>``: a coupling q = multiplier q_other + offset;
+* pairs of frames of onshape-to-robot (:mod:`srm_mbs.formats.urdf.loops`).
+
+A URDF without any of them is left as it is.
+
+Loops of onshape-to-robot: pairs of frames ``closing_<name>_1`` and ``closing_<name>_2``.
+
+The exporter writes a mate whose name begins with ``closing_`` as two frames, which in its URDFs are
+links on fixed joints.  A revolute mate gets two more frames, 0.1 m along its axis:
+``closing_<name>_1_z`` and ``closing_<name>_2_z``.  Of the other mates (ball, fastened, slider) the
+URDF does not say the type: the origins are joined, with a note.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import pinocchio as pin
+
+from srm_mbs.formats.translation import Options, Translation
+from srm_mbs.formats.urdf import loop_elements
+from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
+from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
+from srm_mbs.formats.xml import parse_urdf
+
+CLOSING = re.compile(r"(closing_.+)_1\Z")
+
+
+def _named_by(own: Mapping[str, Any]) -> set[str]:
+    """Links and frames at which the description itself has closures."""
+    found = set()
+    for loop in own.get("loop", ()):
+        for side in "ab":
+            end = loop.get(side, {})
+            if isinstance(end, Mapping):
+                found |= {str(end.get("link")), str(end.get("frame"))}
+    return found
+
+
+def closing_frames(
+    links: Iterable[str], own: Mapping[str, Any]
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Closures of the pairs among ``links``, and notes.
+
+    Pairs at which the description ``own`` has a closure are left to it.
+    """
+    names = list(links)
+    known, described = set(names), _named_by(own)
+    loops: list[dict[str, Any]] = []
+    notes: list[str] = []
+    for link in names:
+        match = CLOSING.match(link)
+        if match is None:
+            continue
+        name, other = match[1], f"{match[1]}_2"
+        if other not in known:
+            notes.append(f"the link {link!r} has no partner {other!r}: no loop is closed there")
+            continue
+        if {link, other} & described:
+            notes.append(f"{name!r} is closed as the description says")
+            continue
+        loop = {"name": name, "type": "point", "a": {"link": other}, "b": {"link": link}}
+        if {f"{link}_z", f"{other}_z"} <= known:
+            loop |= {"type": "revolute", "axis": [0.0, 0.0, 1.0]}
+        else:
+            notes.append(
+                f"{name!r} joins the origins of {link!r} and {other!r} (closure point): the file "
+                "does not say the type of this mate; a [[loop]] between the two replaces it"
+            )
+        loops.append(loop)
+    return loops, notes
+
+
+def translate(text: str, file: str, options: Options) -> Translation:
+    """The URDF ``text`` without its loops, and these as entries of a description.
+
+    Raises
+    ------
+    InputError
+        Naming the element that cannot be read.
+    """
+    root = parse_urdf(text, file)
+    elements = LoopElements(file, Graph(root))
+    notes: list[str] = []
+    found = _cut_second_parents(root, elements, options, notes)
+    elements.graph = graph = Graph(root)
+    found |= elements.read(root)
+    found |= loop_elements.read(root, elements)
+    found |= _mimics(elements, options, notes)
+    loops, remarks = closing_frames(graph.links, options.own)
+    elements.loops.extend(loops)
+    notes += remarks
+    entries: dict[str, Any] = {}
+    if elements.loops:
+        entries["loop"] = _named(elements.loops, options.own.get("loop", ()))
+    if elements.forces:
+        entries["force"] = _named(elements.forces, options.own.get("force", ()))
+    if found:
+        # Otherwise the check of the tree counts the same again.
+        notes += elements.ignored_notes()
+        ET.indent(root)
+        text = ET.tostring(root, encoding="unicode") + "\n"
+    return Translation(text, entries, tuple(notes))
+
+
+def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
+    """The entries, with names made for those without: from the type and the links."""
+    taken = {str(entry.get("name")) for entry in (*entries, *own)}
+    out = []
+    for entry in entries:
+        name = entry.get("name", "")
+        if not name:
+            ends = entry.get("joints") or [entry[side].get("link") for side in "ab"]
+            name = stem = "_".join([entry["type"], *ends])
+            count = 1
+            while name in taken:
+                count += 1
+                name = f"{stem}_{count}"
+            taken.add(name)
+        out.append({**entry, "name": name})
+    return out
+
+
+# -- children of two parents -----------------------------------------------------------------
+
+
+def _cut_second_parents(
+    root: Element, reader: LoopElements, options: Options, notes: list[str]
+) -> bool:
+    """Take the joints out that close loops, their closures into ``reader``; whether there were
+    any."""
+    by_child: dict[str, list[Element]] = {}
+    for joint in reader.named(root, "joint").values():
+        child = link_of(joint, "child")
+        if child and link_of(joint, "parent"):
+            by_child.setdefault(child, []).append(joint)
+    for name in options.cut:
+        if name not in reader.graph.joints:
+            raise reader.fault("cut", f"there is no joint {name!r}", "Name joints of the file")
+    cut = []
+    for child, joints in by_child.items():
+        wanted = [joint for joint in joints if joint.get("name") in options.cut]
+        kept = next((joint for joint in joints if joint not in wanted), None)
+        if kept is None:
+            raise reader.fault(
+                f"joint {wanted[0].get('name', '')!r}",
+                f"it cannot be cut: no other joint holds the link {child!r} in the tree",
+                "Cut another joint of the loop",
+            )
+        for joint in joints:
+            if joint is not kept:
+                _close(joint, reader)
+                root.remove(joint)
+                cut.append(joint.get("name", ""))
+    if cut:
+        names = ", ".join(map(repr, cut))
+        notes.append(f"the joints {names} close loops: they are cut and became closures")
+    return bool(cut)
+
+
+def _close(joint: Element, reader: LoopElements) -> None:
+    """The closure of ``joint``: its frame on the child is the child's own, as it is at q = 0."""
+    name = joint.get("name", "")
+    where = f"joint {name!r}, which closes a loop"
+    kind = reader.kind(joint, where)
+    if joint.find("mimic") is not None:
+        raise reader.fault(where, "it has a <mimic>", "Cut the loop at another joint")
+    reader.attributes(joint, where)
+    reader.children(joint, where)
+    limit = joint.find("limit")
+    if limit is not None:
+        for key in limit.attrib:
+            reader.numbers(limit, key, 1, where)
+    damping, friction, armature = (
+        reader.numbers(dynamics, key, 1, where)[0]
+        if (dynamics := joint.find("dynamics")) is not None and dynamics.get(key) is not None
+        else 0.0
+        for key in ("damping", "friction", "armature")
+    )
+    for value, what in ((friction, "friction"), (armature, "armature")):
+        if value:
+            raise reader.fault(
+                where,
+                f"its {what} ({value:g}) would not act: a closure has none",
+                f'Cut the loop at another joint (cut = ["..."]), or set the {what} to 0',
+            )
+    if kind == "floating":  # it restrains nothing
+        return
+    parent, child = (
+        (reader.link(Element(side, link=link_of(joint, side)), "link", where), frame)
+        for side, frame in (
+            ("parent", reader.origin_of(joint.find("origin"), where)),
+            ("child", pin.SE3.Identity()),
+        )
+    )
+    axes = [
+        None if (node := joint.find(tag)) is None else reader.numbers(node, "xyz", 3, where)
+        for tag in ("axis", "axis2")
+    ]
+    reader.joint(kind, name, parent, child, axes, damping=damping, where=where)
+
+
+# -- mimic -----------------------------------------------------------------------------------
+
+
+def _mimics(elements: LoopElements, options: Options, notes: list[str]) -> bool:
+    """Read and remove every <mimic>; whether there was one."""
+    found = False
+    locked = options.own.get("lock", ())
+    joints = elements.graph.joints
+    for name, joint in joints.items():
+        mimic = joint.find("mimic")
+        if mimic is None:
+            continue
+        where = f"joint {name!r}, <mimic>"
+        elements.only(mimic, where, ("joint", "multiplier", "offset"))
+        elements.leaf(mimic, where)
+        if len(joint.findall("mimic")) > 1:
+            raise elements.fault(where, "it is given twice", "Keep one")
+        joint.remove(mimic)
+        found = True
+        if joint.get("type") == "fixed" or name in locked:
+            notes.append(f"joint {name!r} does not move: its <mimic> is ignored")
+            continue
+        leader = mimic.get("joint", "")
+        multiplier, offset = (
+            elements.numbers(mimic, key, 1, where)[0] if mimic.get(key) is not None else default
+            for key, default in (("multiplier", 1.0), ("offset", 0.0))
+        )
+        problem = _mimic_problem(name, leader, joints, locked)
+        if problem:
+            raise elements.fault(where, *problem)
+        followers, leaders = [name], [leader]
+        if multiplier == 0.0:
+            leaders = []
+        entry = coupling(f"mimic_{name}", followers, leaders, multiplier, offset)
+        elements.loops.append(entry)
+    return found
+
+
+def _mimic_problem(
+    name: str, leader: str, joints: dict[str, Element], locked: Any
+) -> tuple[str, str] | None:
+    """Problem and remedy of a <mimic> that cannot be a coupling."""
+    if leader not in joints:
+        return f"there is no joint {leader!r}", f"Known: {', '.join(joints)}"
+    if leader == name:
+        return "the joint mimics itself", "Name another joint"
+    for joint in (name, leader):
+        kind = joints[joint].get("type")
+        if kind not in ONE_DEGREE:
+            return (
+                f"the joint {joint!r} is of type {kind!r}",
+                "Name joints with one degree of freedom",
+            )
+    if leader in locked:
+        return f"the joint {leader!r} is locked", f"Lock {name!r} too, where it belongs"
+    return None

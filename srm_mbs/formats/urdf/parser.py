@@ -1,0 +1,161 @@
+"""URDF to Pinocchio: the checked tree on its base, and joints that are locked.
+
+Pinocchio gets a copy of the file that holds nothing but what
+:class:`~srm_mbs.formats.urdf.validation.UrdfChecker` has checked; what is dropped knowingly is
+listed in the notes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs.errors import InputError
+from srm_mbs.formats.urdf.joint_types import take_extended, with_joints
+from srm_mbs.formats.urdf.validation import UrdfChecker
+from srm_mbs.formats.xml import parse_urdf
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class UrdfModel:
+    """A checked URDF and its tree.
+
+    Attributes
+    ----------
+    model
+        Pinocchio's model, with joint damping from the file.
+    notes
+        Sentences about what the file holds and this version does not use.
+    """
+
+    model: pin.Model
+    notes: tuple[str, ...]
+
+
+ROOT_JOINTS: dict[str, Callable[[], Any] | None] = {
+    "fixed": None,
+    "floating": pin.JointModelFreeFlyer,
+    "planar": pin.JointModelPlanar,
+}
+
+
+def build_urdf(
+    text: str,
+    file: str,
+    base: str,
+    locked: Sequence[str] = (),
+    counting_turns: Collection[str] = (),
+) -> UrdfModel:
+    """Check ``text`` and build its tree on a fixed, floating or planar base.
+
+    Inertias are checked by :func:`~srm_mbs.model.validation.check_inertia`, after locking.
+
+    Parameters
+    ----------
+    text, file
+        The URDF and its name for messages.
+    base
+        ``fixed``, ``floating`` (root joint ``root_joint``, a free flyer) or ``planar`` (motion in
+        the x-y plane of the world).
+    locked
+        Joints that will be locked: their damping does not matter.
+    counting_turns
+        Joints whose angle must count turns: ``continuous`` ones among them are built as revolute
+        joints without limits, because Pinocchio stores the others as (cos, sin).
+
+    Raises
+    ------
+    InputError
+        Naming the file, the element and the remedy.
+    """
+    checker = UrdfChecker(file)
+    root = parse_urdf(text, file)
+    checker.check(root, base, locked)
+    unlimited = _without_limits(root, set(counting_turns) - set(locked))
+    armature = _armature(root)
+    extended = take_extended(root)
+    text = tostring(root, encoding="unicode")
+    root_joint = ROOT_JOINTS[base]
+    try:
+        if root_joint is None:
+            model = pin.buildModelFromXML(text)
+        else:
+            model = pin.buildModelFromXML(text, root_joint())
+    except Exception as error:  # Boost.Python raises whatever Pinocchio throws
+        raise InputError(
+            f"Pinocchio cannot read it: {error}",
+            file=file,
+            remedy="Correct what it complains about",
+        ) from error
+    for name, bare in unlimited.items():
+        joint = model.joints[model.getJointId(name)]
+        model.lowerPositionLimit[joint.idx_q] = -np.inf
+        model.upperPositionLimit[joint.idx_q] = np.inf
+        if bare:
+            model.effortLimit[joint.idx_v] = model.velocityLimit[joint.idx_v] = np.inf
+    for note in checker.notes:
+        log.info("%s: %s", file, note)
+    model = with_joints(model, extended)
+    for name, value in armature.items():
+        joint = model.joints[model.getJointId(name)]
+        model.armature[joint.idx_v : joint.idx_v + joint.nv] = value
+    return UrdfModel(model, tuple(checker.notes))
+
+
+def _armature(root: Element) -> dict[str, float]:
+    """Inertias of motors by joint: an attribute of <dynamics> that URDF does not have."""
+    found = {}
+    for joint in root.findall("joint"):
+        dynamics = joint.find("dynamics")
+        if dynamics is None or "armature" not in dynamics.attrib:
+            continue
+        value = float(dynamics.attrib.pop("armature"))
+        if joint.get("type") != "fixed":
+            found[joint.get("name", "")] = value
+        if not dynamics.attrib:  # which urdfdom does not read
+            joint.remove(dynamics)
+    return found
+
+
+def _without_limits(root: Element, names: Collection[str]) -> dict[str, bool]:
+    """Make revolute joints of the continuous ones among ``names``.
+
+    Returns those that were changed, and whether they had no <limit> of effort and velocity.
+    """
+    changed = {}
+    for joint in root.findall("joint"):
+        name = joint.get("name", "")
+        if name not in names or joint.get("type") != "continuous":
+            continue
+        joint.set("type", "revolute")
+        limit = joint.find("limit")
+        changed[name] = limit is None
+        if limit is None:
+            limit = SubElement(joint, "limit", effort="0", velocity="0")
+        limit.attrib |= {"lower": "0", "upper": "0"}
+    return changed
+
+
+def lock_joints(model: pin.Model, names: list[str], q: Any) -> pin.Model:
+    """``model`` without the joints ``names``, frozen at the configuration ``q`` (nq,).
+
+    Pinocchio finds joints by frame name there, and URDF models give links and joints the same
+    names; link frames are renamed while it works.
+    """
+    working = model.copy()
+    mark = "\0link"
+    for frame in working.frames:
+        if frame.type == pin.FrameType.BODY:
+            frame.name += mark
+    reduced = pin.buildReducedModel(working, [working.getJointId(name) for name in names], q)
+    for frame in reduced.frames:
+        frame.name = frame.name.removesuffix(mark)
+    return reduced

@@ -1,0 +1,537 @@
+"""What a URDF says, checked before Pinocchio reads it.
+
+Pinocchio's parser drops what it does not know without a word: unknown elements, a second joint
+with the same child, a whole <inertial> whose numbers are separated by a newline.
+Everything that would change the mechanism is therefore checked on the XML, and what is left of it
+holds nothing but what was checked, with the numbers written afresh.
+
+Elements and attributes of URDF: what is read, what is ignored knowingly, what is refused.
+
+Elements, attributes and numbers of a URDF: the unknown is refused, the ignored is counted.
+
+The joints of a URDF, one by one: type, axes, limits, damping and friction.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+from collections.abc import Sequence
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.formats.toml.schema import LARGEST
+from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
+from srm_mbs.formats.xml import NUMBER
+from srm_mbs.model.anchors import WORLD
+
+LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
+IGNORED = {
+    "robot": ("material", "transmission", "gazebo", "sensor", "ros2_control", "verbose"),
+    "link": (
+        "visual",
+        "collision",
+        "contact",
+        "self_filter",
+        "sensor",
+        "self_collision_checking",
+        "collision_checking",
+        "surface",
+        "kinematic",
+        "gravity",
+    ),
+    "joint": ("safety_controller", "calibration", "joint_properties"),
+}
+READ = {
+    "robot": ("link", "joint"),
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+    "joint": (
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "axis2",
+        "thread_pitch",
+        "limit",
+        "dynamics",
+    ),
+}
+ATTRIBUTES = {
+    "link": ("name", "type"),
+    "joint": ("name", "type", "dont_collapse"),
+    "origin": ("xyz", "rpy"),
+    "mass": ("value",),
+    "inertia": ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
+    "parent": ("link",),
+    "child": ("link",),
+    "axis": ("xyz",),
+    "axis2": ("xyz",),
+    "thread_pitch": ("value",),
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction", "armature"),
+}
+INFORMATIVE = {
+    "joint": ("independent",),
+    "limit": ("command_effort", "current", "gear_velocity"),
+    "dynamics": ("D", "K", "mu_coulomb", "mu_viscous"),
+}
+"""Attributes of other tools found in published files: ignored, with a note."""
+DRAWN_ONLY = ("material", "visual", "collision")
+"""Elements whose loss needs no note: they do not act."""
+
+
+class ElementChecker:
+    """What every check of elements and attributes needs; faults are :class:`InputError`."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.notes: list[str] = []
+        self.ignored: dict[str, int] = {}
+
+    def fault(self, element: str, problem: str, remedy: str) -> InputError:
+        return InputError(problem, file=self.file, element=element, remedy=remedy)
+
+    def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
+        """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
+        text = node.get(key)
+        parts = (text or "").split()
+        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
+        # Limits do not act, and exporters write the largest double there.
+        largest = sys.float_info.max if node.tag == "limit" else LARGEST
+        if len(values) != count or not all(abs(value) <= largest for value in values):
+            tag = node.tag.rsplit("}", 1)[-1]
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
+            raise self.fault(
+                where,
+                f"<{tag}> has no {key!r}"
+                if text is None
+                else f"<{tag} {key}={text!r}> is not {wanted}",
+                f"Write {wanted}",
+            )
+        node.set(key, " ".join(map(repr, values)))
+        return values
+
+    def attributes(self, node: Element, where: str) -> None:
+        known = ATTRIBUTES.get(node.tag)
+        ignored = INFORMATIVE.get(node.tag, ())
+        for key in list(node.attrib):
+            if key in ignored:
+                self.ignore(f"<{node.tag} {key}> attribute")
+                del node.attrib[key]
+            elif known is not None and key not in known:
+                raise self.fault(
+                    where,
+                    f"<{node.tag}> has an unknown attribute {key!r}",
+                    f"Known: {', '.join(known)}",
+                )
+
+    def ignore(self, what: str) -> None:
+        self.ignored[what] = self.ignored.get(what, 0) + 1
+
+    def ignored_notes(self) -> tuple[str, ...]:
+        """What was ignored, one sentence for each kind."""
+        return tuple(
+            f"{count} {what}(s) do not act and are ignored" for what, count in self.ignored.items()
+        )
+
+    def children(self, node: Element, where: str) -> None:
+        """Refuse unknown elements of ``node``; count and remove those that are ignored."""
+        read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
+        for child in list(node):
+            tag = child.tag
+            local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
+            if tag in read:
+                self.attributes(child, where)
+                if tag not in READ and len(child):
+                    raise self.fault(
+                        where, f"unknown element <{child[0].tag}> in <{tag}>", "Remove it"
+                    )
+            elif tag in ignored:
+                self.no_loop_inside(child, where)
+                self.no_inertia_inside(child, where)
+                if tag not in DRAWN_ONLY:
+                    self.ignore(f"<{tag}> element")
+                node.remove(child)
+            elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
+                raise self.fault(
+                    f"{where}, <xacro:{local}>" if where else f"<xacro:{local}>",
+                    "this is a xacro macro, not URDF",
+                    "Run xacro on the file first",
+                )
+            elif local in LOOP_ELEMENTS or tag != local:
+                raise self.fault(
+                    f"{where}, <{local}>" if where else f"<{local}>",
+                    f"the element <{local}> (a loop, coupling or force of another tool) is not "
+                    "read by this version",
+                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                )
+            else:
+                raise self.fault(
+                    where or f"<{tag}>",
+                    f"unknown element <{tag}> in <{node.tag}>",
+                    f"Known: {', '.join((*read, *ignored))}",
+                )
+        for tag in set(read) - {"link", "joint"}:
+            if len(node.findall(tag)) > 1:
+                raise self.fault(where, f"<{tag}> is given twice", "Keep one")
+
+    def no_loop_inside(self, node: Element, where: str) -> None:
+        """Refuse loops and couplings inside an element that is ignored as a whole."""
+        for inner in node.iter():
+            if inner.tag in (*LOOP_ELEMENTS, "mimic"):
+                raise self.fault(
+                    ", ".join(part for part in (where, f"<{node.tag}>, <{inner.tag}>") if part),
+                    f"the element <{inner.tag}> (a loop or coupling) inside <{node.tag}> is not "
+                    "read by this version",
+                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                )
+
+    def no_inertia_inside(self, node: Element, where: str) -> None:
+        """Refuse inertia inside an element that is only drawn: the link would lose it."""
+        if node.tag not in DRAWN_ONLY:
+            return
+        for inner in node.iter():
+            if inner.tag in ("inertial", "mass", "inertia"):
+                raise self.fault(
+                    where or f"<{node.tag}>",
+                    f"<{inner.tag}> inside <{node.tag}> would not act",
+                    "Put <mass> and <inertia> into the <inertial> of the link",
+                )
+
+    def named(self, root: Element, tag: str) -> dict[str, Element]:
+        found: dict[str, Element] = {}
+        for node in root.findall(tag):
+            self.attributes(node, f"<{tag}>")
+            name = node.get("name")
+            if not name:
+                raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')
+            if name in found:
+                raise self.fault(
+                    f"{tag} {name!r}", f"two {tag}s have this name", "Rename one of them"
+                )
+            found[name] = node
+        return found
+
+    def origin(self, node: Element, where: str) -> None:
+        origin = node.find("origin")
+        if origin is None:
+            return
+        for key in ("xyz", "rpy"):
+            if origin.get(key) is not None:
+                self.numbers(origin, key, 3, where)
+
+
+URDF_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+JOINT_TYPES = (*URDF_TYPES, *EXTENDED_TYPES)
+WITH_AXIS = ("revolute", "continuous", "prismatic", "planar", "universal", "screw")
+WITH_LIMIT = ("revolute", "continuous", "prismatic", "screw")
+UNIVERSE = "universe"
+"""Pinocchio's name for the ground."""
+ROOT_JOINT = "root_joint"
+"""Pinocchio's name for the joint of a floating or planar base."""
+PARALLEL = 1e-6
+"""Axes of a universal joint at a smaller angle (rad) are parallel."""
+
+
+class JointChecker(ElementChecker):
+    """Checks one joint at a time."""
+
+    def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
+        where = f"joint {name!r}"
+        if name == UNIVERSE or (name == ROOT_JOINT and base != "fixed"):
+            raise self.fault(
+                where,
+                f"the name {name!r} is reserved"
+                + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
+                "Rename the joint",
+            )
+        self.children(joint, where)
+        kind = joint.get("type")
+        if kind not in JOINT_TYPES:
+            raise self.fault(
+                where, f"there is no joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
+            )
+        self.origin(joint, where)
+        self.axis(joint, kind, where)
+        self.only_of(joint, kind, where)
+        self.limit(joint, kind, where)
+        self.dynamics(joint, kind, where, locked)
+
+    def axis(self, joint: Element, kind: str, where: str) -> None:
+        axis = joint.find("axis")
+        if axis is not None and kind not in WITH_AXIS:
+            joint.remove(axis)
+            axis = None
+        direction = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
+        if kind == "planar" and (direction[:2] != [0.0, 0.0] or direction[2] < 0.0):
+            given = " (the default of URDF)" if axis is None else ""
+            raise self.fault(
+                where,
+                f"the normal of a planar joint is read along z only, not {direction}{given}",
+                'Write <axis xyz="0 0 1"/> and turn the joint by <origin rpy=...>',
+            )
+
+    def direction(self, axis: Element, where: str) -> list[float]:
+        """The unit vector of <axis> or <axis2>, written afresh."""
+        direction = self.numbers(axis, "xyz", 3, where)
+        if not any(direction):
+            raise self.fault(where, "its axis is zero", "Give a direction")
+        # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
+        length = math.hypot(*direction)
+        direction = [component / length for component in direction]
+        axis.set("xyz", " ".join(map(repr, direction)))
+        return direction
+
+    def only_of(self, joint: Element, kind: str, where: str) -> None:
+        """<axis2> of a universal joint and <thread_pitch> of a screw."""
+        for tag, owner in (("axis2", "universal"), ("thread_pitch", "screw")):
+            node = joint.find(tag)
+            if (node is not None) != (kind == owner):
+                raise self.fault(
+                    where,
+                    f"a {kind} joint takes no <{tag}>"
+                    if node is not None
+                    else f"a {owner} joint needs <{tag}>",
+                    "Remove it" if node is not None else "Add it",
+                )
+            if node is None:
+                continue
+            if tag == "thread_pitch":
+                if self.numbers(node, "value", 1, where) == [0.0]:
+                    raise self.fault(
+                        where, "its thread pitch is zero", 'Give m per turn, or type="revolute"'
+                    )
+                continue
+            axis = joint.find("axis")
+            first = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
+            second = self.direction(node, where)
+            if np.linalg.norm(np.cross(first, second)) < PARALLEL:
+                raise self.fault(
+                    where, "<axis> and <axis2> are parallel", "Give them different directions"
+                )
+
+    def limit(self, joint: Element, kind: str, where: str) -> None:
+        limit = joint.find("limit")
+        if limit is None:
+            if kind in ("revolute", "prismatic"):
+                raise self.fault(
+                    where,
+                    f"a {kind} joint needs <limit lower upper effort velocity>",
+                    'Add it, or use type="continuous" for an unlimited angle'
+                    if kind == "revolute"
+                    else "Add it",
+                )
+            return
+        for key in limit.attrib:
+            self.numbers(limit, key, 1, where)
+        if kind not in WITH_LIMIT:
+            joint.remove(limit)
+            return
+        for key in ("effort", "velocity"):
+            if limit.get(key) is None and kind in ("continuous", "screw"):
+                limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
+            (value,) = self.numbers(limit, key, 1, where)
+            if value < 0.0:
+                raise self.fault(
+                    where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
+                )
+        lower, upper = (
+            self.numbers(limit, key, 1, where)[0] if key in limit.attrib else 0.0
+            for key in ("lower", "upper")
+        )
+        if lower > upper:
+            self.notes.append(
+                f"{where}: its limits are none: lower = {lower:g} is above upper = {upper:g}"
+            )
+
+    def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
+        dynamics = joint.find("dynamics")
+        if dynamics is None:
+            return
+        for key in dynamics.attrib:
+            (value,) = self.numbers(dynamics, key, 1, where)
+            if value < 0.0:
+                raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
+            if value != 0.0 and kind in ("floating", "planar") and not locked:
+                raise self.fault(
+                    where,
+                    f"the {key} ({value:g}) of a {kind} joint is not simulated by this version",
+                    "Set it to 0; that of one-degree joints acts",
+                )
+        if not dynamics.attrib:
+            joint.remove(dynamics)
+
+
+DEEPEST = 1000
+"""Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""
+POINT_LIKE = 1e-18
+"""m^2: a radius of gyration below a nanometre is the rounding of zero."""
+
+
+class UrdfChecker(JointChecker):
+    """Walks a URDF once; raises :class:`InputError` at the first fault."""
+
+    def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
+        """The whole file; leaves in ``root`` what Pinocchio is to read."""
+        self.root(root)
+        for block in root.findall("gazebo"):
+            for joint in block.iter("joint"):
+                if joint.find("child") is not None:
+                    raise self.fault(
+                        f"<gazebo><joint> {joint.get('name', '')!r}",
+                        "a joint deep inside <gazebo> is not read",
+                        "Move it up, directly into <gazebo>",
+                    )
+        self.children(root, "")
+        links, joints = self.named(root, "link"), self.named(root, "joint")
+        if not links:
+            raise self.fault("<robot>", "there is no <link>", "Add one for every body")
+        for name, link in links.items():
+            self.link(name, link)
+        self.tree(links, joints, base)
+        for name, joint in joints.items():
+            self.joint(name, joint, base, name in locked)
+        self.notes += self.ignored_notes()
+
+    def root(self, root: Element) -> None:
+        """The root element and its attributes, of which the name is kept."""
+        if root.tag.endswith("}robot"):
+            raise self.fault(
+                "<robot>",
+                "it has a default namespace (xmlns=...), so that none of its elements is URDF",
+                "Remove the attribute xmlns",
+            )
+        if root.tag != "robot":
+            raise self.fault(f"<{root.tag}>", "the root element is not <robot>", "Give a URDF file")
+        version = root.get("version", "1.0")
+        if version not in ("1", "1.0", "1.1", "1.2"):
+            raise self.fault(
+                "<robot>", f"there is no URDF version {version!r}", "Known: 1.0, 1.1, 1.2"
+            )
+        name = root.get("name")
+        if not name:
+            raise self.fault("<robot>", "it has no name", 'Give name="..."')
+        root.attrib.clear()
+        root.set("name", name)
+
+    def link(self, name: str, link: Element) -> None:
+        where = f"link {name!r}"
+        origin = link.find("origin")
+        if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
+            self.attributes(origin, where)
+            for key in ("xyz", "rpy"):
+                if origin.get(key) is not None and any(self.numbers(origin, key, 3, where)):
+                    raise self.fault(
+                        where,
+                        "<origin> in <link> has no meaning in URDF and would not move anything",
+                        "Put it into the joint, <inertial> or <visual> that it belongs to",
+                    )
+            link.remove(origin)
+        self.children(link, where)
+        inertial = link.find("inertial")
+        if inertial is None:
+            return
+        self.children(inertial, where)
+        self.origin(inertial, where)
+        mass, inertia = inertial.find("mass"), inertial.find("inertia")
+        if mass is None or inertia is None:
+            missing = "mass" if mass is None else "inertia"
+            raise self.fault(where, f"<inertial> has no <{missing}>", "Add it")
+        (value,) = self.numbers(mass, "value", 1, where)
+        if value < 0.0:
+            raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
+        xx, yy, zz, xy, xz, yz = (
+            self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
+        )
+        principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_LIKE * value
+        if principal[0] < -rounding:
+            raise self.fault(
+                where,
+                f"a principal moment of inertia is negative ({principal[0]:.3g} kg m^2)",
+                "Check the entries of <inertia>",
+            )
+        if principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
+            note = (
+                f"link {name!r}: the principal moments of inertia {principal[0]:.3g}, "
+                f"{principal[1]:.3g}, {principal[2]:.3g} violate the triangle inequality: "
+                "no real body has them"
+            )
+            self.notes.append(note)
+            warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
+
+    def tree(self, links: dict[str, Element], joints: dict[str, Element], base: str) -> None:
+        parent_joint: dict[str, str] = {}
+        parent_link: dict[str, str] = {}
+        for name, joint in joints.items():
+            ends = {}
+            for side in ("parent", "child"):
+                node = joint.find(side)
+                link = None if node is None else node.get("link")
+                if not link:
+                    raise self.fault(
+                        f"joint {name!r}", f"it has no <{side} link=...>", f"Name its {side} link"
+                    )
+                if link not in links:
+                    raise self.fault(
+                        f"joint {name!r}",
+                        f"its {side} link {link!r} does not exist",
+                        f"Known: {', '.join(links)}",
+                    )
+                ends[side] = link
+            child = ends["child"]
+            if child in parent_joint:
+                raise self.fault(
+                    f"link {child!r}",
+                    f"it is the child of two joints, {parent_joint[child]!r} and {name!r}",
+                    "Keep one of them and describe the other as [[loop]] in a TOML description",
+                )
+            parent_joint[child], parent_link[child] = name, ends["parent"]
+        roots = [link for link in links if link not in parent_joint]
+        if len(roots) != 1:
+            problem = (
+                "every link has a parent: the joints form a ring"
+                if not roots
+                else f"{len(roots)} links have no parent joint: {', '.join(roots)}"
+            )
+            raise self.fault(
+                "<robot>", problem, "Keep exactly one root link; close loops by [[loop]]"
+            )
+        children: dict[str, list[str]] = {}
+        for child, parent in parent_link.items():
+            children.setdefault(parent, []).append(child)
+        level, depth, loose = roots, 0, set(links)
+        while level:
+            if depth > DEEPEST:
+                raise self.fault(
+                    f"link {level[0]!r}",
+                    f"more than {DEEPEST} joints lie between it and the root link",
+                    "Split the chain: Pinocchio cannot read such a deep one",
+                )
+            loose -= set(level)
+            level = [child for link in level for child in children.get(link, ())]
+            depth += 1
+        if loose:
+            ring: dict[str, None] = {}
+            at = next(link for link in links if link in loose)
+            while at not in ring:
+                ring[at] = None
+                at = parent_link[at]
+            raise self.fault(
+                f"link {at!r}",
+                f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a ring",
+                "Close loops by [[loop]] in a TOML description",
+            )
+        for reserved in (WORLD, UNIVERSE):
+            if reserved in links and (roots[0] != reserved or base != "fixed"):
+                raise self.fault(
+                    f"link {reserved!r}",
+                    f"{reserved!r} is reserved for the ground, but here it moves",
+                    'Rename the link, or use base = "fixed"'
+                    if roots[0] == reserved
+                    else "Rename the link",
+                )

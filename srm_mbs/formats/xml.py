@@ -1,0 +1,245 @@
+"""XML of unknown origin: read without entities or external references.
+
+Numbers, words and known names in XML, with errors that name file, element and remedy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from xml.etree.ElementTree import Element, ParseError
+
+import numpy as np
+from defusedxml import DefusedXmlException
+from defusedxml import ElementTree as SafeTree
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.formats.toml.schema import LARGEST
+
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
+ACTING = (
+    "joint",
+    "constraint",
+    "bushing",
+    "spring",
+    "damper",
+    "inertia",
+    "gear",
+    "mimic",
+    "coupling",
+    "tendon",
+)
+"""Words in the names of other tools' elements that tell that they act, such as
+``drake:rotor_inertia``."""
+DEEPEST = 300
+"""Most elements in each other."""
+NAMESPACED = re.compile(r"\{[^}]*\}")
+
+
+class XmlValues:
+    """Reads values of one file; counts what it ignores.
+
+    Parameters
+    ----------
+    file
+        Its name, for messages.
+    """
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self._ignored: dict[str, int] = {}
+        self._remarks: dict[str, list[str]] = {}
+
+    def fault(self, where: str, problem: str, remedy: str) -> InputError:
+        """The error to raise about the element ``where``."""
+        return InputError(problem, file=self.file, element=where, remedy=remedy)
+
+    def ignore(self, what: str) -> None:
+        """Count something that is left out knowingly, as ``<sensor> element``."""
+        self._ignored[what] = self._ignored.get(what, 0) + 1
+
+    def remark(self, what: str, where: str) -> None:
+        """Note what was assumed or approximated at ``where``; one sentence lists the places."""
+        self._remarks.setdefault(what, []).append(where)
+
+    def notes(self) -> tuple[str, ...]:
+        """One sentence for each kind of thing that was assumed or ignored."""
+        return (
+            *(f"{what}: {', '.join(where)}" for what, where in self._remarks.items()),
+            *(
+                f"{count} {what}(s) do not act and are ignored"
+                for what, count in self._ignored.items()
+            ),
+        )
+
+    def numbers(
+        self, text: str | None, count: int | Sequence[int], where: str, what: str
+    ) -> FloatArray:
+        """Exactly ``count`` finite numbers (or as many as one of several counts).
+
+        Raises
+        ------
+        InputError
+            Saying what stands there instead, if it is anything else.
+        """
+        counts = (count,) if isinstance(count, int) else tuple(count)
+        parts = (text or "").split()
+        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
+        if len(values) not in counts or not all(abs(value) <= LARGEST for value in values):
+            wanted = " or ".join(
+                "a finite number" if n == 1 else f"{n} finite numbers" for n in counts
+            )
+            shown = "nothing" if text is None or not parts else repr(" ".join(parts)[:60])
+            raise self.fault(where, f"{what} is {shown}, not {wanted}", f"Write {wanted}")
+        return np.array(values)
+
+    def limit(self, text: str, where: str, what: str) -> float:
+        """A number that may be infinite."""
+        if LIMIT.fullmatch(text.strip()):
+            return -np.inf if text.strip().startswith("-") else np.inf
+        return float(self.numbers(text, 1, where, what)[0])
+
+    def truth(self, text: str | None, where: str, what: str) -> bool:
+        """``true`` or ``1``, ``false`` or ``0``."""
+        word = (text or "").strip().lower()
+        if word not in ("true", "false", "1", "0"):
+            raise self.fault(where, f"{what} is {word!r}", "Write true or false")
+        return word in ("true", "1")
+
+    def direction(self, values: FloatArray, where: str, what: str) -> FloatArray:
+        """``values`` (3,) as a unit vector."""
+        length = float(np.linalg.norm(values))
+        if length == 0.0:
+            raise self.fault(where, f"{what} is zero", "Give a direction")
+        out: FloatArray = values / length
+        return out
+
+    def check_depth(self, root: Element) -> None:
+        """Refuse elements in each other deeper than the readers, which recurse, can follow."""
+        level, depth = [root], 0
+        while level:
+            if depth > DEEPEST:
+                raise self.fault(
+                    f"<{level[0].tag}>",
+                    f"more than {DEEPEST} elements are nested",
+                    "Write such a long chain as a URDF, which is flat",
+                )
+            level = [child for node in level for child in node]
+            depth += 1
+
+    def children(
+        self,
+        node: Element,
+        where: str,
+        read: Iterable[str],
+        ignored: Iterable[str],
+        many: Iterable[str] = (),
+    ) -> None:
+        """Refuse unknown children, and two where one is read; count those that are ignored.
+
+        Parameters
+        ----------
+        node, where
+            The element, and its name for messages.
+        read, ignored
+            Tags of both kinds.
+        many
+            Those of ``read`` that may stand there several times.
+        """
+        read, ignored, seen = tuple(read), tuple(ignored), set[str]()
+        for child in node:
+            tag = child.tag
+            if not isinstance(tag, str):  # a comment or processing instruction
+                continue
+            if tag in read:
+                if tag in seen and tag not in many:
+                    raise self.fault(where, f"<{tag}> is given twice", "Keep one")
+                seen.add(tag)
+            elif tag in ignored:
+                self.ignore(f"<{tag}> element")
+            elif NAMESPACED.match(tag) or ":" in tag:
+                self._other_tool(NAMESPACED.sub("", tag), where)
+            else:
+                raise self.fault(
+                    where or f"<{tag}>",
+                    f"unknown element <{tag}> in <{node.tag}>",
+                    f"Known: {', '.join((*read, *ignored))}",
+                )
+
+    def _other_tool(self, tag: str, where: str) -> None:
+        """Refuse an element with a namespace prefix that acts, by its name; count the others."""
+        found = next((word for word in ACTING if word in tag), None)
+        if found is not None:
+            raise self.fault(
+                f"{where}, <{tag}>",
+                f"this element of another tool (a {found}) is not read by this version",
+                "Describe it in a TOML description and remove the element",
+            )
+        self.ignore(f"<{tag}> element of another tool")
+
+    def attributes(
+        self, node: Element, where: str, read: Iterable[str], ignored: Iterable[str] = ()
+    ) -> None:
+        """Refuse unknown attributes; count those that are ignored."""
+        read, ignored = tuple(read), tuple(ignored)
+        for key in node.attrib:
+            if key in ignored:
+                self.ignore(f"<{node.tag} {key}> attribute")
+            elif NAMESPACED.match(key):
+                self.ignore(f"<{node.tag} {NAMESPACED.sub('', key)}> attribute of another tool")
+            elif key not in read:
+                raise self.fault(
+                    where,
+                    f"<{node.tag}> has an unknown attribute {key!r}",
+                    f"Known: {', '.join((*read, *ignored)) or 'none'}",
+                )
+
+
+_PROLOG = re.compile(
+    r"(?:\s+|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*(?:\[[^\]]*\])?[^>]*>)*<([^\s/><!?]+)", re.DOTALL
+)
+
+
+def root_tag(text: str) -> str | None:
+    """Name of the root element, prefix included; None if ``text`` does not look like XML."""
+    match = _PROLOG.match(text.lstrip("\ufeff"))
+    return match[1] if match else None
+
+
+def parse_urdf(text: str, file: str) -> Element:
+    """Root element of ``text``.
+
+    Raises
+    ------
+    InputError
+        If it is not well-formed XML, or uses entities or external references.
+    """
+    try:
+        return SafeTree.fromstring(text)  # type: ignore[no-any-return]
+    except ParseError as error:
+        # Drake's own reader takes <drake:...> without a declaration; expat does not.
+        declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
+        if declared != text:
+            return parse_urdf(declared, file)
+        raise InputError(
+            f"this is not well-formed XML: {error}", file=file, remedy="Correct the file there"
+        ) from error
+    except DefusedXmlException as error:
+        raise InputError(
+            f"the XML uses entities or external references: {error}",
+            file=file,
+            remedy="Remove them; they are refused for safety",
+        ) from error
+
+
+def _with_prefixes(text: str) -> str:
+    """``text`` with every namespace prefix that it uses and does not declare declared."""
+    root = _PROLOG.match(text)
+    if root is None:
+        return text
+    used = set(re.findall(r"[<\s/]([A-Za-z_][\w.-]*):[A-Za-z_]", text))
+    missing = used - set(re.findall(r"\sxmlns:([\w.-]+)\s*=", text)) - {"xml", "xmlns"}
+    declarations = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(missing))
+    return text[: root.end()] + declarations + text[root.end() :]

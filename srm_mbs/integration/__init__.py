@@ -1,0 +1,1 @@
+"""Time integration: driver, events, dense output, breakpoints, singular passages."""

@@ -1,0 +1,275 @@
+r"""Breakpoints: times at which the right-hand side is not smooth.
+
+Knots of tables, switches of drives, samples of a controller.  Between two of them, on a *piece*,
+the equations are smooth and every scheme keeps its order.  So a step ends on each breakpoint; its
+last stages see the forces just before, the first stage after it is evaluated anew and sees those
+just after; multipliers are not extrapolated across, because they jump with the forces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.errors import EvaluationError, InputError
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method
+from srm_mbs.integration.methods.near_singular import ROUNDING, ZONE_LARGEST
+from srm_mbs.integration.singular_endpoints import LOOK, arrive, start
+
+APART = 2e-14
+"""Breakpoints closer to each other than this fraction of the run are one: no step is that short."""
+BESIDE = 8.0
+"""Distance (units of rounding of t) from a breakpoint at which the time on one side of it is
+taken, so that ``t < 0.3``, ``t <= 0.3`` and ``floor(t / 0.1)`` all mean the side they should."""
+CLOSER = 0.5
+"""A singular configuration is looked for again when sigma has fallen by this factor."""
+ALLOWED = 0.1
+"""Part of the tolerance that rounding in the first stage of a piece may take."""
+
+
+_UNBOUNDED = np.array([np.inf])
+_NONE = np.zeros(0, dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """The pieces of a run, n of them.
+
+    Attributes
+    ----------
+    ends : (n,) s
+        Where they end, the end of the run last.
+    first, last : (n,) s
+        The times at which the system is evaluated lie between these.
+    given : (n - 1,) bool
+        Which of the breakpoints between them were marked by the caller.
+    """
+
+    ends: FloatArray
+    first: FloatArray
+    last: FloatArray
+    given: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of pieces."""
+        return len(self.ends)
+
+
+def pieces_between(times: FloatArray, marked: FloatArray, t0: float, t_end: float) -> Pieces:
+    """The pieces into which ``times`` cut the run from ``t0`` to ``t_end`` (s).
+
+    Parameters
+    ----------
+    times : (k,) s
+        Breakpoints in any order; those outside the run are left out.
+    marked : (j,) s
+        Further ones, which :attr:`Pieces.given` tells apart; those at the ends of the run count
+        as outside.
+    """
+    if not len(times) and not len(marked):
+        return Pieces(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
+    order = np.concatenate([marked, times])
+    is_marked = np.arange(len(order)) < len(marked)
+    by_time = np.argsort(order, kind="stable")
+    order, is_marked = order[by_time], is_marked[by_time]
+    near = max(APART * (t_end - t0), BESIDE * float(np.spacing(max(abs(t0), abs(t_end)))))
+    inside = (order >= t0 - near) & (order <= t_end + near)
+    order, is_marked = order[inside], is_marked[inside]
+    # Each cluster of times that no step fits between is one breakpoint, at its first time.
+    new = np.diff(order, prepend=-np.inf) > near
+    cluster = np.cumsum(new) - 1
+    begin = order[new]
+    final = order[np.append(new[1:], True)] if len(order) else order
+    has_marked = np.zeros(len(begin), dtype=bool)
+    np.logical_or.at(has_marked, cluster, is_marked)
+    before = begin - BESIDE * np.spacing(np.abs(begin))
+    after = final + BESIDE * np.spacing(np.abs(final))
+    between = (begin > t0 + near) & (begin < t_end - near)
+    at_start, at_end = after[begin <= t0 + near], before[begin >= t_end - near]
+    return Pieces(
+        ends=np.append(begin[between], t_end),
+        first=np.concatenate([at_start[-1:] if len(at_start) else [-np.inf], after[between]]),
+        last=np.concatenate([before[between], at_end[:1] if len(at_end) else [np.inf]]),
+        given=has_marked[between],
+    )
+
+
+def direct_from(memory: Memory, norm: ErrorNorm, span: float, nv: int) -> float:
+    """sigma from which the first stage of a piece of length ``span`` (s) can be evaluated directly.
+
+    Rounding in a direct solve grows with 1/sigma^2; over a short piece it is harmless.  At most,
+    and without a tolerance (fixed steps), it is where the zone ends.
+    """
+    if norm.negligible == 0.0:
+        return ZONE_LARGEST
+    error = np.zeros(2 * nv)
+    turning = 3.0 * memory.sigma_slope**2 * norm.one[:nv]
+    error[nv:] = span * ROUNDING * (np.abs(memory.rate[nv:]) + turning)
+    weighed = norm(error, norm.weights(memory.magnitude))
+    return min(ZONE_LARGEST, float(np.sqrt(weighed / ALLOWED)))
+
+
+class Nearness:
+    """When the singular configuration next to the first stage of a piece is worth looking for.
+
+    Attributes
+    ----------
+    looked
+        Half the sigma at which that was done last; LOOK far away.
+    """
+
+    def __init__(self) -> None:
+        self.looked = LOOK
+
+    def matters(self, fresh: Memory, norm: ErrorNorm, span: float, nv: int) -> bool:
+        """Whether for ``fresh``, at the start of a piece of length ``span`` (s)."""
+        if fresh.sigma >= LOOK:
+            self.looked = LOOK
+        if not fresh.sigma < self.looked or not fresh.sigma < direct_from(fresh, norm, span, nv):
+            return False
+        self.looked = CLOSER * fresh.sigma
+        return True
+
+
+def beside_singular(
+    system: OpenSystem | ClosedSystem,
+    method: Method,
+    t: float,
+    state: FloatArray,
+    norm: ErrorNorm,
+    end: float,
+    evaluator: Any,
+    fresh: Memory,
+) -> Memory:
+    """``fresh``, of the first stage of a piece up to ``end``, made accurate next to a singular
+    configuration; the parameters are those of
+    :func:`~srm_mbs.integration.singular_endpoints.start`.
+
+    Raises
+    ------
+    EvaluationError
+        If the motion on from there is not determined.
+    """
+    try:
+        return start(system, method, t, state, norm, end, evaluator, fresh)
+    except InputError as error:
+        raise EvaluationError(f"at the breakpoint {error}") from error
+
+
+class Passing:
+    """What happens at the breakpoints of a run, and before those, or an end, that lie beside a
+    singular configuration; used by the drivers.
+
+    Parameters
+    ----------
+    pieces
+        Of the run.
+    system, method, norm
+        Of the run.
+    evaluator
+        Evaluates the first stage of a piece.
+
+    Attributes
+    ----------
+    sample
+        Called with (t, state) at the marked breakpoints, before anything is evaluated there.
+    arrivals
+        Whether :meth:`arrive` can do anything.
+    """
+
+    def __init__(
+        self,
+        pieces: Pieces,
+        system: OpenSystem | ClosedSystem,
+        method: Method,
+        norm: ErrorNorm,
+        evaluator: Any = None,
+    ) -> None:
+        self.pieces = pieces
+        self._system = system
+        self._method = method
+        self._norm = norm
+        self._evaluator = system if evaluator is None else evaluator
+        self.sample: Callable[[float, FloatArray], None] | None = None
+        self.arrivals = isinstance(system, ClosedSystem)
+        self._index = 0
+        self._nearness = Nearness()
+        self._evaluate_within(0)
+
+    @property
+    def end(self) -> float:
+        """End of the current piece (s)."""
+        return float(self.pieces.ends[self._index])
+
+    def _evaluate_within(self, index: int) -> None:
+        pieces = self.pieces
+        self._evaluator.between(float(pieces.first[index]), float(pieces.last[index]))
+
+    def enter(self, index: int, t: float, state: FloatArray) -> None:
+        """Go on to the piece ``index``, which starts at ``t`` (s): the system is evaluated in it.
+
+        Raises
+        ------
+        ControllerError
+            If the sampled controller fails.
+        """
+        if self.sample is not None and self.pieces.given[index - 1]:
+            self.sample(t, state)
+        self._index = index
+        self._evaluate_within(index)
+
+    def next(self, t: float, state: FloatArray, memory: Memory) -> Memory:
+        """Go on to the next piece; ``memory`` with its first stage.
+
+        Raises
+        ------
+        ControllerError
+            If the sampled controller fails.
+        EvaluationError
+            As :meth:`resolved`, or if the stage cannot be evaluated.
+        """
+        self.enter(self._index + 1, t, state)
+        fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
+        if self._nearness.matters(fresh, self._norm, self.end - t, self._system.nv):
+            return self._resolved(t, state, fresh)
+        return fresh
+
+    def resolved(self, t: float, state: FloatArray, memory: Memory) -> Memory:
+        """``memory`` with the first stage of the current piece, from where it starts, evaluated
+        with a look at the singular configuration nearby.
+
+        Raises
+        ------
+        EvaluationError
+            If it cannot be evaluated, or the motion on from there is not determined.
+        """
+        fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
+        return self._resolved(t, state, fresh)
+
+    def _resolved(self, t: float, state: FloatArray, fresh: Memory) -> Memory:
+        return beside_singular(
+            self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
+        )
+
+    def arrive(
+        self, t: float, state: FloatArray, memory: Memory, index: int | None = None
+    ) -> Memory:
+        """``memory`` with the multipliers known up to the end of the piece, which lies beside a
+        singular configuration; see :func:`~srm_mbs.integration.singular_endpoints.arrive`.
+
+        ``index``: of that piece, if the kernel went on to it by itself.
+        """
+        if index is not None and index != self._index:
+            self._index = index
+            self._evaluate_within(index)
+        return arrive(self._system, t, state, memory, self._norm, self.end)
+
+    def done(self) -> None:
+        """The run is over: the system may be evaluated at any time."""
+        self._evaluator.between(-np.inf, np.inf)

@@ -1,0 +1,1 @@
+"""Step-size control, placement of steps around singular configurations, and guards."""

@@ -1,0 +1,337 @@
+r"""Steps placed so that no stage lands on a singular configuration.
+
+A wrapper of step-size control (docs/notation.md, "Singular configurations"):
+
+* a priori, when sigma falls, its zero is predicted by a parabola through the stages of the last
+  step, and the step is shortened so that the zero lies well inside a gap between the abscissae of
+  the tableau, or well behind the end;
+* sigma changes by at most 0.5 per step;
+* a posteriori, when a stage came too close, the zero is located from the stages of the step and
+  the step is redone, at most three times;
+* where the run, or its piece, ends beside a singular configuration, steps are not placed: the
+  multipliers up to the end are found first (:mod:`srm_mbs.integration.singular_endpoints`).
+
+Zeros of sigma, from its values at the stages of a step.
+
+sigma is the modulus of a smooth quantity: at a passage it has a kink.  With the sign turned behind
+it, the values follow a polynomial of low degree.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from enum import IntEnum
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.integration.control.step_size import Grid, Proposal, StepSizeControl, Verdict
+from srm_mbs.integration.methods.base import Memory, StepResult
+from srm_mbs.integration.methods.butcher import ButcherTableau
+
+AHEAD = 3.0
+"""Zeros are looked for within this many steps."""
+
+
+def misfit(basis: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
+    """Norm of the residual of the least-squares fit of ``values``, and its coefficients."""
+    coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
+    return float(np.linalg.norm(basis @ coefficients - values)), np.asarray(
+        coefficients, dtype=np.float64
+    )
+
+
+def real_roots(p0: float, p1: float, p2: float = 0.0) -> list[float]:
+    """Real roots of p0 + p1 x + p2 x^2, ascending."""
+    if p2 == 0.0:
+        return [-p0 / p1] if p1 else []
+    discriminant = p1 * p1 - 4.0 * p2 * p0
+    if discriminant < 0.0:
+        return []
+    # Of the two forms of a root, the one that does not cancel.
+    q = -0.5 * (p1 + math.copysign(math.sqrt(discriminant), p1))
+    return sorted([q / p2, p0 / q]) if q else [0.0]
+
+
+def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
+    """Where in (0, 1 + a little] the step passes a zero of sigma; None if it does not.
+
+    Parameters
+    ----------
+    abscissae, sigmas : (s + 1,)
+        Fractions of the step, and sigma there.
+    """
+    order = np.argsort(abscissae, kind="stable")
+    c, sigma = abscissae[order], sigmas[order]
+    top = float(sigma.max())
+    if not top > 0.0:
+        return None
+    degree = 2 if len(c) > 4 else 1
+    basis = np.vander(c, degree + 1)
+    best, zero = np.inf, None
+    for k in range(1, len(c) + 1):
+        after = float(c[k]) if k < len(c) else 1.1
+        if after <= c[k - 1]:
+            continue
+        signed = np.where(np.arange(len(c)) < k, sigma, -sigma)
+        error, coefficients = misfit(basis, signed)
+        if not error < best:
+            continue
+        for root in real_roots(*coefficients[::-1].tolist()):
+            if c[k - 1] - 0.02 <= root <= after + 0.02:
+                best, zero = error, root
+                break
+    return zero
+
+
+def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
+    """Where sigma will vanish, in steps from the start of the last one (> 1); None if it does not
+    fall, or not within ``AHEAD`` steps.
+
+    A parabola through the start, the stage ``k`` with the abscissa ``c``, and the end; a line if
+    that has no zero ahead.
+    """
+    start, end = float(sigmas[0]), float(sigmas[-1])
+    if not end < start:
+        return None
+    middle = float(sigmas[k])
+    line = start / (start - end)
+    zero = line
+    if 0.1 < c < 0.9:
+        # sigma = start + a x + b x^2 through (c, middle) and (1, end)
+        b = ((middle - start) / c - (end - start)) / (c - 1.0)
+        a = end - start - b
+        root = a * a - 4.0 * b * start
+        if root >= 0.0 and a < 0.0:
+            zero = 2.0 * start / (-a + np.sqrt(root))
+        elif a + 2.0 * b >= 0.0 or root < 0.0:
+            return None if line > AHEAD else line
+    return (
+        float(zero)
+        if 1.0 < zero < AHEAD
+        else (line if 1.0 < line < AHEAD and zero <= 1.0 else None)
+    )
+
+
+SIGMA_CHANGE = 0.5
+"""Largest change of sigma in one step, by the slope of the last steps."""
+TOO_CLOSE = 0.05
+"""A stage is too close if sigma < TOO_CLOSE * slope * h, and nearer to zero than the start."""
+CLEARANCE = 0.6
+"""Distance of the zero from the abscissae that is good enough, over half the widest gap."""
+MAX_REDONE = 3
+BESIDE = 5e-3
+"""A run, or its piece, ends beside a singular configuration if sigma is smaller there: rounding in
+direct solves nearer than that exceeds the tightest tolerances."""
+ARRIVAL = 0.2
+"""Change of sigma from where such an end is prepared for, unless one step reaches further."""
+
+
+class Arrival(IntEnum):
+    """What is known of the end of the run, or its piece."""
+
+    NONE = 0
+    """It is no matter, or prepared for."""
+    WATCHED = 1
+    """It may lie beside a singular configuration."""
+    DUE = 2
+    """It does: a step that reached it was redone."""
+
+
+def inverse_abscissae(scheme: ButcherTableau) -> list[float]:
+    """1/c of the stages and the end (s + 1,); 0 where c is."""
+    return [1.0 / c if c > 0.0 else 0.0 for c in [*scheme.c.tolist(), 1.0]]
+
+
+def sigma_slope(inverse: list[float], sigmas: FloatArray, h: float) -> float:
+    """max_j |sigma_j - sigma_0| / (c_j h) over the stages (1/s); ``inverse`` has their 1/c_j."""
+    # Lists: NumPy's overhead on a dozen numbers is several times the work, in every step.
+    values: list[float] = sigmas.tolist()
+    start = values[0]
+    return max([abs(sigma - start) * x for sigma, x in zip(values, inverse)]) / h
+
+
+class Gaps:
+    """Where, as a fraction of the step, a zero of sigma does no harm."""
+
+    def __init__(self, scheme: ButcherTableau) -> None:
+        self._centre, half_width = scheme.gaps[0]
+        self._clearance = CLEARANCE * half_width
+        self._first = min((x for x in scheme.c.tolist() if x > 0.0), default=1.0)
+        self._wide = sorted(
+            (middle, middle + half - self._clearance)
+            for middle, half in scheme.gaps
+            if half > self._clearance
+        )
+
+    def longest_step(self, distance: float, h: float) -> float:
+        """The longest step up to ``h`` (s) for a zero of sigma at ``distance`` (s) ahead.
+
+        The zero comes to lie in a wide gap between the abscissae, or so far behind the end that
+        an equal step would put it there.
+        """
+        position = distance / h
+        if position >= 1.0 + self._centre:
+            return h
+        if position <= 0.5 * self._first:
+            return h  # the first stage is no nearer to the zero than the start
+        for centre, end in self._wide:
+            if position <= end:
+                return distance / max(position, centre)
+        return distance / (1.0 + self._centre)
+
+    def ends_on(self, distance: float, h: float) -> bool:
+        """Whether a step ``h`` ends on a zero at ``distance``."""
+        return abs(distance / h - 1.0) < self._clearance
+
+    def step_over(self, distance: float) -> float:
+        """The shortest step that has a zero at ``distance`` well inside one of its gaps."""
+        return distance / self._wide[-1][1]
+
+
+class SingularityPlacement:
+    """Wraps ``inner`` step-size control around singular configurations.
+
+    Parameters
+    ----------
+    inner, scheme
+        What is wrapped; the tableau of the run.
+    t_end
+        End of the run (s).
+    arrivals
+        Whether the driver prepares for ends beside singular configurations.
+
+    Attributes
+    ----------
+    placed, replaced
+        How many steps were changed a priori, and redone a posteriori.
+    """
+
+    def __init__(
+        self,
+        inner: StepSizeControl,
+        scheme: ButcherTableau,
+        t_end: float = np.inf,
+        arrivals: bool = False,
+    ) -> None:
+        self._inner = inner
+        self._t_end = t_end
+        self._gaps = Gaps(scheme)
+        self._abscissae = [*scheme.c.tolist(), 1.0]
+        self._inverse = inverse_abscissae(scheme)
+        self._later_stages = [j for j, c in enumerate(self._abscissae) if c > 0.0]
+        self._inner_stages = [j for j in self._later_stages if self._abscissae[j] < 1.0]
+        self._middle = scheme.middle
+        self.adaptive = inner.adaptive
+        self.placed = 0
+        self.replaced = 0
+        self._slope = 0.0
+        self._zero: float | None = None
+        self._redo: float | None = None
+        self._redone = 0
+        self._watched = Arrival.WATCHED if arrivals and inner.adaptive else Arrival.NONE
+        self._arrival = self._watched
+        self._known = False
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """The inner proposal, shortened where a stage would come too close."""
+        if self._redo is not None:
+            limit = min(limit, self._redo)
+        slope = memory.sigma_slope = self._slope
+        if slope > 0.0 and self.adaptive:
+            longest = SIGMA_CHANGE / slope
+            if longest < limit:
+                limit = longest
+        proposal = self._inner.propose(t, limit, memory)
+        if self._arrives(t, proposal):
+            self._arrival = Arrival.NONE
+            return replace(proposal, arriving=True)
+        # Where the multipliers are known, stages may lie anywhere.
+        self._known = memory.history is not None and memory.history.known_until >= self._t_end
+        if self._known:
+            return proposal
+        if self._zero is not None and self._redo is None and self._zero > t:
+            h = self._placed(self._zero - t, proposal.h, t)
+            if h != proposal.h:
+                self.placed += 1
+                return Proposal(h, t + h, placed=True)
+        return proposal
+
+    def aim(self, end: float, grid: Grid | None = None) -> None:
+        """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
+        self._t_end = end
+        self._arrival = self._watched
+        self._inner.aim(end, grid)
+
+    def _arrives(self, t: float, proposal: Proposal) -> bool:
+        """Whether the end beside a singular configuration is to be prepared for."""
+        if self._arrival is not Arrival.WATCHED:
+            return self._arrival is Arrival.DUE
+        if self._zero is None or not self._zero > t:
+            return False
+        if not abs(self._zero - self._t_end) * self._slope < BESIDE:
+            return False
+        return proposal.t_new >= self._t_end or (self._t_end - t) * self._slope <= ARRIVAL
+
+    def _placed(self, distance: float, h: float, t: float) -> float:
+        if t + h >= self._t_end and self._gaps.ends_on(distance, h):
+            return h  # the run, or its piece, ends there
+        if self.adaptive:
+            return self._gaps.longest_step(distance, h)
+        # A fixed step may cross its grid point where that is singular: it could only creep up.
+        if not self._gaps.ends_on(distance, h):
+            return self._gaps.longest_step(distance, h) if distance < h else h
+        over = self._gaps.step_over(distance)
+        return over if t + over <= self._t_end else h
+
+    def _better_step(self, h: float, sigmas: FloatArray, slope: float, last: bool) -> float | None:
+        """A better step length if a stage or the end came too close, else None.
+
+        ``last``: the run, or its piece, ends with this step, wherever that is.
+        """
+        values: list[float] = sigmas.tolist()
+        reach = TOO_CLOSE * max(self._slope, slope) * h
+        if not min(values) < min(reach, 0.5 * values[0]):
+            return None
+        movable = self._inner_stages if last else self._later_stages
+        if not min((values[i] for i in movable), default=np.inf) < min(reach, 0.5 * values[0]):
+            return None
+        zero = zero_within(np.array(self._abscissae), sigmas)
+        if zero is None or not zero > 0.0:
+            return None
+        return self._gaps.longest_step(zero * h, 0.98 * h)
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Redo a badly placed step; otherwise the inner control's verdict."""
+        slope = 0.0
+        if result is None:
+            pass
+        elif result.quiet:  # no zero is near: only the slope goes on
+            slope = result.slope
+        else:
+            h = proposal.h
+            slope = sigma_slope(self._inverse, result.sigmas, h)
+            last = proposal.t_new >= self._t_end
+            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < BESIDE:
+                self._arrival, self._redo = Arrival.DUE, h
+                self.replaced += 1
+                return Verdict.REPLACED
+            if self._redone < MAX_REDONE and not self._known:
+                better = self._better_step(h, result.sigmas, slope, last)
+                if better is not None and 0.0 < better < h:
+                    self._redo = better
+                    self._redone += 1
+                    self.replaced += 1
+                    return Verdict.REPLACED
+        verdict = self._inner.judge(proposal, result)
+        self._redo = None
+        self._redone = 0
+        if verdict is Verdict.ACCEPTED and result is not None:
+            slowest = 0.5 * self._slope
+            self._slope = slope if slope > slowest else slowest
+            self._zero = None
+            if not result.quiet:
+                ahead = zero_ahead(*self._middle, result.sigmas)
+                self._zero = None if ahead is None else result.t + proposal.h * ahead
+        return verdict

@@ -1,0 +1,237 @@
+"""Step-size control: how long the next step is, and whether the last one stands.
+
+Judging a step is separate from making it, and one control may wrap another
+(:class:`~srm_mbs.integration.control.placement.SingularityPlacement` does).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.errors import EvaluationError
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+
+SAFETY = 0.9
+MIN_FACTOR, MAX_FACTOR = 0.2, 5.0
+PROPORTIONAL, INTEGRAL = 0.4, 0.7
+"""h_new = h 0.9 xi^(-0.7/k) xi_old^(0.4/k): PI control after Gustafsson."""
+XI_OLD_FLOOR = 1e-4
+XI_FLOOR = 1e-10
+OVERFLOW = 1e100
+"""Size of a rate from which its products may overflow."""
+PROBE = 0.01
+"""Length of the step that probes how fast rates change, over that in which the state would change
+by itself; the change that the first step may make."""
+LONGEST_FIRST = 100.0
+"""Longest first step, over that probe."""
+FAILED_EVALUATION = 1e6
+"""Error ratio of a step whose stages could not be evaluated or are not finite."""
+
+
+Grid = tuple[float, float]
+"""Where a grid of fixed steps begins, and its spacing (s)."""
+
+
+class Verdict(Enum):
+    """What becomes of a proposed step."""
+
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+    REPLACED = "replaced"
+    """The step is redone with another length so that no stage lies on a singular point."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A step of length ``h`` that ends at ``t_new`` (exactly, where that is a given time).
+
+    ``placed``: it was made shorter so that no stage lies on a singular configuration.
+    ``arriving``: the run, or its piece, is about to end beside one; the multipliers up to there are
+    to be found first (:mod:`srm_mbs.integration.singular_endpoints`), and a step proposed again.
+    """
+
+    h: float
+    t_new: float
+    placed: bool = False
+    arriving: bool = False
+
+
+class Propose(Protocol):
+    """:meth:`StepSizeControl.propose`."""
+
+    def __call__(self, t: float, limit: float, memory: Memory) -> Proposal: ...
+
+
+class StepSizeControl(Protocol):
+    """Decides on step lengths."""
+
+    adaptive: bool
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """The next step from ``t``, at most ``limit`` long where the control is adaptive."""
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Judge a step; ``result`` is None if a stage could not be evaluated."""
+
+    def aim(self, end: float, grid: Grid | None = None) -> None:
+        """A step ends on ``end`` (s): a breakpoint, or the end of the run.
+
+        With ``grid`` fixed steps are counted anew; others have none.
+        """
+
+
+def _until(t: float, h: float, end: float) -> Proposal:
+    """A step of at most ``h`` that neither passes ``end`` nor leaves a sliver before it."""
+    remaining = end - t
+    if h >= remaining * (1.0 - 1e-12):
+        return Proposal(remaining, end)
+    if 2.0 * h > remaining:
+        h = 0.5 * remaining
+    return Proposal(h, t + h)
+
+
+class PIControl:
+    """Proportional-integral control of the error of an embedded pair.
+
+    Parameters
+    ----------
+    t_end
+        Time at which the run ends (s).
+    first_step
+        Length of the first step (s).
+    order
+        k: 3 for tvd32, 5 for dopr54, 8 for dop853.
+    """
+
+    adaptive = True
+
+    def __init__(self, t_end: float, first_step: float, order: int) -> None:
+        self._t_end = t_end
+        self._h = first_step
+        self._order = order
+        self._xi_old = 1.0
+        self._just_rejected = False
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """The step that the error allows."""
+        return _until(t, min(self._h, limit), self._t_end)
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Accept if the error ratio xi <= 1; no growth right after a rejection."""
+        xi = FAILED_EVALUATION if result is None else result.error_ratio
+        if not xi < FAILED_EVALUATION:
+            xi = FAILED_EVALUATION
+        k = self._order
+        if xi > 1.0:
+            self._h = proposal.h * max(MIN_FACTOR, SAFETY * xi ** (-1.0 / k))
+            self._just_rejected = True
+            return Verdict.REJECTED
+        factor = SAFETY * max(xi, XI_FLOOR) ** (-INTEGRAL / k) * self._xi_old ** (PROPORTIONAL / k)
+        factor = min(MAX_FACTOR, max(MIN_FACTOR, factor))
+        if self._just_rejected:
+            factor = min(factor, 1.0)
+        h = proposal.h * factor
+        if proposal.t_new == self._t_end and proposal.h < self._h:
+            # Cut to end there: behind a breakpoint the step wanted before is the better guess.
+            h = max(h, self._h)
+        self._h = h
+        self._xi_old = max(xi, XI_OLD_FLOOR)
+        self._just_rejected = False
+        return Verdict.ACCEPTED
+
+    def aim(self, end: float, grid: Grid | None = None) -> None:
+        """See :class:`StepSizeControl`."""
+        self._t_end = end
+
+
+class FixedStep:
+    """Steps on a grid t0 + i step; a shortened step returns to the grid.
+
+    Parameters
+    ----------
+    t0, t_end
+        Range of the run (s); the last step is shortened to end there.
+    step
+        Grid spacing (s).
+    """
+
+    adaptive = False
+
+    def __init__(self, t0: float, t_end: float, step: float) -> None:
+        self._t0, self._t_end, self._step = t0, t_end, step
+        self._index = 1
+
+    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+        """To the next grid point, or ``limit`` towards it."""
+        target = self._t0 + self._index * self._step
+        if target > self._t_end - 1e-9 * self._step:
+            target = self._t_end
+        if limit < target - t:
+            return Proposal(limit, t + limit)
+        return Proposal(target - t, target)
+
+    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+        """Accept every step that could be evaluated."""
+        if result is None or not np.isfinite(result.state).all():
+            return Verdict.REJECTED
+        while proposal.t_new >= self._t0 + self._index * self._step - self._sliver():
+            self._index += 1
+        return Verdict.ACCEPTED
+
+    def _sliver(self) -> float:
+        """Distance (s) before a grid point that is not worth a step."""
+        return max(1e-9, 1e-14 * self._index) * self._step
+
+    def aim(self, end: float, grid: Grid | None = None) -> None:
+        """See :class:`StepSizeControl`; without a new grid the old one stays."""
+        self._t_end = end
+        if grid is not None:
+            (self._t0, self._step), self._index = grid, 1
+
+
+_TOO_TIGHT = "the rates at the start are beyond all measure of atol: it is far too small"
+
+
+def initial_step(
+    system: System,
+    state: FloatArray,
+    memory: Memory,
+    norm: ErrorNorm,
+    span: float,
+    order: int,
+    t: float = 0.0,
+) -> float:
+    """Length of the first step (s): the thesis' appendix B.2 made independent of the time unit.
+
+    With d0 = ||unit of x||, d1 = ||x'|| and d2 = ||x''|| (an Euler step of 0.01 d0/d1), and the
+    time tau = d1/d2: h = min(d0/d1, tau (0.01 / (tau d1))^(1/k)).
+    """
+    weights = norm.weights(memory.magnitude)
+    # |x| itself may vanish; atol over rtol is the size that the tolerances call "one".
+    d0 = norm(np.maximum(memory.magnitude, norm.one), weights)
+    if not np.abs(memory.rate).max() < OVERFLOW:
+        raise EvaluationError("the rates at the start overflow: an input is far too large")
+    with np.errstate(over="ignore"):
+        d1 = norm(memory.rate, weights)
+    if not np.isfinite(d1):
+        raise EvaluationError(_TOO_TIGHT)
+    if not d1 > 0.0:
+        return PROBE * span
+    h0 = min(PROBE * d0 / d1, span)
+    probe = system.retract(state, h0 * memory.rate)
+    rate = system.chart_rate(h0 * memory.rate, system.evaluate(t + h0, probe).rate())
+    with np.errstate(over="ignore"):
+        d2 = norm(rate - memory.rate, weights) / h0
+    if not np.isfinite(d2):
+        raise EvaluationError(_TOO_TIGHT)
+    longest = LONGEST_FIRST * h0
+    if not d2 > 0.0:
+        return min(longest, span)
+    tau = d1 / d2
+    return float(min(longest, tau * (PROBE / (tau * d1)) ** (1.0 / order), span))

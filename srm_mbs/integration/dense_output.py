@@ -1,0 +1,509 @@
+r"""Dense output: the state at any time of a run.
+
+The Runge-Kutta extension of a step ends at the uncorrected point x^-; the correction (dq, dv) at
+the step end is added as a smooth ramp,
+
+    s = 3 theta^2 - 2 theta^3,  r = theta^3 - theta^2:   q += s dq + h r dv,   v += s dv,
+
+so that the interpolant joins the corrected states with matching slopes and stays within
+tolerance of the closures.  The extra stages of dop853 are evaluated only when a step is read.
+
+Times at which a run is read.
+
+Dense output next to singular configurations: Hermite interpolation of accepted states.
+
+Where a step passes, or almost touches, a singular configuration, the rates of its stages carry the
+rounding of the stage over its distance to that configuration, which the weights of a continuous
+extension multiply.  The accepted states and their rates do not: they lie further away.  States
+between them follow from the polynomial through the states and rates at the nearest ends of steps,
+in the chart at the start of the step.
+
+Angles of joints that turn without end, followed through the steps of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.system import System, Zone
+from srm_mbs.errors import InputError
+from srm_mbs.integration.methods.base import StepResult
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+
+SLACK = 1e-12
+"""Part of the time up to which a run is read beyond its ends, for rounding."""
+
+
+def times_to_read(t: Any, *, scalar: bool = False) -> FloatArray:
+    """``t`` (s) as a new array (k,), or () where a ``scalar`` is allowed.
+
+    Raises
+    ------
+    InputError
+        For more dimensions, or what are no numbers.
+    """
+    try:
+        times = np.array(t, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"t = {t!r} does not consist of numbers", element="t", remedy="Give times (s)"
+        ) from None
+    if times.ndim != 1 and not (scalar and times.ndim == 0):
+        kinds = "a scalar or a vector of times" if scalar else "a vector of times"
+        raise InputError(f"t has shape {times.shape}", element="t", remedy=f"Give {kinds}")
+    return times
+
+
+def check_within(t: FloatArray, start: float, end: float) -> None:
+    """Refuse times ``t`` (k,) outside a run from ``start`` to ``end`` (s).
+
+    Raises
+    ------
+    InputError
+        If there are such.
+    """
+    slack = SLACK * max(abs(start), abs(end))
+    if len(t) and not (np.min(t) >= start - slack and np.max(t) <= end + slack):
+        raise InputError(
+            f"the run covers t = {start:.9g} to {end:.9g} s, "
+            f"asked for are {np.min(t):.9g} to {np.max(t):.9g} s",
+            element="t",
+            remedy="Give times of the run",
+        )
+
+
+NODES = (4, 6, 8)
+"""Numbers of ends of steps: polynomials of degree 7, 11 and 15."""
+SPACING = 0.1
+"""Smallest distance of the ends of steps that are used, over the length of the step: closer ones
+would magnify their rounding."""
+CLOSE = 1.0
+"""A step is close to a singular configuration if its smallest sigma is below CLOSE times the change
+of sigma over a step."""
+PROBES = np.array([0.25, 0.5, 0.75])
+"""Fractions of the step at which polynomials are compared."""
+
+
+def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
+    """Whether stages of the step (abscissae and sigma, (s + 1,)) lie close to a zero of sigma."""
+    if not np.isfinite(sigmas).all():
+        return False
+    change = float(np.max(np.abs(sigmas[1:] - sigmas[0]) / abscissae[1:]))
+    return bool(sigmas.min() < CLOSE * change)
+
+
+class HermiteStep:
+    """The interpolant of one step.
+
+    Degree 11 where degree 15 confirms it better than it confirms degree 7: between steps of very
+    different lengths a higher degree is not better.
+
+    Parameters
+    ----------
+    system, steps, step
+        The run, and the number of the step.
+    weights : (k,)
+        Those of the rates over a whole step, as far as they are in ``steps``.
+    """
+
+    def __init__(self, system: System, steps: StepData, step: int, weights: FloatArray) -> None:
+        self._system = system
+        self._steps = steps
+        self._step = step
+        self._weights = weights
+        # Rates jump at breakpoints: a polynomial goes no further.
+        self._piece = steps.piece(step)
+        self._start = steps.states[step]
+        self._h = steps.times[step + 1] - steps.times[step]
+        polynomials = [self._through(count) for count in NODES]
+        values = [polynomial(PROBES) for polynomial in polynomials]
+        changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
+        self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
+
+    def _nodes(self, count: int) -> list[int]:
+        """Indices of up to ``count`` ends of steps around the step, none too close together."""
+        times, near = self._steps.times, SPACING * self._h
+        states, reachable = self._steps.states, self._system.reachable
+        first, last = self._piece
+        before, after = [self._step], [self._step + 1]
+        i, j = self._step - 1, self._step + 2
+        while len(before) + len(after) < count and (i >= first or j <= last):
+            left = i >= first and (j > last or len(before) <= len(after))
+            if left:
+                if times[before[-1]] - times[i] >= near:
+                    if reachable(self._start, states[i]):
+                        before.append(i)
+                    else:
+                        first = i
+                i -= 1
+            else:
+                if times[j] - times[after[-1]] >= near:
+                    if reachable(self._start, states[j]):
+                        after.append(j)
+                    else:
+                        last = j
+                j += 1
+        return sorted(before + after)
+
+    def _moved(self, node: int) -> FloatArray:
+        """Motion (m,) from the step to a node, in the charts of the steps between: turns included,
+        however the rates change within a step."""
+        steps = self._steps
+        own = slice(min(node, self._step), max(node, self._step))
+        count = len(self._weights)
+        h = np.diff(steps.times[own.start : own.stop + 1])
+        moved: FloatArray = self._weights @ np.tensordot(h, steps.rates[own, :count], axes=1)
+        return moved if node > self._step else -moved
+
+    def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
+        from scipy.interpolate import KroghInterpolator
+
+        steps = self._steps
+        last = self._piece[1]
+        t0 = steps.times[self._step]
+        points: list[float] = []
+        values: list[FloatArray] = []
+        for i in self._nodes(count):
+            delta = self._system.difference(self._start, steps.states[i], self._moved(i))
+            rate = steps.rate_at(i, last)
+            points += 2 * [(steps.times[i] - t0) / self._h]
+            values += [delta, self._h * self._system.chart_rate(delta, rate)]
+        return KroghInterpolator(np.array(points), np.array(values))  # type: ignore[no-any-return]
+
+    def __call__(self, theta: FloatArray) -> FloatArray:
+        """States (k, nx) at the fractions ``theta`` (k,) of the step."""
+        deltas = self._polynomial(theta)
+        return np.array([self._system.retract(self._start, delta) for delta in deltas])
+
+
+PLACEMENTS = ("", "a priori", "redone")
+"""How steps are placed around singular configurations; see
+:class:`~srm_mbs.integration.methods.base.StepResult`."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepData:
+    """The accepted steps of a run as arrays, n steps of a tableau with s stages.
+
+    Attributes
+    ----------
+    times : (n + 1,) s
+        Ends of the steps, the start first.
+    states : (n + 1, nx)
+        States there.
+    rates : (n, s + 1, m) or (n, s + 1 + e, m)
+        Chart rates of the stages and the end point; of the extra stages as well for methods that
+        evaluate them in every step.
+    corrections : (n, m)
+        What was subtracted at each step end; (n, 0) without closures.
+    sigmas : (n, s + 1)
+        sigma at the stages and the end point.
+    ranks : (n,)
+        Smallest number of rows in use in the step.
+    error_ratios : (n,)
+        Error estimate over tolerance.
+    placements : (n,)
+        How the step was placed around a singular configuration: index into PLACEMENTS.
+    held : (n,)
+        1 for steps that lingered next to a singular configuration, held on their branch, else 0.
+    end_rate : (m,)
+        Tangent rate at the end of the last step.
+    zones
+        Step index -> (threshold, history) of the steps with a stage in the zone.
+    stop
+        Where a terminal event ended the run within the last step (s); None at the step's end.
+    breaks : (k,)
+        Numbers of the steps that end on a breakpoint, counted from 1: behind it rates are others.
+    break_rates : (k, m)
+        Tangent rates before those breakpoints.
+    """
+
+    times: FloatArray
+    states: FloatArray
+    rates: FloatArray
+    corrections: FloatArray
+    sigmas: FloatArray
+    ranks: FloatArray
+    error_ratios: FloatArray
+    placements: FloatArray
+    held: FloatArray
+    end_rate: FloatArray
+    zones: dict[int, tuple[float, MultiplierHistory]]
+    stop: float | None = None
+    breaks: IndexArray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    break_rates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def end(self) -> float:
+        """End of the run (s)."""
+        return float(self.times[-1]) if self.stop is None else self.stop
+
+    @property
+    def count(self) -> int:
+        """Number of steps."""
+        return len(self.times) - 1
+
+    def piece(self, step: int) -> tuple[int, int]:
+        """First and last end of a step, as indices into ``times``, between the breakpoints around
+        ``step``."""
+        k = int(np.searchsorted(self.breaks, step, side="right"))
+        first = int(self.breaks[k - 1]) if k else 0
+        last = int(self.breaks[k]) if k < len(self.breaks) else self.count
+        return first, last
+
+    def rate_at(self, node: int, last: int) -> FloatArray:
+        """Tangent rate (m,) at the end ``node`` of a step of the piece that ends at ``last``."""
+        rate: FloatArray
+        if node < last:
+            rate = self.rates[node, 0]
+        elif node == self.count:
+            rate = self.end_rate
+        else:
+            rate = self.break_rates[int(np.searchsorted(self.breaks, node))]
+        return rate
+
+
+def step_data(
+    t0: float,
+    x0: FloatArray,
+    times: Sequence[float],
+    steps: Sequence[StepResult],
+    scheme: ButcherTableau,
+    tangent_size: int,
+    stop: float | None = None,
+    breaks: Sequence[int] = (),
+) -> StepData:
+    """The ``steps`` from (``t0``, ``x0``), which end at ``times``, as arrays."""
+    n, stages = len(steps), scheme.n_stages + 1
+    return StepData(
+        times=np.array([t0, *times]),
+        states=np.array([x0, *(s.state for s in steps)]),
+        rates=np.array([s.rates for s in steps]).reshape(n, -1 if n else stages, tangent_size),
+        corrections=_corrections(steps),
+        sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
+        ranks=np.array([s.rank for s in steps], dtype=float),
+        error_ratios=np.array([s.error_ratio for s in steps]),
+        placements=np.array([PLACEMENTS.index(s.placement) for s in steps], dtype=float),
+        held=np.array([s.held for s in steps], dtype=float),
+        end_rate=np.array(steps[-1].end_rate if n else np.zeros(tangent_size)),
+        zones={
+            i: (s.zone.threshold, s.history)
+            for i, s in enumerate(steps)
+            if s.zone is not None and s.history is not None
+        },
+        stop=stop,
+        breaks=np.array(breaks, dtype=int),
+        break_rates=np.array([steps[i - 1].end_rate for i in breaks]).reshape(-1, tangent_size),
+    )
+
+
+def _corrections(steps: Sequence[StepResult]) -> FloatArray:
+    """What was subtracted at the ends of the ``steps``; 0 where a method does not in every step."""
+    size = max((s.correction.size for s in steps), default=0)
+    nothing = np.zeros(size)
+    rows = [s.correction if s.correction.size else nothing for s in steps]
+    return np.array(rows).reshape(len(steps), size)
+
+
+@lru_cache(maxsize=64)
+def _abscissae(scheme: ButcherTableau) -> FloatArray:
+    """Those of the stages, and of the end."""
+    return np.append(scheme.c, 1.0)
+
+
+class DenseOutput:
+    """Evaluates the continuous extension of a run.
+
+    Parameters
+    ----------
+    system
+        Used for retraction, and for the extra stages of tableaus that have them.
+    scheme
+        The tableau of the run.
+    steps
+        The accepted steps.
+    """
+
+    def __init__(self, system: System, scheme: ButcherTableau, steps: StepData) -> None:
+        self._system = system
+        self._extension = scheme.dense
+        self._abscissae = _abscissae(scheme)
+        self._smooth: dict[int, HermiteStep] = {}
+        self._steps = steps
+        self._extra: dict[int, FloatArray] = {}
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        """States (k, nx) at the times ``t`` (k,), in any order.
+
+        Raises
+        ------
+        ValueError
+            If a time lies outside the run.
+        """
+        self.check(t)
+        times = self._steps.times
+        out = np.empty((len(t), self._steps.states.shape[1]))
+        if self._steps.count == 0:
+            out[:] = self._steps.states[0]
+            return out
+        index = np.clip(np.searchsorted(times, t, side="right") - 1, 0, self._steps.count - 1)
+        for step in np.unique(index):
+            here = index == step
+            h = times[step + 1] - times[step]
+            out[here] = self._in_step(int(step), (t[here] - times[step]) / h)
+        return out
+
+    def check(self, t: FloatArray) -> None:
+        """Raise InputError if a time of ``t`` (k,) lies outside the run."""
+        check_within(t, float(self._steps.times[0]), self._steps.end)
+
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        """Times (n + 1,) and states (n + 1, nx) at the ends of the steps, the start first; the
+        last ones at the end of the run."""
+        data = self._steps
+        if data.stop is None:
+            return data.times, data.states
+        times, states = data.times.copy(), data.states.copy()
+        times[-1], states[-1] = data.stop, self(np.array([data.stop]))[0]
+        return times, states
+
+    def complete(self) -> StepData:
+        """The steps with the rates of all stages that reading between them needs: for a reader
+        that does not have the controller."""
+        data, count = self._steps, self._extension.n_rates
+        if not data.count or data.rates.shape[1] == count:
+            return data
+        rates = np.zeros((data.count, count, data.rates.shape[2]))
+        rates[:, : data.rates.shape[1]] = data.rates
+        for step, h in enumerate(np.diff(data.times)):
+            if not self._between_neighbours(step):
+                rates[step] = self._all_rates(step, h)
+        return replace(data, rates=rates)
+
+    @cached_property
+    def _whole(self) -> FloatArray:
+        """Weights of the rates over a whole step, as far as the steps have them: those of extra
+        stages are zero."""
+        weights: FloatArray = self._extension.weights(np.ones(1))[0]
+        return weights[: self._steps.rates.shape[1]]
+
+    def _between_neighbours(self, step: int) -> bool:
+        """Whether a step is read from its neighbours (:mod:`.hermite`), not from its stages."""
+        data = self._steps
+        first, last = data.piece(step)
+        return last - first > 1 and (
+            step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
+        )
+
+    def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
+        data, system = self._steps, self._system
+        if self._between_neighbours(step):
+            if step not in self._smooth:
+                self._smooth[step] = HermiteStep(system, data, step, self._whole)
+            return self._smooth[step](theta)
+        h = data.times[step + 1] - data.times[step]
+        start = data.states[step]
+        weights, rates = h * self._extension.weights(theta), self._all_rates(step, h)
+        ramps = self._ramps(step, theta, h)
+        states = []
+        for k in range(len(theta)):
+            # One at a time: how BLAS sums would depend on what else is read with it.
+            x = system.retract(start, weights[k] @ rates)
+            states.append(x if ramps is None else system.retract(x, ramps[k]))
+        return np.array(states)
+
+    def _ramps(self, step: int, theta: FloatArray, h: float) -> FloatArray | None:
+        correction = self._steps.corrections[step]
+        if not correction.size:
+            return None
+        s = theta**2 * (3.0 - 2.0 * theta)
+        r = theta**2 * (theta - 1.0)
+        slope = self._system.rate_change(-correction)
+        return -np.outer(s, correction) + h * np.outer(r, slope)
+
+    def _all_rates(self, step: int, h: float) -> FloatArray:
+        rates: FloatArray = self._steps.rates[step]
+        A, c = self._extension.extra_A, self._extension.extra_c
+        if len(rates) == self._extension.n_rates:  # no extra stages, or evaluated by the method
+            return rates
+        if step not in self._extra:
+            start, t = self._steps.states[step], self._steps.times[step]
+            zone = None
+            if step in self._steps.zones:
+                threshold, history = self._steps.zones[step]
+                zone = Zone(threshold, history.predict)
+            full = np.vstack([rates, np.zeros((len(c), rates.shape[1]))])
+            for i, ci in enumerate(c):
+                delta = (h * A[i]) @ full
+                terms = self._system.evaluate(t + ci * h, self._system.retract(start, delta), zone)
+                full[len(rates) + i] = self._system.chart_rate(delta, terms.rate())
+            self._extra[step] = full[len(rates) :]
+        return np.vstack([rates, self._extra[step]])
+
+
+def wound_angles(
+    joint: Any, nq: int, steps: StepData, scheme: ButcherTableau, t: FloatArray, states: FloatArray
+) -> FloatArray:
+    """Angle (n,) rad of a (cos, sin) joint at ``t``, followed through every step of the run.
+
+    Parameters
+    ----------
+    joint
+        Pinocchio's joint model.
+    nq
+        Length of a configuration: the rates follow it in a state.
+    steps, scheme
+        The steps of the run, and the scheme that made them.
+    t : (n,) s, states : (n, nq + nv)
+        Times within the run, and the states there.
+    """
+    nodes, cos, sin = steps.states, joint.idx_q, joint.idx_q + 1
+    principal = np.arctan2(nodes[:, sin], nodes[:, cos])
+    here = np.arctan2(states[:, sin], states[:, cos])
+    if not steps.count:
+        return here
+    # A long step may turn the joint by more than pi: its chart coordinate knows by how much.
+    h = np.diff(steps.times)
+    turned = h * (steps.rates[:, : scheme.n_stages, joint.idx_v] @ scheme.b)
+    wound = principal[0] + np.concatenate([[0.0], np.cumsum(turned)])
+    wound = _nearest_turn(principal, wound)
+    step = np.clip(np.searchsorted(steps.times, t, side="right") - 1, 0, steps.count - 1)
+    theta = (t - steps.times[step]) / h[step]
+    return _nearest_turn(here, _between(wound, nq, joint.idx_v, steps, step, theta))
+
+
+def _nearest_turn(principal: FloatArray, guess: FloatArray) -> FloatArray:
+    out: FloatArray = principal + 2.0 * np.pi * np.round((guess - principal) / (2.0 * np.pi))
+    return out
+
+
+def _between(
+    wound: FloatArray, nq: int, k: int, steps: StepData, step: IndexArray, theta: FloatArray
+) -> FloatArray:
+    """The angle (n,) at the fractions ``theta`` (n,) of the steps ``step`` (n,), by the polynomial
+    of degree 5 through the angle ``wound``, rate v_k and its derivative at both ends of a step."""
+    h, rate = np.diff(steps.times), steps.states[:, nq + k]
+    place = steps.rates.shape[2] // 2 + k
+    starts = steps.rates[:, 0, place]
+    ends = np.append(starts[1:], steps.end_rate[place])
+    if len(steps.breaks):
+        ends[steps.breaks - 1] = steps.break_rates[:, place]
+    v0, v1 = (h * rate[:-1])[step], (h * rate[1:])[step]
+    a0, a1 = (h**2 * starts)[step], (h**2 * ends)[step]
+    start, gain = wound[step], np.diff(wound)[step]
+    # What is left of the cubic terms after the Taylor polynomial at the start.
+    p = gain - v0 - 0.5 * a0
+    v = v1 - v0 - a0
+    a = a1 - a0
+    bend = 10.0 * p - 4.0 * v + 0.5 * a + theta * (-15.0 * p + 7.0 * v - a)
+    bend += theta**2 * (6.0 * p - 3.0 * v + 0.5 * a)
+    out: FloatArray = start + theta * (v0 + theta * (0.5 * a0 + theta * bend))
+    return out

@@ -1,0 +1,395 @@
+r"""Events: zeros of functions of time and state, located on the dense output of a run.
+
+The conventions are those of ``scipy.integrate.solve_ivp``: an event is a callable that returns a
+float; it occurs where that float passes zero; its attribute ``terminal`` (a bool, or a number of
+occurrences) ends the run there, and ``direction`` (> 0 or < 0) counts only zeros passed upwards or
+downwards.  Four points are settled where SciPy leaves them open:
+
+* A step is examined at as many equal parts of its dense output as that has polynomial degree
+  (3 to 7), and, where the parabola through three neighbouring values comes near zero, at its
+  vertex: a step of dop853 is long enough to hold several zeros.  Two zeros closer to each other
+  than that may still be missed; ``max_step`` helps.
+* A zero at the start of the run is not an event, nor is one within round-off of it, so that a run
+  can be continued from an event.
+* A zero on the boundary of two steps is one event, passed in the direction in which it was
+  reached.
+* A terminal event ends the run with the state of the dense output there; other events are kept up
+  to and including that time.  Those within round-off of it are at that time: what happens at once,
+  by symmetry, has times that differ by rounding, and a run that goes on from there would not count
+  them.
+
+The machinery works on states, for mechanisms and DAEs alike::
+
+    watch = EventWatch(system, scheme, prepare_events(events, adapt), state.size)
+    record = integrate(..., events=watch)
+    times, states = watch.found()
+
+``adapt`` turns a user's function into one of (t, state); for a DAE, whose events have that
+signature already, it is ``lambda event: event``.  ``record.stop`` belongs into
+:class:`~srm_mbs.integration.dense_output.StepData`, whose dense output then ends there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.errors import EvaluationError, EventError, InputError
+from srm_mbs.integration.dense_output import DenseOutput, step_data
+from srm_mbs.integration.methods.base import StepResult
+from srm_mbs.integration.methods.butcher import ButcherTableau
+
+TOGETHER = 1e-10
+"""A zero within this fraction of the first step after the start counts as lying on it, and within
+this fraction of the last step after the end of a run as lying there."""
+ROUNDING = 16.0 * float(np.finfo(float).eps)
+"""The same over the time itself: two equal zeros come out of the search up to 8 eps each apart."""
+RETURNS = 30
+"""Halvings of the first part of a step within which a value that departs from zero may return."""
+NEAR_ZERO = 0.5
+"""A vertex is examined if it is nearer to zero than this fraction of its neighbours."""
+
+
+StateFunction = Callable[[float, FloatArray], Any]
+"""(t, state) -> a float that passes zero at the event."""
+
+
+def together(t: float, t_new: float) -> float:
+    """Times within the step from ``t`` to ``t_new`` that are closer than this (s) are one."""
+    return max(TOGETHER * (t_new - t), ROUNDING * max(abs(t), abs(t_new)))
+
+
+@dataclass(frozen=True)
+class EventFunction:
+    """An event function and its attributes.
+
+    Attributes
+    ----------
+    name
+        How messages call it: the function's name, or its place in the list.
+    function
+        Of (t, state).
+    occurrences
+        Number of occurrences that ends the run; infinite if it is not terminal.
+    direction
+        > 0 for zeros passed upwards, < 0 downwards, 0 for both.
+    acts
+        Whether every occurrence ends the run, because something is to be done there.
+    departs
+        Whether the run starts at an occurrence, from where the value moves away.
+    floor
+        Size of values that count as zero: of an event that closures hold at zero, the rounding.
+    guard
+        Time after the start of the run up to which a zero lies on it; None for :func:`together`
+        of the first step.  In a segment of a run 0 for zeros that its predecessor did not count.
+    """
+
+    name: str
+    function: StateFunction
+    occurrences: float
+    direction: float
+    acts: bool = False
+    departs: bool = False
+    floor: float = 0.0
+    guard: float | None = None
+
+    def __call__(self, t: float, state: FloatArray) -> float:
+        """The value at ``t``; ``state`` must not be needed any more, the user may write to it.
+
+        Raises
+        ------
+        EventError
+            If the function raises, or returns anything but one finite number.
+        """
+        try:
+            value = np.asarray(self.function(t, state), dtype=float)
+        except Exception as error:
+            raise EventError(f"the event {self.name} raised {error!r} at t = {t:.6g} s") from error
+        if value.size != 1 or not np.isfinite(value).all():
+            raise EventError(
+                f"the event {self.name} returned {value.tolist()} at t = {t:.6g} s; "
+                "it must return one finite number"
+            )
+        return float(value.item())
+
+    def sign(self, value: float) -> float:
+        """Sign of a value; 0 at the floor."""
+        return 0.0 if abs(value) <= self.floor else math.copysign(1.0, value)
+
+    def counts(self, rising: bool) -> bool:
+        """Whether a zero passed upwards (``rising``) or downwards is an event."""
+        return self.direction == 0.0 or (self.direction > 0.0) == rising
+
+
+def prepare_events(
+    events: Any, adapt: Callable[[Callable[..., Any]], StateFunction]
+) -> list[EventFunction]:
+    """Events from what a user gives: a callable, or a list of them.
+
+    Parameters
+    ----------
+    events
+        With the attributes ``terminal`` and ``direction``, both optional.
+    adapt
+        Makes a function of (t, state) of each callable.
+
+    Raises
+    ------
+    InputError
+        If something cannot be called, or an attribute has no meaning.
+    """
+    given: Sequence[Any] = [events]
+    if not callable(events):
+        given = list(events) if isinstance(events, Iterable) else given
+    return [_prepared(event, i, adapt) for i, event in enumerate(given)]
+
+
+def _prepared(
+    event: Any, i: int, adapt: Callable[[Callable[..., Any]], StateFunction]
+) -> EventFunction:
+    place = f"events[{i}]"
+    if not callable(event):
+        raise InputError(
+            f"{event!r} cannot be called",
+            element=place,
+            remedy="Give functions that return a float, as scipy.integrate.solve_ivp takes them",
+        )
+    name = getattr(event, "__name__", "<lambda>")
+    terminal, direction = getattr(event, "terminal", None), getattr(event, "direction", 0)
+    occurrences = math.inf if terminal is None else _number(terminal)
+    if occurrences == 0.0:
+        occurrences = math.inf
+    if not (occurrences > 0.0 and (occurrences == math.inf or occurrences.is_integer())):
+        raise InputError(
+            f"terminal = {terminal!r} is neither a boolean nor a number of occurrences",
+            element=place,
+            remedy="Give True, False or a positive integer",
+        )
+    if math.isnan(_number(direction)):
+        raise InputError(
+            f"direction = {direction!r} is not a number",
+            element=place,
+            remedy="Give 1 (upwards), -1 (downwards) or 0 (both)",
+        )
+    label = place if name == "<lambda>" else repr(name)
+    acts, departs = (bool(getattr(event, name, False)) for name in ("acts", "departs"))
+    floor, guard = float(getattr(event, "floor", 0.0)), getattr(event, "guard", None)
+    return EventFunction(
+        label, adapt(event), occurrences, _number(direction), acts, departs, floor, guard
+    )
+
+
+def acting(events: Any) -> bool:
+    """Whether any of what a user gives as events has an action."""
+    given = [events] if callable(events) else events
+    return isinstance(given, Iterable) and any(
+        getattr(event, "action", None) is not None for event in given
+    )
+
+
+def _number(value: Any) -> float:
+    """``value`` as a float, NaN if it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What ended a run: the time of the terminal event, and a sentence that names it."""
+
+    time: float
+    message: str
+
+
+class EventWatch:
+    """Finds events step by step; called by the driver.
+
+    Parameters
+    ----------
+    system, scheme
+        For the dense output of the steps.
+    events
+        From :func:`prepare_events`.
+    size
+        Length of a state.
+    """
+
+    def __init__(
+        self, system: System, scheme: ButcherTableau, events: Sequence[EventFunction], size: int
+    ) -> None:
+        self._system = system
+        self._scheme = scheme
+        self._events = tuple(events)
+        self._fractions = np.linspace(0.0, 1.0, len(scheme.dense.rows) + 1)[1:-1]
+        self._values = [0.0] * len(self._events)
+        # The sign last seen; 0 after a value that was exactly zero.
+        self._signs = [0.0] * len(self._events)
+        self._times: list[list[float]] = [[] for _ in self._events]
+        self._states: list[list[FloatArray]] = [[] for _ in self._events]
+        self._start = 0.0
+        self._size = size
+
+    def begin(self, t: float, state: FloatArray) -> None:
+        """Evaluate the events at the start of a run.
+
+        Raises
+        ------
+        EventError
+            If an event function fails.
+        """
+        self._start = t
+        self._values = [event(t, state.copy()) for event in self._events]
+        self._signs = [
+            0.0 if event.departs else event.sign(value)
+            for event, value in zip(self._events, self._values)
+        ]
+
+    def after_step(self, state: FloatArray, result: StepResult, t_new: float) -> Stop | None:
+        """Record the events of an accepted step from ``state`` to ``t_new``.
+
+        Returns
+        -------
+        Stop or None
+            Where and why the run ends, if a terminal event occurred often enough.
+
+        Raises
+        ------
+        EventError
+            If an event function fails, or a state within the step cannot be evaluated.
+        """
+        t = result.t
+        data = step_data(t, state, [t_new], [result], self._scheme, self._system.tangent_size)
+        dense = DenseOutput(self._system, self._scheme, data)
+        times = [*(t + self._fractions * (t_new - t)).tolist(), t_new]
+        try:
+            states = [*dense(np.array(times[:-1])), result.state]
+        except EvaluationError as error:
+            raise EventError(f"no event could be looked for within a step: {error}") from error
+        found: list[tuple[float, int]] = []
+        for i, event in enumerate(self._events):
+            values = [event(at, x.copy()) for at, x in zip(times, states)]
+            nodes = [(t, self._values[i]), *zip(times, values)]
+            early = None
+            if event.departs and t == self._start and event.counts(rising=values[0] > 0.0):
+                early = self._departing(i, dense, nodes)
+            nodes = _with_vertices(event, dense, nodes)
+            if early is not None:
+                nodes = [early, *(node for node in nodes[1:] if node[0] > early[0])]
+            found += [(time, i) for time in self._zeros(i, nodes, dense)]
+            self._values[i] = values[-1]
+        if not found:
+            return None
+        return self._record(sorted(found), dense, together(t, t_new))
+
+    def _departing(
+        self, i: int, dense: DenseOutput, nodes: list[tuple[float, float]]
+    ) -> tuple[float, float] | None:
+        """A node of the first step between the start and the first of ``nodes`` where the value
+        still has the sign with which it departs, if it returns to zero that soon; else None."""
+        event, (t, _), (after, value) = self._events[i], *nodes[:2]
+        length = after - t
+        for _ in range(RETURNS):
+            length *= 0.5
+            now = _value_at(event, dense, t + length)
+            if now * value < 0.0:
+                self._signs[i] = float(np.sign(now))
+                return t + length, now
+        return None
+
+    def _zeros(self, i: int, nodes: list[tuple[float, float]], dense: DenseOutput) -> list[float]:
+        """Times at which event ``i`` occurs, given its values at ``nodes``."""
+        event = self._events[i]
+        earliest = -math.inf
+        if nodes[0][0] == self._start and not event.departs:
+            guard = event.guard
+            if guard is None:
+                guard = together(self._start, nodes[-1][0])
+            earliest = self._start + guard
+        zeros = []
+        for left, right in pairwise(nodes):
+            before, now = self._signs[i], event.sign(right[1])
+            self._signs[i] = now
+            if before == 0.0 or now == before:
+                continue
+            zero = right[0] if now == 0.0 else _zero_between(event, dense, left, right)
+            if zero > earliest and event.counts(rising=before < 0.0):
+                zeros.append(zero)
+        return zeros
+
+    def _record(
+        self, found: list[tuple[float, int]], dense: DenseOutput, close: float
+    ) -> Stop | None:
+        stop: Stop | None = None
+        for time, i in found:
+            if stop is not None:
+                if time > stop.time + close:
+                    break
+                time = stop.time
+            self._times[i].append(time)
+            self._states[i].append(dense(np.array([time]))[0])
+            event, count = self._events[i], len(self._times[i])
+            if stop is None and (event.acts or count >= event.occurrences):
+                which = f" (occurrence {count})" if count > 1 else ""
+                message = f"The event {event.name}{which} ended the run at t = {time:.9g} s."
+                stop = Stop(time, message)
+        return stop
+
+    def found(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Times (k,) and states (k, nx) of the occurrences, for each event in turn."""
+        times = [np.array(times, dtype=float) for times in self._times]
+        states = [
+            np.array(states, dtype=float).reshape(len(states), self._size)
+            for states in self._states
+        ]
+        return times, states
+
+
+def _value_at(event: EventFunction, dense: DenseOutput, t: float) -> float:
+    return event(t, dense(np.array([t]))[0])
+
+
+def _with_vertices(
+    event: EventFunction, dense: DenseOutput, nodes: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """``nodes``, equally spaced, with the vertices of parabolas that come near zero between."""
+    extra = []
+    for (_, a), (t, b), (t_next, c) in zip(nodes, nodes[1:], nodes[2:]):
+        sign = np.sign(b)
+        curvature = 0.5 * (a + c) - b
+        if not (sign * a > 0.0 and sign * c > 0.0 and sign * curvature > 0.0):
+            continue
+        vertex = -0.25 * (c - a) / curvature
+        lowest = sign * (b - curvature * vertex**2)
+        if abs(vertex) < 1.0 and vertex != 0.0 and lowest < NEAR_ZERO * min(abs(a), abs(b), abs(c)):
+            at = t + vertex * (t_next - t)
+            extra.append((at, _value_at(event, dense, at)))
+    return sorted([*nodes, *extra]) if extra else nodes
+
+
+def _zero_between(
+    event: EventFunction, dense: DenseOutput, left: tuple[float, float], right: tuple[float, float]
+) -> float:
+    """The zero of ``event`` between two (time, value) of opposite sign, to round-off."""
+    from scipy.optimize import brentq
+
+    known = dict((left, right))
+    precision = 4.0 * np.finfo(float).eps
+
+    def value(t: float) -> float:
+        # The dense output at the ends of a step differs from its states by round-off, which
+        # could take the change of sign away.
+        return known[t] if t in known else _value_at(event, dense, t)
+
+    zero = brentq(
+        value, left[0], right[0], xtol=precision * (right[0] - left[0]), rtol=precision, maxiter=200
+    )
+    return float(zero)

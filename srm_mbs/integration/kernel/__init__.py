@@ -1,0 +1,1 @@
+"""Bridge to the compiled kernel: data handed over, runs, dense output."""

@@ -1,0 +1,129 @@
+"""Dense output on the compiled kernel, of the runs that it made."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._kernel import core
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.integration import dense_output as hermite
+from srm_mbs.integration.dense_output import SLACK, DenseOutput, StepData
+from srm_mbs.integration.kernel.system import given_back, shared, taken, twin_of
+from srm_mbs.integration.methods.butcher import ButcherTableau
+
+
+def dense_output(
+    system: ClosedSystem | OpenSystem, scheme: ButcherTableau, steps: StepData, made_by: str
+) -> DenseOutput:
+    """Dense output of a run, on the kernel where that made the run and is at hand.
+
+    Parameters
+    ----------
+    made_by
+        Backend of the run.
+    """
+    if made_by == "kernel" and core is not None:
+        return CompiledDenseOutput(
+            None if shared(system) else twin_of(system), system, scheme, steps
+        )
+    return DenseOutput(system, scheme, steps)
+
+
+class CompiledDenseOutput(DenseOutput):
+    """Dense output on the kernel, of the runs that it made.
+
+    Parameters
+    ----------
+    twin
+        That of the run, to be kept; None where any idle one of the mechanism serves
+        (:func:`~srm_mbs.integration.kernel.system.shared`), so that runs at hand hold no workspace.
+    system, scheme, steps
+        As for :class:`~srm_mbs.integration.dense_output.DenseOutput`.
+    """
+
+    def __init__(
+        self,
+        twin: Any,
+        system: ClosedSystem | OpenSystem,
+        scheme: ButcherTableau,
+        steps: StepData,
+    ) -> None:
+        super().__init__(system, scheme, steps)
+        self._mechanism_system = system
+        self._scheme = scheme
+        self._twin = twin
+        self._compiled: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Where it is copied to there may be no kernel.
+        return dense_output, (self._mechanism_system, self._scheme, self._steps, "kernel")
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        """States (k, nx) at the times ``t`` (k,), in any order; see
+        :class:`~srm_mbs.integration.dense_output.DenseOutput`."""
+        if self._steps.count < 2:  # a single step has no neighbours, but perhaps a zone
+            return super().__call__(t)
+        if self._lone_zones:
+            return super().__call__(t)
+        if len(self._extension.extra_c) and self._steps.rates.shape[1] == self._extension.n_rates:
+            return super().__call__(t)  # loaded without the controller: no stage is to be evaluated
+        if self._compiled is None:
+            self._compiled = self._compile()
+        system = self._mechanism_system
+        twin = taken(system) if self._twin is None else self._twin
+        before = twin.evaluations, twin.factorisations
+        try:
+            return self._compiled.states(twin, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
+        except ArithmeticError:
+            return super().__call__(t)  # which says why
+        except IndexError:
+            self.check(t)  # raises
+            raise
+        finally:
+            system.count(twin.evaluations - before[0], twin.factorisations - before[1])
+            if self._twin is None:
+                given_back(system, twin)
+
+    @cached_property
+    def _lone_zones(self) -> bool:
+        """Whether a step with a zone has a breakpoint on both sides: the kernel's extra stages have
+        no zone."""
+        pieces = (self._steps.piece(step) for step in self._steps.zones)
+        return any(last - first < 2 for first, last in pieces)
+
+    def _compile(self) -> Any:
+        steps, extension = self._steps, self._extension
+        return core.DenseOutput(  # type: ignore[union-attr]
+            self._mechanism_system.nq,
+            self._mechanism_system.nv,
+            {
+                "rows": extension.rows,
+                "extra_A": extension.extra_A,
+                "extra_c": extension.extra_c,
+                "degree": len(extension.rows),
+                "n_rates": extension.n_rates,
+                "abscissae": self._abscissae,
+                "nodes": list(hermite.NODES),
+                "spacing": hermite.SPACING,
+                "close": hermite.CLOSE,
+                "probes": hermite.PROBES,
+                "end": steps.end,
+                "slack": SLACK,
+                "count": steps.count,
+                "width": steps.rates.shape[1],
+                "corrected": steps.corrections.shape[1] > 0,
+                "zones": list(steps.zones),
+                "breaks": steps.breaks.astype(float),
+                **{
+                    name: np.ascontiguousarray(getattr(steps, name))
+                    for name in (
+                        "times", "states", "rates", "corrections", "sigmas", "end_rate",
+                        "break_rates",
+                    )
+                },
+            },
+        )  # fmt: skip

@@ -1,0 +1,148 @@
+"""From the start of a run on the compiled kernel to its record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.errors import ControllerError, EvaluationError, EventError
+from srm_mbs.integration import driver
+from srm_mbs.integration.breakpoints import Passing
+from srm_mbs.integration.dense_output import StepData
+from srm_mbs.integration.driver import RunRecord, Tick
+from srm_mbs.integration.events import EventWatch
+from srm_mbs.integration.kernel.marshalling import VERDICTS, history_from
+from srm_mbs.integration.kernel.run import (
+    ARRIVAL,
+    BREAKPOINT,
+    CHUNK_FULL,
+    CLOSURES,
+    FINISHED,
+    NOT_EVALUATED,
+    STANDSTILL,
+    TOO_SHORT,
+    CompiledRun,
+)
+from srm_mbs.integration.methods.butcher import ButcherTableau
+
+
+@dataclass
+class CompiledRecord(RunRecord):
+    """A run of the kernel.
+
+    Attributes
+    ----------
+    run
+        What holds its steps.
+    suspects
+        Times (s) of steps that were kept although the velocity turned.
+    """
+
+    run: Any = None
+    suspects: list[float] = field(default_factory=list)
+    placed: int = 0
+    replaced: int = 0
+
+    def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
+        """The accepted steps as arrays."""
+        if self.run is None:
+            return super().data(scheme, tangent_size)
+        arrays = self.run.arrays(self.t0, self.x0)
+        zones = {
+            step: (threshold, history_from(history))
+            for step, (threshold, history) in arrays.pop("zones").items()
+        }
+        breaks = arrays.pop("breaks").astype(int)
+        return StepData(breaks=breaks, zones=zones, stop=self.stop, **arrays)
+
+
+def integrate(
+    system: ClosedSystem | OpenSystem,
+    run: CompiledRun,
+    *,
+    tick: Tick | None = None,
+    events: EventWatch | None = None,
+    passing: Passing | None = None,
+) -> CompiledRecord:
+    """As :func:`srm_mbs.integration.driver.integrate`, on the kernel.
+
+    Parameters
+    ----------
+    system
+        The mechanism that ``run`` is of.
+    tick, events
+        With events the kernel returns after every step; with a tick after as many as its
+        ``stride`` says, one if it has none.
+    passing
+        What happens at breakpoints, if there are any.
+    """
+    state = run.start
+    record = CompiledRecord(run.t0, state)
+    record.run = run
+    started = time.perf_counter()
+    one_by_one = tick is not None or events is not None
+    start = state
+    try:
+        if events is not None:
+            events.begin(run.t0, state)
+        reason = CHUNK_FULL
+        while reason in (CHUNK_FULL, BREAKPOINT, ARRIVAL):
+            made = run.count
+            steps = getattr(tick, "stride", 1) if events is None else 1
+            reason = run.advance(steps if one_by_one else 0)
+            if reason == BREAKPOINT and passing is not None:
+                run.pass_breakpoint(passing)
+                continue
+            if reason == ARRIVAL and passing is not None:
+                run.arrive(passing)
+                continue
+            if reason not in (CHUNK_FULL, FINISHED):
+                trouble = why_stopped(reason, system, run)
+                driver.fail(record, run.t, run.h, run.memory(), trouble, run.adaptive)
+                break
+            if not one_by_one or run.count == made:
+                continue
+            result, t = run.last(), run.t
+            stop = None if events is None else events.after_step(start, result, t)
+            start = result.state
+            if stop is not None:
+                record.ended(stop)
+                break
+            if tick is not None:
+                driver.tell(tick, t, result.h, result.state)
+        else:
+            record.finished(run.t_end)
+    except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
+        record.broken_off(run.t, error)
+    record.attempts = [
+        driver.Attempt(t, h, ratio, VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
+    ]
+    record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
+    system.count(run.twin.evaluations, run.twin.factorisations)
+    record.wall_time = time.perf_counter() - started
+    return record
+
+
+def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> str:
+    """Why the kernel stopped, in the words of the reference, which repeats what failed."""
+    attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
+    if reason == STANDSTILL:
+        return driver.standstill(run.t - run.time_before(driver.WATCHED_STEPS))
+    if reason == CLOSURES:
+        return driver.Closures(system, run.norm).trouble(run.last())
+    if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
+        return driver.BELOW_ROUND_OFF
+    if run.trouble:
+        failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
+        # The last one first; at the edge of what can be evaluated rounding decides.
+        for h in reversed(failed):
+            try:
+                run.method.step(system, run.t, h, run.state, run.memory(), run.norm)
+            except EvaluationError as error:
+                return str(error)
+    return driver.NOT_FINITE if reason == NOT_EVALUATED else ""

@@ -1,0 +1,134 @@
+"""A mechanism in the compiled kernel, and the reference with the kernel's regular stages."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+from typing import Any
+
+from srm_mbs._kernel import core
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.dynamics.system import Zone
+from srm_mbs.integration.control.step_size import initial_step
+from srm_mbs.integration.kernel.marshalling import FIRST_STEP
+from srm_mbs.integration.methods.base import ErrorNorm, Memory
+
+KEPT = 4
+"""Idle workspaces that a mechanism keeps at most."""
+LARGEST_KEPT = 64
+"""Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
+
+
+def twin_of(system: ClosedSystem | OpenSystem) -> Any:
+    """The kernel's twin of ``system``, with a workspace of its own."""
+    held = system.held
+    calls = system.calls_forces or (system.controlled and held is None)
+    controller = system.called_force if calls else None
+    twin = core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
+    if held is not None:
+        for t, force in zip(held.times, held.values):
+            twin.hold(t, force, True)
+    return twin
+
+
+def shared(system: ClosedSystem | OpenSystem) -> bool:
+    """Whether a twin of ``system`` serves every run of its mechanism: no function of the user and
+    no motion from one start is in it, and it is small enough to be kept."""
+    return (
+        system.nv <= LARGEST_KEPT
+        and system.held is None
+        and not (system.controlled or system.calls_forces or system.mechanism.drives)
+    )
+
+
+def taken(system: ClosedSystem | OpenSystem) -> Any:
+    """A twin of ``system`` for one user: an idle one of its mechanism, or a new one.
+
+    :func:`given_back` returns it.  One that is not, because a run raised, is simply lost.
+    """
+    if shared(system):
+        with suppress(IndexError):  # deque: two threads never get the same
+            twin = _idle(system).pop()
+            twin.renew(**system.constants_of_start())
+            return twin
+    return twin_of(system)
+
+
+def given_back(system: ClosedSystem | OpenSystem, twin: Any) -> None:
+    """Nobody uses ``twin`` any more: keep it for the mechanism's next run, if it is :func:`shared`
+    and there are not KEPT already."""
+    if shared(system):
+        _idle(system).append(twin)
+
+
+def _idle(system: ClosedSystem | OpenSystem) -> deque[Any]:
+    idle: deque[Any] = system.mechanism.derived("idle twins", lambda: deque(maxlen=KEPT))
+    return idle
+
+
+class _TwinTerms:
+    """Terms of a regular stage, evaluated by the kernel."""
+
+    weak = False
+    held = False
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        self.sigma: float = found["sigma"]
+        self.rank: int = found["rank"]
+        self._found = found
+
+    def rate(self) -> FloatArray:
+        return self._found["rate"]  # type: ignore[no-any-return]
+
+    def multiplier(self) -> FloatArray:
+        return self._found["multiplier"]  # type: ignore[no-any-return]
+
+
+class Evaluator:
+    """A system whose stages outside the zone are evaluated by the kernel.
+
+    Parameters
+    ----------
+    system, twin
+        The mechanism, and what :func:`twin_of` made of it.
+    """
+
+    def __init__(self, system: ClosedSystem | OpenSystem, twin: Any) -> None:
+        self._system = system
+        self._twin = twin
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._system, name)
+
+    def between(self, first: float, last: float) -> None:
+        """Times of both within [``first``, ``last``] (s); see :mod:`..stepping.breakpoints`."""
+        self._system.between(first, last)
+        self._twin.between(first, last)
+
+    def first_step(
+        self,
+        state: FloatArray,
+        memory: Memory,
+        norm: ErrorNorm,
+        span: float,
+        order: int,
+        t: float,
+    ) -> float:
+        """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
+        try:
+            return self._twin.first_step(  # type: ignore[no-any-return]
+                t, state, memory.rate, memory.magnitude, norm.atol, norm.one, norm.rtol, span,
+                order, FIRST_STEP,
+            )  # fmt: skip
+        except ArithmeticError:  # the reference says why
+            return initial_step(self, state, memory, norm, span, order, t)
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
+        """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""
+        if zone is None:
+            try:
+                return _TwinTerms(self._twin.terms(t, state))
+            except ArithmeticError:
+                pass  # the reference says why
+        return self._system.evaluate(t, state, zone)

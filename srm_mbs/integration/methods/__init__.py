@@ -1,0 +1,1 @@
+"""One-step methods: Runge-Kutta tableaus, the split PSRM, and the sweeps of the thesis."""

@@ -1,0 +1,102 @@
+"""Multipliers of recent steps, extrapolated into the zone around a singular configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
+
+STALE = 4.0
+"""A multiplier is predicted at most this many spans of the nodes beyond the last one."""
+WINDOW = 9
+"""Nodes of an interpolation between nodes on both sides."""
+POINTS = 5
+"""Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
+
+
+@dataclass(frozen=True, eq=False)
+class MultiplierHistory:
+    """The last multipliers yhat outside the zone, oldest first.
+
+    Immutable: a step keeps the history that it used, for its dense output.
+
+    Attributes
+    ----------
+    times : (k,) s
+    values : (k, nv)
+    known_until, known_below
+        Of a start on a singular configuration, whose nodes lie ahead: until that time (s), and
+        where sigma is smaller, they are more accurate than the direct solve.
+    normals
+        Of the last node, if it lies next to a singular configuration; see
+        :class:`~srm_mbs.dynamics.system.Zone`.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    known_until: float = -np.inf
+    known_below: float = 0.0
+    normals: FloatArray | None = None
+
+    @classmethod
+    def begin(cls, t: float, value: FloatArray) -> MultiplierHistory:
+        """History with one node."""
+        return cls(np.array([t]), value[None].copy())
+
+    @cached_property
+    def begun(self) -> bool:
+        """Whether there is a node."""
+        return len(self.times) > 0
+
+    def emptied(self) -> MultiplierHistory:
+        """Without nodes: far from singular configurations none are kept."""
+        return MultiplierHistory(self.times[:0], self.values[:0])
+
+    def extended(
+        self, t: float, value: FloatArray, normals: FloatArray | None = None
+    ) -> MultiplierHistory:
+        """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``POINTS`` nodes.
+
+        Nodes ahead of ``t`` are dropped.
+        """
+        if len(self.times) == POINTS and self.times[-1] < t:
+            moved, kept = np.empty_like(self.times), np.empty_like(self.values)
+            moved[:-1], moved[-1] = self.times[1:], t
+            kept[:-1], kept[-1] = self.values[1:], value
+            return MultiplierHistory(moved, kept, normals=normals)
+        before = self.times < t
+        times = np.concatenate([self.times[before], [t]])[-POINTS:]
+        values = np.concatenate([self.values[before], value[None]])[-POINTS:]
+        return MultiplierHistory(times, values, normals=normals)
+
+    def _around(self, t: float) -> slice:
+        """The nodes to use at ``t``: all, unless there are more than WINDOW."""
+        count = len(self.times)
+        first = int(np.searchsorted(self.times, t)) - WINDOW // 2
+        first = max(0, min(first, count - WINDOW))
+        return slice(first, first + WINDOW)
+
+    def predict(self, t: float) -> FloatArray:
+        """yhat (nv,) extrapolated, or between nodes interpolated, to ``t``."""
+        nodes = self._around(t)
+        return lagrange_weights(self.times[nodes], t) @ self.values[nodes]
+
+    def predict_near(self, t: float) -> FloatArray | None:
+        """yhat (nv,) extrapolated to ``t``; None if that lies too far beyond the nodes."""
+        span = float(self.times[-1] - self.times[0])
+        if span > 0.0 and t > max(self.times[-1] + STALE * span, self.known_until):
+            return None
+        return self.predict(t)
+
+    def uncertainty(self, t: float) -> FloatArray:
+        """|yhat_pred - the prediction without the oldest node| (nv,); 0 with a single node."""
+        nodes = self._around(t)
+        times, values = self.times[nodes], self.values[nodes]
+        if len(times) < 2:
+            return np.zeros(values.shape[1])
+        lower = lagrange_weights(times[1:], t) @ values[1:]
+        return np.abs(self.predict(t) - lower)

@@ -1,0 +1,290 @@
+r"""Stages next to a singular configuration, evaluated on the branch of the motion.
+
+A stage lies off the closure manifold by its own error (dq, dv).  Next to a singular configuration
+that error turns the null space of G, and the acceleration changes by
+
+    2 w dv + w^2 dq,   w = |d sigma / dt| / sigma.
+
+Where a step crosses the singular configuration, w h does not shrink with the step, and the scheme
+falls to the order of its stages.  Evaluated at its projection on the manifold (Newton steps with
+the factorisation of each evaluation) a stage sees the smooth field on the branch, and the scheme
+keeps its order.
+
+When the multiplier of a stage is predicted, because a singular configuration is too near.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System, Terms, Zone
+from srm_mbs.integration.methods.base import ErrorNorm, Memory
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+
+ZONE_LARGEST = 1e-3
+"""Largest sigma_z: the zone starts here where rounding exceeds the tolerance, or there is none
+(fixed steps), and later otherwise
+(:meth:`~srm_mbs.integration.methods.near_singular.BranchStages.known_from`)."""
+COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_LARGEST
+"""h * slope of sigma from which the uncertainty of the predicted multiplier counts as error;
+counting it always would trap the step-size control next to the singular configuration."""
+
+
+HIT = 1e-6
+"""sigma that is a direct hit, for which anything predicted is better."""
+FEWEST = 3
+"""Nodes of the history from which a prediction is better than the direct solve."""
+
+
+def zone_from(history: MultiplierHistory | None, threshold: float, end: float) -> Zone | None:
+    """The zone sigma < ``threshold`` of a step to the time ``end``.
+
+    None without nodes; only for direct hits while they are few.
+    """
+    if history is None or not history.begun:
+        return None
+    known = history.known_below if end <= history.known_until else 0.0
+    if len(history.times) < FEWEST:
+        threshold = min(threshold, HIT)
+    return Zone(max(threshold, known), history.predict_near, history.normals)
+
+
+WATCHED = 0.05
+"""sigma below which, or within NEAR steps of which, a step looks out for singular
+configurations."""
+NEAR = 4.0
+"""Steps that start with sigma below NEAR |d sigma / dt| h are looked at; of sweeps, which keep
+their constraint errors for about eps, those below NEAR |d sigma / dt| max(h, eps)."""
+FAR = 8.0
+"""Steps from a singular configuration from which a step prepares nothing for one."""
+PROJECTIONS = 4
+"""Newton steps at most; the error squares each time."""
+AMBIGUOUS = 0.1
+"""A stage that lies off the branch by more than this fraction of sigma is evaluated where it is:
+Newton might lead to another branch."""
+HELD = 0.1
+"""Part of the tolerance up to which a slow motion is held on its branch, not extrapolated."""
+TURNS = 2.0
+"""Margin for what a constraint error changes by because the closures turn."""
+ROUNDING = 16.0 * np.finfo(float).eps
+"""Rounding of the positions, in units: at most."""
+USUAL = 1.0 / 32.0
+"""What it usually is, over ROUNDING: half a unit in the last place."""
+CROSSES = 0.5
+"""sigma at the ends of a step across a singular configuration, over its change."""
+LEAD = 100.0
+"""Steps before a singular configuration from which they are kept long enough for rounding."""
+MOST_FLOOR = 1e-7
+"""Relative error up to which rounding is taken for granted: above, a run had better stop."""
+
+
+@dataclass
+class BranchStages:
+    """Evaluates the stages of one step on their branch.
+
+    Parameters
+    ----------
+    norm, weights : (n,)
+        Error norm and weights of the step.
+    sigma_change
+        |d sigma / dt| h, of the last steps.
+    history
+        What the zone of the step predicts from; None for sweeps that need no zone.
+    end
+        End of the step (s).
+    memory_span
+        How long the method keeps a constraint error, eps (s); 0 if every step removes it.
+
+    Attributes
+    ----------
+    near
+        Whether the step is next to a singular configuration.
+    zone
+        The zone of the step.
+    excused
+        sigma below which a direct solve errs by more than the tolerance, if such are made because
+        predictions err by more; else 0.
+    floor : (n,)
+        Error that rounding leaves in a step of this length that crosses a singular configuration;
+        part of the weights.  It grows like 1/h^2.  Counted from before the configuration on, it
+        keeps the steps so long that their own errors are above it: shorter ones are no more
+        accurate, and get stuck.  0 away from singular configurations.
+    projected
+        Whether any stage was moved.
+    """
+
+    system: System
+    memory: Memory
+    norm: ErrorNorm
+    weights: FloatArray
+    h: float
+    sigma_change: float
+    history: MultiplierHistory | None
+    end: float
+    memory_span: float = 0.0
+    near: bool = field(init=False)
+    zone: Zone | None = field(init=False)
+    excused: float = field(init=False)
+    floor: FloatArray = field(init=False)
+    projected: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self.floor = np.zeros_like(self.weights)
+        # All stages of a step or none: a mixture of both loses the order.
+        # By time, not by steps alone: errors kept over many short steps grow like 1/sigma^2 in the
+        # multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
+        spans = max(1.0, self.memory_span / self.h)
+        reach = NEAR * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED
+        self.near = self.memory.sigma < reach
+        threshold = ZONE_LARGEST
+        lingering = False
+        self.excused = 0.0
+        if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
+            threshold = self.known_from(ZONE_LARGEST, 1.0)
+            lingering = threshold < ZONE_LARGEST and self.lingers(threshold)
+            # The zone is as wide as the tolerance asks for; how good its predictions and
+            # projections have to be follows from what can be had.
+            self.floor = self._floor()
+            self.weights = self.weights + self.floor
+            uncertain = self.uncertainty()
+            if uncertain > 1.0 and not lingering:
+                # A prediction that errs by more than the tolerance is no better than a direct
+                # solve that does.
+                self.excused = threshold
+                threshold = self.known_from(ZONE_LARGEST, uncertain)
+        self.zone = zone_from(self.history, threshold, self.end)
+        if self.zone is not None and lingering:
+            self.zone = replace(self.zone, predict=lambda _: None)
+
+    def __call__(
+        self, terms: Terms, t: float, c: float, x: FloatArray
+    ) -> tuple[Terms, FloatArray, FloatArray | None]:
+        """Terms at the projection of the stage ``x`` on its branch, the projected state, and what
+        was subtracted.
+
+        ``terms``, ``x`` and None where projecting would change nothing that counts: less than
+        ``norm.negligible`` of the tolerance, or than rounding.
+
+        Parameters
+        ----------
+        terms
+            As evaluated at ``x``.
+        c
+            Abscissa of the stage.
+        """
+        moved: FloatArray | None = None
+        if not (self.near and c > 0.0):
+            return terms, x, moved
+        change = max(self.sigma_change, abs(terms.sigma - self.memory.sigma) / c)
+        for _ in range(PROJECTIONS):
+            sigma = terms.sigma
+            if terms.weak or not sigma > 0.0:
+                break
+            error = terms.correction()
+            if self.system.size(error) > AMBIGUOUS * sigma:
+                break
+            effect = self.norm(self._turning(error, sigma, change), self.weights)
+            if effect <= self.norm.negligible:
+                break
+            if effect <= self.norm(self.rounding(sigma, change, True), self.weights):
+                break
+            moved = error.copy() if moved is None else moved + error
+            x = self.system.retract(x, -error)
+            terms = self.system.evaluate(t, x, self.zone)
+            self.projected = True
+        return terms, x, moved
+
+    def _turning(self, error: FloatArray, sigma: float, change: float) -> FloatArray:
+        """Change (n,) of h times the tangent rate by the normal ``error`` (n,) of a stage."""
+        part = self.system.multiplier_part
+        reach = change / sigma
+        out = np.zeros_like(error)
+        out[part] = 2.0 * reach * np.abs(error[part])
+        if part.start:
+            out[part] += (reach * reach / self.h) * np.abs(error[: part.start])
+        return out
+
+    def turning(self, off: FloatArray, sigma: float) -> FloatArray:
+        """Change (n,), at most, over the step of how far a sweep is ``off`` (n,) the closures by
+        their turning next to ``sigma``.
+
+        It is a part of ``off`` however short the step: nothing for a shorter one to mend.
+        """
+        reach = self.sigma_change / sigma
+        return TURNS * (self._turning(off, sigma, self.sigma_change) + reach * np.abs(off))
+
+    def rounding(self, sigma: float, change: float, projected: bool) -> FloatArray:
+        """What rounding at a stage with ``sigma`` does to h times the tangent rate (n,).
+
+        Next to a singular configuration it may exceed the tolerance, and more so the shorter the
+        step: an error estimate below it says nothing.  A projection knows positions to
+        ROUNDING / sigma.
+        """
+        error = (ROUNDING / sigma if projected else ROUNDING) * self.norm.one
+        part = self.system.multiplier_part
+        if part.start:
+            error[part] = change / (self.h * sigma) * error[: part.start]
+        return self._turning(error, sigma, change)
+
+    def _floor(self) -> FloatArray:
+        change = self.sigma_change
+        near = min(WATCHED, LEAD * change)
+        if not (self.memory.sigma < near and self.norm.negligible > 0.0):
+            return np.zeros_like(self.weights)
+        noise = self.rounding(CROSSES * change, change, True)
+        return np.minimum(USUAL * noise, MOST_FLOOR * self.norm.one)
+
+    def widened(
+        self, weights: FloatArray, scheme: ButcherTableau, sigmas: FloatArray
+    ) -> FloatArray:
+        """``weights`` (n,) and what rounding does to the error estimate of a step of ``scheme``
+        with ``sigmas`` (s + 1,) at its stages."""
+        weights = weights + self.floor
+        # Below the threshold of the zone nothing is solved for directly.  Where that lies lower
+        # than the tolerance asks for, shorter steps predict better: rounding is no excuse.
+        least = 0.0 if self.zone is None else self.zone.threshold
+        direct = min((sigma for sigma in sigmas[1:].tolist() if sigma >= least), default=np.inf)
+        lowest = max(direct, self.excused)
+        if scheme.error is None or not 0.0 < lowest < NEAR * self.sigma_change:
+            return weights
+        noise = self.rounding(lowest, self.sigma_change, self.projected)
+        wide: FloatArray = weights + np.abs(scheme.error).max() * noise
+        return wide
+
+    def lingers(self, threshold: float) -> bool:
+        """Whether the motion is so slow that holding it tangential to the normals of the last node,
+        at ``threshold``, errs by little of the tolerance: by |a| threshold + v^2."""
+        part = self.system.multiplier_part
+        if not part.start or self.memory.history is None or self.memory.history.normals is None:
+            return False
+        v, a = self.memory.rate[: part.start], self.memory.rate[part]
+        speed = self.system.size(np.concatenate([v, a]))
+        error = np.zeros_like(self.weights)
+        error[part] = self.h * (threshold * np.abs(a) + speed * np.abs(v))
+        return self.norm(error, self.weights) < HELD
+
+    def uncertainty(self) -> float:
+        """How far the multiplier predicted for the end of the step may be off, over the tolerance;
+        0 where there are too few nodes to tell."""
+        if self.history is None or len(self.history.times) < FEWEST:
+            return 0.0
+        error = np.zeros_like(self.weights)
+        error[self.system.multiplier_part] = self.h * self.history.uncertainty(self.end)
+        return self.norm(error, self.weights)
+
+    def known_from(self, longest: float, allowed: float) -> float:
+        """sigma from which the direct solve errs by less than ``allowed`` tolerances; at most
+        ``longest``.
+
+        Without a tolerance (fixed steps): ``longest``.
+        """
+        if self.norm.negligible == 0.0:
+            return longest
+        part = self.system.multiplier_part
+        error = self.rounding(1.0, self.sigma_change, False)
+        error[part] += self.h * ROUNDING * np.abs(self.memory.rate[part])
+        return float(min(longest, np.sqrt(self.norm(error, self.weights) / allowed)))

@@ -1,0 +1,172 @@
+r"""The Predicted Sequential Regularization Method in all its forms.
+
+Its split form, the default, is made by :mod:`srm_mbs.integration.methods.split_step`, the others by
+:mod:`srm_mbs.integration.methods.iterated_sweeps`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.errors import InputError
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
+from srm_mbs.integration.methods.iterated_sweeps import First, IteratedSweeps
+from srm_mbs.integration.methods.regularisation import Regularisation, parse_eps
+from srm_mbs.integration.methods.split_step import (
+    split_accept,
+    split_resume,
+    split_start,
+    split_step,
+)
+from srm_mbs.integration.methods.sweep import INTERPOLATIONS, checked_regulariser, interpolant
+from srm_mbs.integration.methods.tableaus import get_tableau
+
+_FORMS = {"exact": ("split", "sweep", "fused"), "simple": ("sweep",)}
+"""Corrections of each prediction, the default first."""
+
+
+@dataclass(frozen=True)
+class PSRM:
+    r"""Predicted sequential regularisation, in all its forms.
+
+    =========== ============ ===================================================== ==============
+    prediction  correction   what a step does                                      default eps
+    =========== ============ ===================================================== ==============
+    exact       split        exact multiplier at the stages, correction at the end None: eps -> 0
+    exact       sweep        predictor sweep, then a corrector sweep (3.3)         h^(2/3), from
+                                                                                   order 5 h^(1/3)
+    exact       fused        both in one sweep at its own stages                   as for sweep
+    simple      sweep        multiplier held over the step, one corrector (3.1)    h
+    =========== ============ ===================================================== ==============
+
+    The split form has the order of its tableau and is the one to use.  Orders of the others
+    (observed ones: ``tests/test_methods.py``): simple 2 with eps proportional to h, 1 with a fixed
+    eps; exact sweeps O(eps h^2) + O(h^4/eps^2) for erk4, so 8/3 with eps = h^(2/3), and
+    O(eps h^4) + O(h^5/eps^2) for dopr54, so 13/3 with eps = h^(1/3).  With a fixed eps the exact
+    sweeps with ``interpolation="stages"``, and the fused form, have the order of the tableau.
+
+    Parameters
+    ----------
+    tableau
+        Name in :data:`srm_mbs.TABLEAUS`, or a :class:`ButcherTableau`.
+    prediction
+        ``"exact"``: the multiplier of every stage from the acceleration-level equations;
+        ``"simple"``: that of the step before.
+    correction
+        ``"split"``, ``"sweep"`` or ``"fused"``; by default split for the exact prediction, sweep
+        for the simple one.
+    eps
+        Regularisation parameter: seconds, or ``"h"``, ``"5h"``, ``"h^(2/3)"`` with the step h
+        (s).  None for the default of the form.  Explicit schemes need h/eps below their real
+        stability limit (:func:`~srm_mbs.integration.methods.regularisation.real_stability_limit`).
+    T
+        For DAEs: ``"identity"``, ``"transpose"`` (GB)^T or ``"inverse"`` (GB)^-1, in the sweeps.
+        Mechanisms have no such choice, and the split form is the same for all.
+    interpolation
+        Of the predicted multiplier, with ``correction="sweep"``: ``"stages"``, the predictor's own
+        stages, the default: full order with a fixed eps; or as in the thesis, ``"auto"`` or
+        ``"linear"`` (:func:`~srm_mbs.integration.methods.sweep.interpolant`), which leave larger
+        constraint errors and need more steps: with dopr54, the slider-crank to t = 20 at a
+        tolerance of 1e-4, 95 for ``"stages"``, 101 for ``"auto"``, some 770 for ``"linear"``, which
+        is of order 2.
+
+    Raises
+    ------
+    InputError
+        For an unknown tableau or option, a combination that does not exist, or eps <= 0.
+    """
+
+    tableau: str | ButcherTableau = "dop853"
+    prediction: str = "exact"
+    correction: str | None = None
+    eps: float | str | None = None
+    T: str = "identity"
+    interpolation: str = "stages"
+
+    def __post_init__(self) -> None:
+        get_tableau(self.tableau)
+        forms = _FORMS.get(self.prediction, ()) if isinstance(self.prediction, str) else ()
+        if self.correction is None and forms:
+            object.__setattr__(self, "correction", forms[0])
+        if self.correction not in forms:
+            raise InputError(
+                f"there is no PSRM with prediction={self.prediction!r}, "
+                f"correction={self.correction!r}",
+                element="method",
+                remedy='Use prediction="exact" with correction="split", "sweep" or "fused", or '
+                'prediction="simple" with correction="sweep"',
+            )
+        checked_regulariser(self.T)
+        self._interpolant()
+        self.regularisation  # noqa: B018 - bad eps is refused now
+
+    def _interpolant(self) -> DenseExtension | str:
+        return interpolant(self.scheme, self.interpolation, (*INTERPOLATIONS, "stages"))
+
+    @cached_property
+    def regularisation(self) -> Regularisation | None:
+        """eps as a function of the step; None for eps -> 0."""
+        if self.eps is not None:
+            return parse_eps(self.eps)
+        if self.correction == "split":
+            return None
+        if self.prediction == "simple":
+            return parse_eps("h")
+        return parse_eps("h^(1/3)" if self.scheme.order >= 5 else "h^(2/3)")
+
+    @cached_property
+    def _sweeps(self) -> IteratedSweeps | None:
+        """What makes the steps of all forms but the split one."""
+        if self.correction == "split" or self.regularisation is None:
+            return None
+        fused = self.correction == "fused"
+        first = First.FUSED if fused else First.EXACT
+        return IteratedSweeps(
+            self.scheme,
+            First.HELD if self.prediction == "simple" else first,
+            1,
+            fused,
+            self.regularisation,
+            self._interpolant(),
+        )
+
+    @property
+    def scheme(self) -> ButcherTableau:
+        """The Runge-Kutta data."""
+        return get_tableau(self.tableau)
+
+    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+        """First stage, and the first node of the multiplier history."""
+        if self._sweeps is not None:
+            return self._sweeps.start(system, t, state, norm)
+        return split_start(system, t, state)
+
+    def step(
+        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        if self._sweeps is not None:
+            return self._sweeps.step(system, t, h, state, memory, norm)
+        eps = self.regularisation
+        theta = 1.0 if eps is None else -math.expm1(-h / eps(h))
+        return split_step(system, self.scheme, t, h, state, memory, norm, theta)
+
+    def accept(self, memory: Memory, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        if self._sweeps is not None:
+            self._sweeps.accept(memory, result)
+            return
+        split_accept(memory, result)
+
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+    ) -> Memory:
+        """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        if self._sweeps is not None:
+            return self._sweeps.resume(system, t, state, memory, norm)
+        return split_resume(system, t, state, memory)

@@ -1,0 +1,188 @@
+r"""One step of the split PSRM.
+
+Exact prediction, and the corrector as a splitting at the step end (docs/notation.md): the
+stages integrate
+
+    q' = v,   v' = M^{-1} f - E gamma,
+
+and at the end point x^- = (q^-, v^-), with the same factorisation as the stage evaluated there,
+
+    q = q^- (+) (-theta E g),   v = v^- - theta P v^-,   theta = 1 - exp(-h / eps).
+
+The end stage serves as the next step's first stage with q' = corrected v, so that a step costs as
+many evaluations as the tableau has stages, and a few more next to singular configurations
+(:mod:`srm_mbs.integration.methods.near_singular`).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+from srm_mbs.integration.methods.near_singular import (
+    COUNT_UNCERTAINTY_ABOVE,
+    FAR,
+    WATCHED,
+    BranchStages,
+)
+
+GAP_EVERY = 16
+"""Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
+
+
+@lru_cache(maxsize=64)
+def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
+    """Weights (s, s) and abscissae (s,) of the stages after the first, and of the end."""
+    return np.vstack([scheme.A[1:], scheme.b]), [*scheme.c[1:].tolist(), 1.0]
+
+
+def split_start(system: System, t: float, state: FloatArray) -> Memory:
+    """First stage, and the first node of the multiplier history."""
+    terms = system.evaluate(t, state)
+    memory = Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    if system.has_constraints:
+        memory.history = MultiplierHistory.begin(t, terms.multiplier())
+    return memory
+
+
+def split_step(
+    system: System,
+    scheme: ButcherTableau,
+    t: float,
+    h: float,
+    state: FloatArray,
+    memory: Memory,
+    norm: ErrorNorm,
+    theta: float,
+) -> StepResult:
+    """One step; see :class:`~srm_mbs.integration.methods.base.Method`.
+
+    Raises
+    ------
+    EvaluationError
+        If a stage cannot be evaluated.
+    """
+    s = scheme.n_stages
+    all_weights, fractions = later_stages(scheme)
+    history, start = memory.history, memory.sigma
+    sigma_change = h * memory.sigma_slope
+    branch: BranchStages | None = None
+    zone = None
+    if history is not None and start < WATCHED + FAR * sigma_change:
+        weights = norm.weights(memory.magnitude)
+        branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
+        zone = branch.zone
+    # Zeros, because each stage weighs all s rates: those still to come with 0.
+    rates = np.zeros((s + 1, system.tangent_size))
+    weighed = rates[:s]
+    all_sigmas = [start]
+    rates[0] = memory.rate
+    weak: list[tuple[int, int, bool]] = []
+    for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
+        delta = stage_weights.dot(weighed)
+        x = system.retract(state, delta)
+        terms = system.evaluate(t + fraction * h, x, zone)
+        all_sigmas.append(terms.sigma)
+        if branch is not None:
+            terms, x, moved = branch(terms, t + fraction * h, fraction, x)
+        rate = terms.rate()
+        rates[j] = system.chart_rate(delta, rate)
+        if terms.weak:
+            weak.append((j, terms.rank, terms.held))
+    sigma = terms.sigma
+    change = abs(sigma - start)
+    quiet = branch is None and sigma > WATCHED + FAR * change
+    magnitude = system.magnitudes(x)
+    multiplier = normals = None
+    if history is None:
+        correction = np.zeros(0)
+        new_state, end_rate = x, rate.copy()
+    else:
+        correction = terms.correction()
+        if theta != 1.0:
+            correction = theta * correction
+        new_state = system.retract(x, -correction)
+        end_rate = rate - system.rate_change(correction)
+        if not (quiet or terms.weak) and (branch is not None or sigma < WATCHED):
+            multiplier = terms.multiplier()
+            if sigma < WATCHED:
+                normals = terms.normals()
+                normals = normals if normals.shape[1] else None
+        if branch is not None and moved is not None:
+            correction = correction + moved
+    sigmas = np.array(all_sigmas)
+    error_ratio = 0.0
+    if scheme.error is not None:
+        error = h * (scheme.error @ rates)
+        weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+        if branch is not None and history is not None:
+            if weak and sigma_change > COUNT_UNCERTAINTY_ABOVE:
+                error = np.abs(error)
+                for j, *_ in weak:
+                    if j < s:
+                        uncertainty = history.uncertainty(t + scheme.c[j] * h)
+                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
+            weights = branch.widened(weights, scheme, sigmas)
+        error_ratio = norm(error, weights)
+    result = StepResult(
+        t=t,
+        h=h,
+        state=new_state,
+        rates=rates,
+        end_rate=end_rate,
+        correction=correction,
+        error_ratio=error_ratio,
+        sigmas=sigmas,
+        rank=terms.rank,
+        zone=None,
+        history=None,
+        multiplier=multiplier,
+        magnitude=magnitude,
+    )
+    steps = memory.steps
+    if (steps < GAP_EVERY or steps % GAP_EVERY == 0) and history is not None and theta == 1.0:
+        result.gap = terms.gap()
+    if quiet:
+        middle, c = scheme.middle
+        halfway = abs(all_sigmas[middle] - start) / c
+        result.quiet = True
+        result.slope = (change if change > halfway else halfway) / h
+        return result
+    result.normals = normals
+    if weak:
+        result.rank = min(rank for _, rank, _ in weak)
+        result.held = any(held for *_, held in weak)
+        result.zone, result.history = zone, history
+    return result
+
+
+def split_resume(system: System, t: float, state: FloatArray, memory: Memory) -> Memory:
+    """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
+    fresh = split_start(system, t, state)
+    fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
+    return fresh
+
+
+def split_accept(memory: Memory, result: StepResult) -> None:
+    """Move ``memory`` to the end of an accepted step."""
+    memory.steps += 1
+    memory.rate = result.end_rate
+    memory.sigma = float(result.sigmas[-1])
+    memory.magnitude = result.magnitude
+    if memory.history is not None:
+        memory.history = history_after(memory.history, result)
+
+
+def history_after(history: MultiplierHistory, result: StepResult) -> MultiplierHistory:
+    """``history`` behind an accepted step."""
+    if result.multiplier is not None:
+        return history.extended(result.t + result.h, result.multiplier, result.normals)
+    if result.zone is None and history.begun:
+        return history.emptied()
+    return history

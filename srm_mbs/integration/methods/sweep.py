@@ -1,0 +1,331 @@
+r"""One explicit Runge-Kutta sweep over a step, and its multiplier as the next sweep sees it.
+
+Sweep s integrates its own equation with the multiplier of sweep s - 1 at the same times
+(docs/notation.md).  All sweeps of a step are evaluated at the same *nodes*: the stages of the
+tableau, the end of the step, and the extra stages of its continuous extension if there are any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System, Terms, Zone
+from srm_mbs.errors import InputError
+from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
+from srm_mbs.integration.methods.near_singular import BranchStages
+
+Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
+"""(terms, node) -> tangent rate and multiplier there; the equation that a sweep integrates."""
+
+INTERPOLATIONS = ("auto", "linear")
+"""Those of SRM; PSRM has ``"stages"`` as well."""
+GOOD_EXTENSION = 4
+"""Order from which an extension is used to interpolate the multiplier."""
+
+
+REGULARISERS = ("identity", "transpose", "inverse")
+"""The matrices T of (2.2): I, (GB)^T, (GB)^-1."""
+
+
+def checked_regulariser(T: str) -> None:
+    """Refuse a matrix T that sweeps do not have.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+    """
+    if T not in REGULARISERS:
+        raise InputError(
+            f"there is no T = {T!r}",
+            element="T",
+            remedy=f"Known: {', '.join(map(repr, REGULARISERS))}",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Where the sweeps of a scheme are evaluated: s stages, the end, e extra stages.
+
+    Attributes
+    ----------
+    c : (s + 1 + e,)
+        Abscissae.
+    A : (s + 1 + e, s + 1 + e)
+        Weights of the rates before each node.
+    """
+
+    c: FloatArray
+    A: FloatArray
+
+
+@lru_cache(maxsize=64)
+def nodes_of(scheme: ButcherTableau) -> Nodes:
+    """The nodes of ``scheme`` with its default extension."""
+    s, extension = scheme.n_stages, scheme.dense
+    n = extension.n_rates
+    A = np.zeros((n, n))
+    A[:s, :s] = scheme.A
+    A[s, :s] = scheme.b
+    A[s + 1 :] = extension.extra_A
+    return Nodes(np.concatenate([scheme.c, [1.0], extension.extra_c]), A)
+
+
+def interpolant(
+    scheme: ButcherTableau, interpolation: str, known: tuple[str, ...] = INTERPOLATIONS
+) -> DenseExtension | str:
+    """How the multiplier of a sweep reaches the nodes of the next.
+
+    ``"auto"``: by the continuous extension where the tableau has one of order 4 or more (the
+    thesis' own for dopr54), linearly for the others, as in the thesis.  ``"linear"``: between the
+    ends of the step.  ``"stages"``: the values at the sweep's own stages.
+
+    Raises
+    ------
+    InputError
+        For a name that is not ``known``.
+    """
+    if interpolation not in known:
+        raise InputError(
+            f"there is no interpolation {interpolation!r}",
+            element="interpolation",
+            remedy=f"Known: {', '.join(map(repr, known))}",
+        )
+    if interpolation != "auto":
+        return interpolation
+    extension = scheme.extensions.get("thesis", scheme.dense)
+    return extension if extension.order >= GOOD_EXTENSION else "linear"
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A sweep at the start of a step, where it is evaluated already.
+
+    Attributes
+    ----------
+    rate : (n,)
+        Tangent rate.
+    multiplier : (k,)
+        The sweep's multiplier.
+    sigma, rank, weak
+        Of the evaluation.
+    """
+
+    rate: FloatArray
+    multiplier: FloatArray
+    sigma: float
+    rank: int
+    weak: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """A sweep over one step.
+
+    Attributes
+    ----------
+    start : (nx,)
+        State at the start.
+    state : (nx,)
+        State at the end.
+    rates : (s + 1 + e, n)
+        Chart rates at the nodes.
+    multipliers : (s + 1 + e, k)
+        Multipliers at the nodes, at the stages' own states.
+    end_rate : (n,)
+        Tangent rate at the end.
+    sigmas : (s + 1,)
+    rank
+        The smallest of any node.
+    weak
+        Nodes with dropped rows.
+    exact
+        yhat by the exact prediction at the end point if it was asked for, else None.
+    off : (n,) or None
+        How far the end point lies off the closures, (E g, E c), if it was asked for.
+    off_before : (n,) or None
+        The same at the start of the step, where it is known.
+    """
+
+    start: FloatArray
+    state: FloatArray
+    rates: FloatArray
+    multipliers: FloatArray
+    end_rate: FloatArray
+    sigmas: FloatArray
+    rank: int
+    weak: tuple[int, ...]
+    exact: FloatArray | None
+    off: FloatArray | None
+    off_before: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class OnBranch:
+    """Evaluates a sweep next to a singular configuration: its algebra on the branch.
+
+    A sweep lies off the closures by its drift and the error of its stage.  M, f, P and E are taken
+    at the projection on the branch, from which (dq, dv) was subtracted; the terms in 1/eps are the
+    sweep's own: E g/eps = dq/eps and P v/eps = dv/eps to first order (dx/eps for a DAE).
+
+    Attributes
+    ----------
+    stages
+        Of the step.
+    eps
+        Regularisation (s); None for a sweep without terms in 1/eps.
+    """
+
+    stages: BranchStages
+    eps: float | None
+
+    def __call__(
+        self, terms: Terms, t: float, c: float, x: FloatArray, j: int, answer: Answer
+    ) -> tuple[Terms, FloatArray, FloatArray, FloatArray | None]:
+        """Terms of the stage ``x`` with abscissa ``c``, its tangent rate, its multiplier, and what
+        was subtracted, if anything."""
+        terms, _, moved = self.stages(terms, t, c, x)
+        return terms, *self.with_own_terms(*answer(terms, j), moved), moved
+
+    def with_own_terms(
+        self, rate: FloatArray, multiplier: FloatArray, moved: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """``rate`` and ``multiplier`` on the branch, with the sweep's own terms of a stage that
+        was ``moved`` to it."""
+        if moved is None or self.eps is None:
+            return rate, multiplier
+        system = self.stages.system
+        rate = rate + system.rate_change(moved) - moved / self.eps
+        return rate, multiplier + moved[system.multiplier_part] / self.eps
+
+
+def sweep_over(
+    system: System,
+    scheme: ButcherTableau,
+    t: float,
+    h: float,
+    state: FloatArray,
+    answer: Answer,
+    start: Start | None = None,
+    zone: Zone | None = None,
+    near: OnBranch | None = None,
+    *,
+    exact: bool = False,
+    off: bool = False,
+) -> Sweep:
+    """Integrate one sweep's equation from ``state`` at ``t`` over ``h``.
+
+    Parameters
+    ----------
+    answer
+        The equation.
+    start
+        The first stage, if it is known; evaluated otherwise.
+    near
+        How stages next to a singular configuration are evaluated; by default like all others.
+    exact
+        Keep yhat by the exact prediction at the end point.
+    off
+        Keep how far the end point lies off the closures.
+
+    Raises
+    ------
+    EvaluationError
+        If a stage cannot be evaluated.
+    """
+    nodes, s = nodes_of(scheme), scheme.n_stages
+    n = len(nodes.c)
+    if start is None:
+        terms = system.evaluate(t, state, zone)
+        rate, multiplier = answer(terms, 0)
+        start = Start(rate, multiplier, terms.sigma, terms.rank, terms.weak)
+    rates = np.empty((n, system.tangent_size))
+    multipliers = np.empty((n, start.multiplier.size))
+    sigmas = np.empty(s + 1)
+    rates[0], multipliers[0], sigmas[0] = start.rate, start.multiplier, start.sigma
+    rank = start.rank
+    weak = [0] if start.weak else []
+    end_state, end_rate = state, start.rate
+    end_exact: FloatArray | None = None
+    end_off: FloatArray | None = None
+    for j in range(1, n):
+        delta = (h * nodes.A[j, :j]) @ rates[:j]
+        x = system.retract(state, delta)
+        c = float(nodes.c[j])
+        terms = system.evaluate(t + c * h, x, zone)
+        if j <= s:
+            sigmas[j] = terms.sigma
+        moved: FloatArray | None = None
+        if near is not None and c > 0.0:
+            terms, rate, multipliers[j], moved = near(terms, t + c * h, c, x, j, answer)
+        else:
+            rate, multipliers[j] = answer(terms, j)
+        rates[j] = system.chart_rate(delta, rate)
+        rank = min(rank, terms.rank)
+        if terms.weak:
+            weak.append(j)
+        if j == s:
+            end_state, end_rate = x, rate.copy()
+            if exact and not terms.weak:
+                end_exact = terms.multiplier().copy()
+            if off:
+                end_off = terms.correction() + (0.0 if moved is None else moved)
+    return Sweep(
+        state,
+        end_state,
+        rates,
+        multipliers,
+        end_rate,
+        sigmas,
+        rank,
+        tuple(weak),
+        end_exact,
+        end_off,
+    )
+
+
+def multipliers_between(
+    system: System,
+    scheme: ButcherTableau,
+    how: DenseExtension | str,
+    t: float,
+    h: float,
+    sweep: Sweep,
+    answer: Answer,
+    zone: Zone | None = None,
+    near: OnBranch | None = None,
+) -> FloatArray:
+    """The multiplier of ``sweep`` at all nodes (s + 1 + e, k), for the next sweep.
+
+    An extension gives the state there, at which ``answer`` gives the multiplier; the ends of the
+    step keep the values that the sweep has there.
+    """
+    if how == "stages":
+        return sweep.multipliers
+    c, end = nodes_of(scheme).c, scheme.n_stages
+    first, last = sweep.multipliers[0], sweep.multipliers[end]
+    if isinstance(how, str):
+        line: FloatArray = first + c[:, None] * (last - first)
+        return line
+    out = np.empty_like(sweep.multipliers)
+    done: dict[float, int] = {0.0: 0, 1.0: end}
+    out[0], out[end] = first, last
+    for j, theta in enumerate(c.tolist()):
+        if theta in done:
+            out[j] = out[done[theta]]
+            continue
+        weights = how.weights(theta)[0]
+        delta = (h * weights) @ sweep.rates[: how.n_rates]
+        x = system.retract(sweep.start, delta)
+        terms = system.evaluate(t + theta * h, x, zone)
+        if near is not None:
+            out[j] = near(terms, t + theta * h, theta, x, j, answer)[2]
+        else:
+            out[j] = answer(terms, j)[1]
+        done[theta] = j
+    return out

@@ -1,1 +1,0 @@
-"""How one step is made: the contract (``base``), the methods, and Runge-Kutta data."""

@@ -1,0 +1,1 @@
+"""Mechanism data that checks itself: closures, forces, drives, laws; it computes no dynamics."""

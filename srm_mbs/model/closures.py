@@ -1,0 +1,524 @@
+r"""Loop closures as immutable descriptions; :mod:`srm_mbs.dynamics.constraints.rows` evaluates
+them.
+
+The types of loop closure, as data.
+
+A closure ties an anchor frame *a* on one body to an anchor frame *b* on another, or joints to each
+other.  With the position p of a's origin and the rotation R of a's axes, both in b's frame, and the
+coordinates q_i of joints with one degree of freedom, every type below is a set of scalar rows of
+four kinds:
+
+* *position rows*   g = d . p,      d a constant unit vector in b;
+* *distance rows*   g = |p| - L,    L a length;
+* *alignment rows*  g = n . (R u),  u constant in a, n constant in b (zero when they are
+  perpendicular; used with R u close to a vector that is perpendicular to n);
+* *joint rows*      g = sum c_i q_i - s,  c_i and s constant.
+
+A new type made of these is one more entry of :data:`CLOSURE_TYPES`; its Jacobian, its
+:math:`\dot G v`, its reactions and its assembly follow from the kinds of row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.model.anchors import Anchor, finite_numbers, name_places, resolve_apart, vector
+
+
+def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors that complete the unit vector ``axis`` (3,) to a right-handed frame.
+
+    For a coordinate axis they are the other two coordinate axes, so that rows that vanish in a
+    planar mechanism vanish exactly.
+    """
+    helper = np.zeros(3)
+    helper[(int(np.argmax(np.abs(axis))) + 1) % 3] = 1.0
+    first = helper - axis * (axis @ helper)
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
+_XYZ = np.eye(3)
+
+
+@dataclass(frozen=True)
+class JointRow:
+    """g = sum c_i q_i - offset over joints with one coordinate and one degree of freedom.
+
+    Attributes
+    ----------
+    joints
+        Their names.
+    coefficients
+        c_i; products with q_i have the unit of the offset.
+    offset
+        s, in the unit of the row: that of the first joint (rad or m) where c_1 is a pure number.
+    """
+
+    joints: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class RowSet:
+    """Rows of one closure in its own anchors, in this order.
+
+    Attributes
+    ----------
+    directions : (k, 3) unit vectors d in b of the position rows
+    distances : the lengths L (m) of the distance rows
+    alignments : (r, 2, 3) pairs (u in a, n in b) of the alignment rows
+    joint_rows : the joint rows
+    matched : (c, 3) axes, the same components in a and b, that must coincide with their sign;
+        assembly uses them, because the alignment rows alone also admit the reversed axis.  Where
+        there are none, the alignment rows are all that is asked for
+    labels : names of all rows
+    """
+
+    labels: tuple[str, ...]
+    directions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    alignments: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    matched: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    distances: tuple[float, ...] = ()
+    joint_rows: tuple[JointRow, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.labels)
+
+    @property
+    def blocks(self) -> tuple[slice, slice, slice]:
+        """The rows that are lengths (position and distance rows), alignments, and joint rows."""
+        lengths = len(self.directions) + len(self.distances)
+        joints = lengths + len(self.alignments)
+        return slice(0, lengths), slice(lengths, joints), slice(joints, self.count)
+
+
+def _no_axis() -> FloatArray:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True)
+class ClosureValues:
+    """What the rows of a closure are made of: unit axes (3,), m; types read what they need."""
+
+    axis: FloatArray = field(default_factory=_no_axis)
+    axis_a: FloatArray = field(default_factory=_no_axis)
+    axis_b: FloatArray = field(default_factory=_no_axis)
+    length: float = np.nan
+    joint_row: JointRow = field(default_factory=lambda: JointRow((), ()))
+
+
+@dataclass(frozen=True)
+class ClosureType:
+    """One type of closure.
+
+    Attributes
+    ----------
+    name
+        As in a description.
+    needs
+        Keys that it must have besides its name and type.
+    takes
+        Keys that it may have.
+    rows
+        Its rows.
+    summary
+        What it is, in a few words.
+    """
+
+    name: str
+    needs: tuple[str, ...]
+    rows: Callable[[ClosureValues], RowSet]
+    summary: str
+    takes: tuple[str, ...] = ()
+
+
+def _point(_: ClosureValues) -> RowSet:
+    return RowSet(("x", "y", "z"), _XYZ)
+
+
+_TURNS = np.array([[_XYZ[1], _XYZ[2]], [_XYZ[2], _XYZ[0]], [_XYZ[0], _XYZ[1]]])
+"""At R = 1 the rates of these alignments are the components of the relative angular velocity."""
+
+
+def _frame(_: ClosureValues) -> RowSet:
+    return RowSet(("x", "y", "z", "rx", "ry", "rz"), _XYZ, _TURNS, _XYZ)
+
+
+def _axis_rows(axis: FloatArray) -> FloatArray:
+    """The two alignments that keep ``axis`` of a parallel to ``axis`` of b."""
+    n1, n2 = perpendicular_basis(axis)
+    return np.array([[axis, n1], [axis, n2]])
+
+
+def _revolute(values: ClosureValues) -> RowSet:
+    labels = ("x", "y", "z", "axis_1", "axis_2")
+    return RowSet(labels, _XYZ, _axis_rows(values.axis), values.axis[None])
+
+
+def _prismatic(values: ClosureValues) -> RowSet:
+    across = np.array(perpendicular_basis(values.axis))
+    return RowSet(("normal_1", "normal_2", "rx", "ry", "rz"), across, _TURNS, _XYZ)
+
+
+def _cylindrical(values: ClosureValues) -> RowSet:
+    axis = values.axis
+    across = np.array(perpendicular_basis(axis))
+    labels = ("normal_1", "normal_2", "axis_1", "axis_2")
+    return RowSet(labels, across, _axis_rows(axis), axis[None])
+
+
+def _universal(values: ClosureValues) -> RowSet:
+    cross = np.array([[values.axis_a, values.axis_b]])
+    return RowSet(("x", "y", "z", "cross"), _XYZ, cross)
+
+
+def _planar(values: ClosureValues) -> RowSet:
+    axis = values.axis
+    return RowSet(("normal", "axis_1", "axis_2"), axis[None].copy(), _axis_rows(axis), axis[None])
+
+
+def _point_on_line(values: ClosureValues) -> RowSet:
+    return RowSet(("normal_1", "normal_2"), np.array(perpendicular_basis(values.axis)))
+
+
+def _point_on_plane(values: ClosureValues) -> RowSet:
+    return RowSet(("normal",), values.axis[None].copy())
+
+
+def _distance(values: ClosureValues) -> RowSet:
+    return RowSet(("distance",), distances=(values.length,))
+
+
+def _coupling(values: ClosureValues) -> RowSet:
+    return RowSet(("coupling",), joint_rows=(values.joint_row,))
+
+
+_ANCHORS = ("a", "b")
+_WITH_AXIS = (*_ANCHORS, "axis")
+
+CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType(
+    {
+        closure.name: closure
+        for closure in (
+            ClosureType("point", _ANCHORS, _point, "ball joint: the two origins coincide"),
+            ClosureType("frame", _ANCHORS, _frame, "weld: the two frames coincide"),
+            ClosureType("revolute", _WITH_AXIS, _revolute, "hinge: origins and axes coincide"),
+            ClosureType(
+                "prismatic", _WITH_AXIS, _prismatic, "slider: a moves in b along axis, without turn"
+            ),
+            ClosureType(
+                "cylindrical", _WITH_AXIS, _cylindrical, "a slides along axis and turns about it"
+            ),
+            ClosureType(
+                "universal",
+                (*_ANCHORS, "axis_a", "axis_b"),
+                _universal,
+                "Hooke joint: the origins coincide, axis_a of a is perpendicular to axis_b of b",
+            ),
+            ClosureType(
+                "planar", _WITH_AXIS, _planar, "a moves in the plane of b with normal axis"
+            ),
+            ClosureType(
+                "point_on_line",
+                _WITH_AXIS,
+                _point_on_line,
+                "a's origin on the line of b along axis",
+            ),
+            ClosureType(
+                "point_on_plane",
+                _WITH_AXIS,
+                _point_on_plane,
+                "a's origin in the plane through b's origin with normal axis",
+            ),
+            ClosureType(
+                "distance", _ANCHORS, _distance, "rod: the origins keep their distance", ("length",)
+            ),
+            ClosureType(
+                "coupling",
+                ("joints",),
+                _coupling,
+                "gear: a linear relation of joint coordinates",
+                ("ratio", "coefficients", "offset"),
+            ),
+        )
+    }
+)
+"""The closures by their type in a description."""
+
+
+_KEYS = {
+    "a": ("an anchor a", 'Give "a = { link = ... }"'),
+    "b": ("an anchor b", 'Give "b = { link = ... }"'),
+    "axis": ("an axis", 'Give "axis = [x, y, z]", in b\'s frame'),
+    "axis_a": ("an axis_a", 'Give "axis_a = [x, y, z]", in a\'s frame'),
+    "axis_b": ("an axis_b", 'Give "axis_b = [x, y, z]", in b\'s frame'),
+    "length": ("a length", 'Give "length = ...", in m'),
+    "joints": ("joints", 'Give "joints = [first, second]"'),
+    "ratio": ("a ratio", 'Give "ratio = ..."'),
+    "coefficients": ("coefficients", 'Give "coefficients = [...]"'),
+    "offset": ("an offset", 'Give "offset = ..."'),
+}
+"""Keys of a closure: in words, and how to give them."""
+_COINCIDENT = 1e-9
+"""Distance, over that of the points from the world's origin, below which it is rounding."""
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """One loop closure: between anchors ``a`` and ``b``, or (``coupling``) between joints.
+
+    Parameters
+    ----------
+    type
+        A key of :data:`srm_mbs.model.closures.CLOSURE_TYPES`, or a
+        :class:`~srm_mbs.model.closures.ClosureType` of one's own.
+    a, b
+        The two anchors.
+    axis : (3,)
+        Direction in b's frame, for the types that have one; normalised here.
+    name
+        Unique name; by default made from the type and the links or joints.
+    axis_a, axis_b : (3,)
+        ``universal``: the axes of the cross, in a's and in b's frame; normalised here.
+    length
+        ``distance``: m; by default the distance in the initial configuration (the guess), which
+        :class:`~srm_mbs.model.mechanism.Mechanism` fills in.
+    joints
+        ``coupling``: names of joints with one degree of freedom.
+    ratio, offset
+        ``coupling`` of two joints: q_a = ratio q_b + offset, in rad or m; offset 0 by default.
+    coefficients
+        ``coupling`` of any number of joints, instead of ``ratio``: sum c_i q_i = offset.
+
+    Raises
+    ------
+    InputError
+        For an unknown type; for an anchor, axis or other key that is missing, superfluous or
+        cannot be.
+    """
+
+    type: str | ClosureType
+    a: Anchor | None = None
+    b: Anchor | None = None
+    axis: tuple[float, float, float] | None = None
+    name: str = ""
+    axis_a: tuple[float, float, float] | None = None
+    axis_b: tuple[float, float, float] | None = None
+    length: float | None = None
+    joints: tuple[str, ...] | None = None
+    ratio: float | None = None
+    coefficients: tuple[float, ...] | None = None
+    offset: float | None = None
+
+    def __post_init__(self) -> None:
+        places = name_places(f"loop {self.name!r}", self.a, self.b)
+        if not self.name:
+            where = places or [*(self.joints or ())]
+            object.__setattr__(self, "name", "_".join((self.type_name, *where)))
+        if not isinstance(self.type, ClosureType) and self.type not in CLOSURE_TYPES:
+            raise self._fault(
+                f"there is no closure type {self.type!r}",
+                f"Known: {', '.join(CLOSURE_TYPES)}",
+            )
+        kind = self.kind
+        for key, (words, remedy) in _KEYS.items():
+            given = getattr(self, key) is not None
+            if not given and key in kind.needs:
+                raise self._fault(f"a {self.type_name} closure needs {words}", remedy)
+            if given and key not in (*kind.needs, *kind.takes):
+                raise self._fault(f"a {self.type_name} closure takes no {key}", f'Remove "{key}"')
+        for key in ("axis", "axis_a", "axis_b"):
+            if getattr(self, key) is not None:
+                self._take_axis(key)
+        if self.length is not None:
+            self._take_length()
+        if self.joints is not None:
+            self._take_joints(self.joints)
+
+    def _fault(self, problem: str, remedy: str) -> InputError:
+        return InputError(problem, element=f"loop {self.name!r}", remedy=remedy)
+
+    def _take_axis(self, key: str) -> None:
+        axis = np.array(vector(getattr(self, key), key))
+        size = float(np.linalg.norm(axis))
+        if size == 0.0:
+            raise self._fault(f"the {key} is zero", "Give a direction")
+        axis /= size
+        object.__setattr__(self, key, (float(axis[0]), float(axis[1]), float(axis[2])))
+
+    def _take_numbers(self, key: str, given: Any, count: int) -> tuple[float, ...]:
+        try:
+            return finite_numbers(given, count, key, f"Give {count} finite number(s)")
+        except InputError as error:
+            error.element = f"loop {self.name!r}"
+            raise
+
+    def _take_length(self) -> None:
+        (length,) = self._take_numbers("length", (self.length,), 1)
+        if length == 0.0:
+            raise self._fault(
+                "a distance of 0 has no direction",
+                'Use type = "point", which makes the two origins coincide',
+            )
+        if length < 0.0:
+            raise self._fault(f"the length {length:g} m is negative", "Give a length > 0")
+        object.__setattr__(self, "length", length)
+
+    def _take_joints(self, given: Sequence[str]) -> None:
+        joints = tuple(given) if not isinstance(given, str) else (given,)
+        if not joints or not all(isinstance(name, str) for name in joints):
+            raise self._fault(
+                f"joints = {given!r} is not a list of names", 'Give "joints = [first, second]"'
+            )
+        for name in joints:
+            if joints.count(name) > 1:
+                raise self._fault(
+                    f"the joint {name!r} is named twice", "Keep one, with the sum of both"
+                )
+        if (self.ratio is None) == (self.coefficients is None):
+            raise self._fault(
+                "a coupling needs a ratio or coefficients"
+                if self.ratio is None
+                else "a coupling takes either a ratio or coefficients",
+                'Give "ratio = ..." (q_a = ratio q_b + offset) for two joints, or '
+                '"coefficients = [...]" (sum c_i q_i = offset)',
+            )
+        if self.ratio is not None:
+            if len(joints) != 2:
+                raise self._fault(
+                    f"a ratio relates two joints, not {len(joints)}",
+                    "Name two joints, or give coefficients",
+                )
+            (ratio,) = self._take_numbers("ratio", (self.ratio,), 1)
+            object.__setattr__(self, "ratio", ratio)
+            numbers: tuple[float, ...] = (ratio,)
+        else:
+            numbers = self._take_numbers("coefficients", self.coefficients, len(joints))
+            object.__setattr__(self, "coefficients", numbers)
+        if 0.0 in numbers:
+            raise self._fault(
+                "a ratio or coefficient is zero",
+                "Remove that joint from the coupling; to hold a joint, name it in lock",
+            )
+        offset = 0.0 if self.offset is None else self.offset
+        object.__setattr__(self, "offset", self._take_numbers("offset", (offset,), 1)[0])
+        object.__setattr__(self, "joints", joints)
+
+    @property
+    def kind(self) -> ClosureType:
+        """Its type: what it needs, and its rows."""
+        return self.type if isinstance(self.type, ClosureType) else CLOSURE_TYPES[self.type]
+
+    @property
+    def type_name(self) -> str:
+        """The name of its type."""
+        return self.type.name if isinstance(self.type, ClosureType) else str(self.type)
+
+    @property
+    def anchors(self) -> tuple[Anchor, ...]:
+        """(a, b), or () for a coupling of joints."""
+        return tuple(anchor for anchor in (self.a, self.b) if anchor is not None)
+
+    @cached_property
+    def rows(self) -> RowSet:
+        """The scalar rows of this closure, in its anchors.
+
+        Raises
+        ------
+        InputError
+            If its length is not yet known: it belongs to no mechanism.
+        """
+        if self.type == "distance" and self.length is None:
+            raise self._fault(
+                "its length is known only when it is part of a mechanism",
+                "Read it from mechanism.loops, or give a length",
+            )
+        given: dict[str, Any] = {
+            key: np.array(getattr(self, key))
+            for key in ("axis", "axis_a", "axis_b")
+            if getattr(self, key) is not None
+        }
+        if self.length is not None:
+            given["length"] = self.length
+        if self.joints is not None:
+            coefficients = self.coefficients or (1.0, -float(self.ratio or 0.0))
+            given["joint_row"] = JointRow(self.joints, coefficients, float(self.offset or 0.0))
+        return self.kind.rows(ClosureValues(**given))
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """``loop.row`` for every row."""
+        return tuple(f"{self.name}.{label}" for label in self.rows.labels)
+
+    def resolve(self, model: pin.Model) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
+        """Joint and placement in it of both anchors, as :meth:`Anchor.resolve` gives them.
+
+        Only for closures that have anchors.
+        """
+        a, b = self.anchors
+        return a.resolve(model), b.resolve(model)
+
+    def check(self, model: pin.Model) -> None:
+        """Refuse anchors or joints that ``model`` does not have, or that cannot be tied.
+
+        Raises
+        ------
+        InputError
+            Naming the loop and the remedy.
+        """
+        if self.anchors:
+            a, b = self.anchors
+            resolve_apart(model, a, b, f"loop {self.name!r}")
+        names = list(model.names)[1:]
+        for name in self.joints or ():
+            if name not in names:
+                raise self._fault(
+                    f"there is no moving joint {name!r}", f"Known: {', '.join(names) or 'none'}"
+                )
+            joint = model.joints[model.getJointId(name)]
+            if joint.nv != 1:
+                raise self._fault(
+                    f"the joint {name!r} has {joint.nv} degrees of freedom",
+                    "Couple joints with one degree of freedom",
+                )
+            if joint.nq != 1:
+                raise self._fault(
+                    f"the joint {name!r} is stored as (cos, sin), which does not count turns",
+                    "Build it as a revolute joint without limits (nq = 1); srm.load does that for "
+                    "the continuous joints of a URDF",
+                )
+
+    def measured(self, model: pin.Model, q: FloatArray) -> LoopClosure:
+        """The same closure with a length that was not given taken from the configuration q (nq,).
+
+        Raises
+        ------
+        InputError
+            If the two points coincide there.
+        """
+        if self.type != "distance" or self.length is not None:
+            return self
+        data = workspace(model)
+        pin.forwardKinematics(model, data, q)
+        a, b = (data.oMi[joint].act(inside.translation) for joint, inside in self.resolve(model))
+        length = float(np.linalg.norm(a - b))
+        if length <= _COINCIDENT * max(np.linalg.norm(a), np.linalg.norm(b)):
+            raise self._fault(
+                "its two points coincide in the guess: a distance of 0 has no direction",
+                'Use type = "point" if they are to coincide, or give a length or another guess',
+            )
+        return replace(self, length=length)

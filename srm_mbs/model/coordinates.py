@@ -1,0 +1,109 @@
+"""Joint values as people write them, and Pinocchio's coordinates.
+
+A one-degree joint takes one number (rad or m), also a URDF ``continuous`` joint, which Pinocchio
+stores as (cos, sin).  Other joints take lists in Pinocchio's order: position xyz then quaternion
+xyzw for a free flyer, a quaternion xyzw for a ball joint, [x, y, angle] or [x, y, cos, sin] for a
+planar joint; rates are linear then angular, in the moving body's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.errors import InputError
+from srm_mbs.model.mechanism import Mechanism
+
+
+def _numbers(value: Any, name: str, accepted: dict[int, str]) -> FloatArray:
+    try:
+        array = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.ndim != 1 or not np.isfinite(array).all() or array.size not in accepted:
+        wanted = " or ".join(accepted.values())
+        raise InputError(f"joint {name!r} cannot take the value {value!r}", remedy=f"Give {wanted}")
+    return array
+
+
+def set_position(mechanism: Mechanism, q: FloatArray, name: str, value: Any) -> None:
+    """Write the position ``value`` of joint ``name`` into ``q`` (nq,), in place.
+
+    Raises
+    ------
+    InputError
+        For an unknown joint, or a value of the wrong length or not finite.
+    """
+    joint = mechanism.joint(name)
+    own = slice(joint.idx_q, joint.idx_q + joint.nq)
+    if joint.nv == 1:
+        angle = _numbers(value, name, {1: "one finite number (rad or m)"})[0]
+        q[own] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+        return
+    accepted = {joint.nq: f"{joint.nq} finite numbers in Pinocchio's order"}
+    planar = joint.shortname() == "JointModelPlanar"
+    if planar:
+        accepted[3] = "[x, y, angle]"
+    array = _numbers(value, name, accepted)
+    if planar and array.size == 3:
+        array = np.array([array[0], array[1], np.cos(array[2]), np.sin(array[2])])
+    if joint.nq != joint.nv:
+        # The group part is last: a quaternion, or (cos, sin).
+        part = slice(array.size - (2 if planar else 4), None)
+        length = float(np.linalg.norm(array[part]))
+        if abs(length - 1.0) > 1e-3:
+            raise InputError(
+                f"joint {name!r}: the rotation part of {value!r} has length {length:.6g}",
+                remedy="Give a unit quaternion (x, y, z, w), or a unit (cos, sin) pair",
+            )
+        array[part] /= length
+    q[own] = array
+
+
+def set_rate(mechanism: Mechanism, v: FloatArray, name: str, value: Any) -> None:
+    """Write the rate ``value`` of joint ``name`` into ``v`` (nv,), in place.
+
+    Raises
+    ------
+    InputError
+        For an unknown joint, or a value of the wrong length or not finite.
+    """
+    joint = mechanism.joint(name)
+    what = "one finite number (rad/s or m/s)" if joint.nv == 1 else f"{joint.nv} finite numbers"
+    v[joint.idx_v : joint.idx_v + joint.nv] = _numbers(value, name, {joint.nv: what})
+
+
+def coordinate_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """A name for each velocity component (nv,): the joint's, or ``joint[i]`` if it has several."""
+    names = []
+    for name in mechanism.joint_names:
+        count = mechanism.joint(name).nv
+        names += [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]
+    return tuple(names)
+
+
+def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
+    """Velocity indices of the joints ``names``, in that order.
+
+    Raises
+    ------
+    InputError
+        For an unknown joint, or one that is named twice.
+    """
+    indices: list[int] = []
+    for name in names:
+        joint = mechanism.joint(name)
+        if joint.idx_v in indices:
+            raise InputError(f"joint {name!r} is named twice", remedy="Name it once")
+        indices += range(joint.idx_v, joint.idx_v + joint.nv)
+    return np.array(indices, dtype=int)
+
+
+def position_of(mechanism: Mechanism, q: FloatArray, name: str) -> float:
+    """Position (rad or m) of the one-degree joint ``name`` in q (nq,)."""
+    joint = mechanism.joint(name)
+    own = q[joint.idx_q : joint.idx_q + joint.nq]
+    return float(own[0] if joint.nq == 1 else np.arctan2(own[1], own[0]))

@@ -1,0 +1,218 @@
+"""Drives: motions prescribed over time, and the constraints g(q) = s(t) that they are.
+
+A drive takes away one degree of freedom; the force that it needs is ``solution.drive_forces``.
+
+Which parts of a mechanism depend on time, until when, and where they are not smooth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs.errors import InputError
+from srm_mbs.model.anchors import Anchor, name_places, resolve_apart
+from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.forces import ForceElement
+from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
+
+NamedLaw = tuple[str, Law]
+"""An element, and a law over time that it follows."""
+
+
+def laws_over_time(drives: Sequence[Drive], forces: Sequence[ForceElement]) -> tuple[NamedLaw, ...]:
+    """Every law that drives and force elements follow."""
+    found = [(f"drive {drive.name!r}", drive.law) for drive in drives]
+    for force in forces:
+        given = getattr(force, "law", None) or ()
+        laws = given if isinstance(given, tuple) else (given,)
+        found += [(f"force {force.name!r}", law) for law in laws]
+    return tuple(found)
+
+
+def check_covers(laws: Sequence[NamedLaw], t_end: float) -> None:
+    """Refuse a run to ``t_end`` (s) that is longer than a table.
+
+    Raises
+    ------
+    InputError
+        Naming what has the table.
+    """
+    for element, law in laws:
+        last = law.span[1]
+        if last < t_end:
+            raise InputError(
+                f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
+                element=element,
+                remedy="Extend the table, or end the run earlier",
+            )
+
+
+def knots_between(laws: Sequence[NamedLaw], t0: float, t_end: float) -> tuple[float, ...]:
+    """Times (s) between ``t0`` and ``t_end`` at which a law is not smooth, in order."""
+    times = {knot for _, law in laws for knot in law.knots}
+    return tuple(sorted(knot for knot in times if t0 < knot < t_end))
+
+
+HAS_VALUES = (Table, Polynomial, Sine)
+"""Laws that say where they start, so that they can be meant as positions themselves."""
+
+NOMINAL = 1e-9
+"""Length (m) of the closure of a driven distance, which the motion of the drive takes off again."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A prescribed motion of a joint, or of a point relative to another.
+
+    By default the law is the motion *from the initial value*: q(t) = q_initial + s(t) - s(0).
+
+    Parameters
+    ----------
+    law
+        From :mod:`srm_mbs.model.laws`: :class:`~srm_mbs.model.laws.ConstantSpeed`, ...
+    joint
+        Name of a joint with one degree of freedom (rad; prismatic: m).  The angle of a continuous
+        joint counts turns.
+    a, b
+        Instead of a joint: anchors on different bodies, with ``axis`` or ``distance``.
+    axis : (3,)
+        In b's frame: the position (m) of a's origin along it is driven.
+    distance
+        True: the distance (m) of the two origins is driven.
+    absolute
+        True: the law is the position itself, q(t) = s(t); for laws with values of their own
+        (table, polynomial, sine).  The mechanism is then assembled with q(0) = s(0).
+    name
+        Unique name; by default that of the joint, or ``drive_a_b``.
+
+    Raises
+    ------
+    InputError
+        Unless exactly one motion is described, or for a malformed value.
+    """
+
+    law: Law
+    joint: str | None = None
+    a: Anchor | None = None
+    b: Anchor | None = None
+    axis: Sequence[float] | None = None
+    distance: bool = False
+    absolute: bool = False
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        places = name_places(f"drive {self.name!r}", self.a, self.b)
+        if not self.name:
+            object.__setattr__(self, "name", self.joint or "_".join(["drive", *places]))
+        if not isinstance(self.law, Law):
+            raise self._fault(f"{self.law!r} is not a law", "Give srm.ConstantSpeed(...) or alike")
+        anchors = self.a is not None and self.b is not None
+        if (self.joint is None) != anchors or (self.a is None) != (self.b is None):
+            raise self._fault(
+                "a drive moves either a joint or a point relative to another",
+                "Give joint, or a and b",
+            )
+        if anchors == (self.axis is None and not self.distance) or (
+            self.axis is not None and self.distance
+        ):
+            raise self._fault(
+                "what is driven is not determined",
+                "Give axis = [x, y, z] or distance = true with a and b, and neither with a joint",
+            )
+        if self.absolute and not isinstance(self.law, HAS_VALUES):
+            raise self._fault(
+                f"the law {self.law.type!r} starts from the initial value in any case",
+                "Remove absolute",
+            )
+        if self.axis is not None and self.closure is not None:
+            object.__setattr__(self, "axis", self.closure.axis)
+
+    def _fault(self, problem: str, remedy: str) -> InputError:
+        return InputError(problem, element=f"drive {self.name!r}", remedy=remedy)
+
+    @property
+    def closure(self) -> LoopClosure | None:
+        """For a point: the closure whose row g(q) the drive lets move; None for a joint."""
+        if self.a is None or self.b is None:
+            return None
+        if self.distance:
+            return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL)
+        x, y, z = self.axis or ()
+        return LoopClosure("point_on_plane", self.a, self.b, (x, y, z), self.name)
+
+    def frozen(self, value: float) -> LoopClosure:
+        """For a point: the closure that holds its coordinate at ``value`` (m).
+
+        Raises
+        ------
+        InputError
+            For a distance that is not positive.
+        """
+        moving = self.closure
+        if moving is None or moving.b is None:
+            raise self._fault("it moves a joint", "Hold that in q")
+        if moving.axis is None:
+            return replace(moving, length=value)
+        b = moving.b
+        ahead = pin.rpy.rpyToMatrix(np.array(b.rpy)) @ np.array(moving.axis) * value
+        x, y, z = (np.array(b.xyz) + ahead).tolist()
+        return replace(moving, b=Anchor(b.link, b.frame, (x, y, z), b.rpy))
+
+    def curve(self, initial: float) -> Curve:
+        """s(t) for the coordinate that is ``initial`` at t = 0."""
+        curve = self.law.curve(initial)
+        return curve if self.absolute else curve.shifted(initial - curve(0.0)[0])
+
+    def check(self, model: pin.Model) -> None:
+        """Refuse a joint, link or frame that ``model`` does not have or that cannot be driven.
+
+        Raises
+        ------
+        InputError
+            Naming the drive and the remedy.
+        """
+        if self.a is not None and self.b is not None:
+            resolve_apart(model, self.a, self.b, f"drive {self.name!r}")
+            return
+        names = list(model.names)[1:]
+        if self.joint not in names:
+            raise self._fault(
+                f"there is no moving joint {self.joint!r}", f"Known: {', '.join(names) or 'none'}"
+            )
+        joint = model.joints[model.getJointId(self.joint)]
+        if joint.nv != 1:
+            raise self._fault(
+                f"joint {self.joint!r} has {joint.nv} degrees of freedom",
+                "Drive a point with a, b and axis, or model it with joints of one degree",
+            )
+
+
+def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
+    """The drives as their rows come after those of the loops: points first, then joints."""
+    return tuple(sorted(drives, key=lambda drive: drive.joint is not None))
+
+
+def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> Mapping[str, float]:
+    """The driven coordinate of each drive (rad, m) at q (nq,); angles of continuous joints in
+    (-pi, pi]."""
+    data = workspace(model)
+    pin.forwardKinematics(model, data, np.asarray(q, dtype=float))
+    out = {}
+    for drive in drives:
+        if drive.a is None or drive.b is None:
+            joint = model.joints[model.getJointId(drive.joint)]
+            own = q[joint.idx_q]
+            out[drive.name] = float(own if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], own))
+            continue
+        (at_a, in_a), (at_b, in_b) = drive.a.resolve(model), drive.b.resolve(model)
+        apart = (data.oMi[at_b] * in_b).actInv((data.oMi[at_a] * in_a).translation)
+        axis = None if drive.axis is None else np.array(drive.axis)
+        out[drive.name] = float(np.linalg.norm(apart) if axis is None else axis @ apart)
+    return MappingProxyType(out)

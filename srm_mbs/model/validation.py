@@ -1,0 +1,273 @@
+"""What is asked of a mechanism as a whole; its closures, forces and drives check themselves.
+
+Whether the inertias of a tree determine its motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg.lapack import dpotrf
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.model.anchors import finite_numbers
+
+NO_INERTIA = 1e-13
+"""An articulated inertia below this fraction of the composite one is the rounding of zero."""
+
+
+def check_inertia(model: pin.Model, file: str | None = None) -> None:
+    """Refuse joints that move no inertia: the equations of motion have no solution.
+
+    ``file`` is what the model was read from.
+
+    Raises
+    ------
+    InputError
+        Naming the joint and the links that it moves.
+    """
+    if model.nv == 0:
+        return
+    moved = np.zeros((model.njoints, 2))
+    for joint in range(model.njoints - 1, 0, -1):
+        inertia = model.inertias[joint]
+        moved[joint] += inertia.mass, np.trace(inertia.inertia)
+        moved[model.parents[joint]] += moved[joint]
+
+    def links(joint: int) -> str:
+        names = [
+            repr(f.name)
+            for f in model.frames
+            if f.parentJoint == joint and f.type == pin.FrameType.BODY
+        ]
+        return ", ".join(names) or "its body"
+
+    for joint in range(1, model.njoints):
+        if not moved[joint].any():
+            raise InputError(
+                f"neither {links(joint)} nor anything behind it has inertia",
+                file=file,
+                element=f"joint {model.names[joint]!r}",
+                remedy="Give the moving end of the chain an <inertial>",
+            )
+    rng = np.random.default_rng(0)
+    q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
+    at = undetermined_joint(model, q, file)
+    if at is not None:
+        raise InputError(
+            f"the joint moves mass ({links(at)} and what is behind it) but no inertia in one "
+            "of its directions: its acceleration is not determined",
+            file=file,
+            element=f"joint {model.names[at]!r}",
+            remedy="Give a moment of inertia, or a centre of mass off the axis",
+        )
+
+
+def undetermined_joint(model: pin.Model, q: FloatArray, file: str | None = None) -> int | None:
+    """A joint with a direction in which it moves no inertia at q (nq,); None if there is none.
+
+    As one whose axis runs through a point mass, or the outer axes of massless links in line.  The
+    pivots of M, tips first, show it; they are those of the articulated inertias over M_ii.
+
+    Raises
+    ------
+    InputError
+        If the mass matrix is not finite.
+    """
+    with np.errstate(all="ignore"):
+        M = pin.crba(model, workspace(model), q)
+        M = (np.triu(M) + np.triu(M, 1).T)[::-1, ::-1]
+        size = np.sqrt(np.diag(M))
+        scaled = M / size[:, None] / size
+    if not np.isfinite(M).all():
+        raise InputError(
+            "the mass matrix is not finite",
+            file=file,
+            remedy="Check the size of the masses, inertias and lengths",
+        )
+    bad = np.flatnonzero(~(size > 0.0))
+    if bad.size:
+        failed = int(bad[0])
+    else:
+        factor, info = dpotrf(scaled, lower=1)
+        small = np.flatnonzero(np.diag(factor)[: info - 1 if info else None] ** 2 < NO_INERTIA)
+        if not small.size and not info:
+            return None
+        failed = int(small[0]) if small.size else info - 1
+    component = model.nv - 1 - failed
+    return next(i for i in range(1, model.njoints) if component < _velocity_end(model, i))
+
+
+def _velocity_end(model: pin.Model, joint: int) -> int:
+    return int(model.joints[joint].idx_v + model.joints[joint].nv)
+
+
+def check_tree(model: pin.Model) -> None:
+    """Refuse a tree that cannot move, or whose joints are not in depth-first order, or where
+    gravity or damping is not finite, or damping negative.
+
+    Raises
+    ------
+    InputError
+        Naming what is wrong, or the joint that is out of order.
+    """
+    if model.nv == 0:
+        raise InputError(
+            "nothing in this mechanism can move",
+            element="model",
+            remedy="Give it at least one joint that is neither fixed nor locked",
+        )
+    for what, numbers in (("gravity", model.gravity.vector), ("damping", model.damping)):
+        if not np.isfinite(numbers).all():
+            raise InputError(
+                f"the {what} of the model is not finite: {numbers}",
+                element=f"model.{what}",
+                remedy="Give finite numbers",
+            )
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:]):
+        damping = model.damping[joint.idx_v : joint.idx_v + joint.nv]
+        if (damping < 0.0).any():
+            raise InputError(
+                f"the damping of the joint {name!r} is negative: {damping}",
+                element="model.damping",
+                remedy="Give no negative numbers; a force that feeds energy in is an srm.UserForce",
+            )
+    _check_order(model)
+
+
+def _check_order(model: pin.Model) -> None:
+    """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
+    for joint in range(2, model.njoints):
+        if model.parents[joint] not in list(model.supports[joint - 1]):
+            raise InputError(
+                f"the joint {model.names[joint]!r} continues a branch that another joint, "
+                f"{model.names[joint - 1]!r}, has interrupted",
+                element="model",
+                remedy="Add the joints depth first, every branch to its tip; Pinocchio's mass "
+                "matrix is wrong otherwise",
+            )
+
+
+Element = TypeVar("Element")
+
+
+def checked_elements(what: str, given: Iterable[Element], example: str) -> tuple[Element, ...]:
+    """The elements of the kind ``what`` as a tuple.
+
+    Raises
+    ------
+    InputError
+        If they are not several, or one has no name and cannot check itself.
+    """
+    several = isinstance(given, Iterable) and not isinstance(given, str)
+    elements: tuple[Any, ...] = tuple(given) if several else (given,)
+    for element in elements:
+        if not (several and hasattr(element, "name") and hasattr(element, "check")):
+            raise InputError(
+                f"{what}s = {given!r} is not a list of {what}s",
+                element=f"{what}s",
+                remedy=f"Give a list of them, such as [srm.{example}(...)]",
+            )
+    return elements
+
+
+def check_names(what: str, names: Sequence[str]) -> None:
+    """Refuse names that repeat, of elements of the kind ``what``.
+
+    Raises
+    ------
+    InputError
+        Naming the first that does.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"the {what} name {name!r} is used twice",
+                element=f"{what} {name!r}",
+                remedy=f"Give every {what} its own name",
+            )
+
+
+def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, FloatArray]:
+    """Read-only copies of an initial state, q0 (nq,) and v0 (nv,).
+
+    Raises
+    ------
+    InputError
+        If a shape does not fit, a number is not finite, or a quaternion is not of unit length.
+    """
+    q0 = _frozen_array(q0, (model.nq,), "q0")
+    if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
+        raise InputError(
+            "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
+            element="q0",
+            remedy="Use pinocchio.normalize(model, q0)",
+        )
+    return q0, _frozen_array(v0, (model.nv,), "v0")
+
+
+def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(
+            f"{what} has shape {array.shape} or does not consist of finite numbers",
+            element=what,
+            remedy=f"Give {shape[0]} finite numbers",
+        )
+    array.setflags(write=False)
+    return array
+
+
+def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
+    """The speed (rad/s, m/s) over which the joint friction of ``model`` changes its sign.
+
+    Raises
+    ------
+    InputError
+        If it is not positive, or the friction is negative or not finite.
+    """
+    if not (np.isfinite(model.friction).all() and np.all(model.friction >= 0.0)):
+        raise InputError(
+            "joint friction is negative or not finite",
+            element="model.friction",
+            remedy="Give values >= 0",
+        )
+    speed = finite_numbers((friction_speed,), 1, "friction_speed", "Give rad/s or m/s")[0]
+    if speed <= 0.0:
+        raise InputError(
+            f"friction_speed = {speed:g} is not positive",
+            element="friction_speed",
+            remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
+        )
+    return speed
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Part = TypeVar("Part", bound=_Named)
+
+
+def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
+    """``parts`` (loops, drives) without the one of that name.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message lists those there are.
+    """
+    kept = tuple(part for part in parts if part.name != name)
+    if len(kept) == len(parts):
+        known = ", ".join(repr(part.name) for part in parts) or "none"
+        raise InputError(f"there is no {what} {name!r}", remedy=f"Known: {known}")
+    return kept

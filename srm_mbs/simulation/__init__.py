@@ -1,0 +1,1 @@
+"""Runs: options, the runner, results, storage, and the incremental simulator."""

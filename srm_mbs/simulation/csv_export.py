@@ -1,0 +1,114 @@
+"""A run as a table of comma-separated values, for spreadsheets and other programs.
+
+One row per time, with a header that names each column and its unit:
+
+* ``t (s)``;
+* the positions of each joint: ``crank (rad)``, angles unwrapped; joints of several degrees of
+  freedom one column per Pinocchio coordinate, ``base.x (m)``, ..., ``base.qw``;
+* the velocities: ``crank rate (rad/s)``, ``base.vx (m/s)``, ..., ``base.wz (rad/s)``, the latter
+  in the moving body's frame;
+* with loops, the closure errors ``||g||`` and their rates ``||G v||``;
+* ``energy (J)``, kinetic plus potential.
+
+Reactions are left out: there are six per loop, and they are better taken from
+``solution.reactions``.  Every number is written with as many digits as give the same float back.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.analysis.summary import JOINT_TYPES
+from srm_mbs.dynamics.scaling import row_dimensions
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.result import Solution
+
+log = logging.getLogger(__name__)
+
+_LENGTHS, _QUATERNION = ("x (m)", "y (m)", "z (m)"), ("qx", "qy", "qz", "qw")
+_LINEAR, _ANGULAR = ("vx (m/s)", "vy (m/s)", "vz (m/s)"), ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)")
+_COMPONENTS = {
+    "JointModelFreeFlyer": (_LENGTHS + _QUATERNION, _LINEAR + _ANGULAR),
+    "JointModelSpherical": (_QUATERNION, _ANGULAR),
+    "JointModelTranslation": (_LENGTHS, _LINEAR),
+    "JointModelUniversal": (
+        ("angle 1 (rad)", "angle 2 (rad)"),
+        ("rate 1 (rad/s)", "rate 2 (rad/s)"),
+    ),
+    "JointModelPlanar": ((*_LENGTHS[:2], "cos", "sin"), (*_LINEAR[:2], _ANGULAR[2])),
+}
+"""Columns of joints of several degrees of freedom: positions, velocities."""
+
+
+def write_csv(solution: Solution, path: Path) -> None:
+    """Write ``solution`` at its times ``solution.t`` to ``path``; see the module's text.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    # A state that runs away overflows in its drift and energy: "inf" or "nan" is written.
+    with np.errstate(over="ignore", invalid="ignore"):
+        columns = _columns(solution)
+    write_table(columns, path)
+
+
+def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Write ``columns``, header -> values (n,), to ``path``.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        # Python's own floats: the csv module writes them with repr.
+        writer.writerows(zip(*(column.tolist() for column in columns.values())))
+    log.info("written: %s", path)
+
+
+def _columns(solution: Solution) -> dict[str, FloatArray]:
+    """Header and values (n,) of each column."""
+    mechanism = solution.mechanism
+    positions: dict[str, FloatArray] = {}
+    rates: dict[str, FloatArray] = {}
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        if joint.nv == 1:
+            unit = _unit(joint.shortname())
+            positions[f"{name} ({unit})"], rates[f"{name} rate ({unit}/s)"] = solution.joint(name)
+            continue
+        numbered = [f"q{i}" for i in range(joint.nq)], [f"v{i}" for i in range(joint.nv)]
+        q_names, v_names = _COMPONENTS.get(joint.shortname(), numbered)
+        for i, component in enumerate(q_names):
+            positions[f"{name}.{component}"] = solution.q[:, joint.idx_q + i]
+        for i, component in enumerate(v_names):
+            rates[f"{name}.{component}"] = solution.v[:, joint.idx_v + i]
+    columns = {"t (s)": solution.t, **positions, **rates}
+    if mechanism.constrained:
+        lengths, speeds = _drift_units(mechanism)
+        columns[f"||g|| ({lengths})"], columns[f"||G v|| ({speeds})"] = solution.drift.T
+    columns["energy (J)"] = solution.energy
+    return columns
+
+
+def _unit(joint_type: str) -> str:
+    kind = JOINT_TYPES.get(joint_type.removeprefix("JointModel"), "")
+    return "m" if kind.startswith("prismatic") else "rad"
+
+
+def _drift_units(mechanism: Mechanism) -> tuple[str, str]:
+    """Units of the closure errors and of their rates; semicolons, so that nothing is quoted."""
+    parts = row_dimensions(mechanism)
+    return "; ".join(parts), "; ".join(f"{part}/s" for part in parts)

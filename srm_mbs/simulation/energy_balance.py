@@ -1,0 +1,225 @@
+r"""Energy balance of a run: what kinetic and potential energy gained is the work of what acts.
+
+    K + V - (K + V)(t_0) = sum of the works W_i,   W_i' = tau_i . v,
+
+with the works of the controller, of joint damping and friction, of each force element (of springs
+and bushings the damping only: their potential is part of V), and of each drive.  Closures, which do
+not depend on time, do no work.  Each power is integrated by Gauss quadrature on the dense output,
+step by step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.result import Solution
+
+NODES = 8
+"""Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
+
+ROUNDING = 1e-13
+"""Part of the energies that add up to it which rounding leaves of a sum, with much to spare."""
+
+Powers = dict[str, FloatArray]
+"""Power (n,) W of each thing that does work, by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyBalance:
+    """Energies and works over a run.
+
+    Attributes
+    ----------
+    t : (n,) s
+        The times of the solution.
+    kinetic, potential : (n,) J
+        Of the bodies; of gravity, springs and bushings.
+    works : {name: (n,) J}
+        Work done on the mechanism since the start of the run, by what does it: ``controller``,
+        ``joint damping``, ``joint friction``, ``force NAME``, ``drive NAME``; and ``events``, what
+        their actions changed at once.
+    start
+        Energy (J) at the start of the run.
+    rounding
+        Residual (J) that rounding alone may leave: a small part of the energies, and of the weight
+        times the scene diagonal.
+    """
+
+    t: FloatArray
+    kinetic: FloatArray
+    potential: FloatArray
+    works: Mapping[str, FloatArray]
+    start: float
+    rounding: float
+
+    @property
+    def residual(self) -> FloatArray:
+        """Energy gained minus all works (n,) J: the error of the run, and of this balance."""
+        done: FloatArray = sum(self.works.values(), start=np.zeros(len(self.t)))
+        return self.kinetic + self.potential - self.start - done
+
+    @property
+    def scale(self) -> float:
+        """The energy (J) that took part: the largest of kinetic energy, change of potential energy
+        and each work."""
+        sizes = [self.kinetic, self.potential - self.potential[:1], *self.works.values()]
+        return max((float(np.abs(values).max(initial=0.0)) for values in sizes), default=0.0)
+
+    @property
+    def relative(self) -> float:
+        """Largest residual over the scale; 0 where nothing moved but for rounding."""
+        largest = float(np.abs(self.residual).max(initial=0.0))
+        return largest / self.scale if self.scale > self.rounding else 0.0
+
+
+_System = OpenSystem | ClosedSystem
+
+
+def _controller(run: Solution, system: _System) -> Powers:
+    if not system.controlled:
+        return {}
+    states = zip(run.t, run.q, run.v)
+    return {"controller": np.array([system.controlled_force(*x) @ x[2] for x in states])}
+
+
+def _joints(run: Solution, system: _System) -> Powers:
+    model = run.mechanism.model
+    powers = {}
+    if np.any(model.damping):
+        powers["joint damping"] = (system.damping_force(run.v) * run.v).sum(axis=1)
+    if np.any(model.friction):
+        powers["joint friction"] = (system.friction_force(run.v) * run.v).sum(axis=1)
+    return powers
+
+
+def _elements(run: Solution, system: _System) -> Powers:
+    """Of springs and bushings what is left when their force at rest is taken off."""
+    mechanism = run.mechanism
+    model, data = mechanism.model, workspace(mechanism.model)
+    rest = np.zeros(model.nv)
+    elements = [ForceKinematics(model, [force]) for force in mechanism.forces]
+    names = [f"force {force.name}" for force in mechanism.forces]
+    powers = {name: np.zeros(len(run.t)) for name in names}
+    for i, (t, q, v) in enumerate(zip(run.t, run.q, run.v)):
+        pin.computeJointJacobians(model, data, q)
+        for velocity, sign in ((v, 1.0), (rest, -1.0)):
+            pin.forwardKinematics(model, data, q, velocity)
+            for name, force, element in zip(names, mechanism.forces, elements):
+                if sign > 0.0 or force.has_potential:
+                    powers[name][i] += sign * (element.generalised(data, q, velocity, t) @ v)
+    # An undamped spring does no other work.
+    return {
+        name: powers[name]
+        for name, force in zip(names, mechanism.forces)
+        if not force.has_potential or np.any(getattr(force, "damping", 1.0))
+    }
+
+
+def _drives(run: Solution, system: _System) -> Powers:
+    if not run.mechanism.drives:
+        return {}
+    rates = run.drive_rates
+    return {f"drive {name}": force * rates[name] for name, force in run.drive_forces.items()}
+
+
+TERMS: tuple[Callable[[Solution, _System], Powers], ...] = (
+    _controller,
+    _joints,
+    _elements,
+    _drives,
+)
+"""Everything that does work beside the potentials; what is new is added here."""
+
+
+def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
+    """The balance of ``solution`` at its times; ``system`` is the one that made it.
+
+    Raises
+    ------
+    EvaluationError
+        If a force cannot be evaluated.
+    """
+    times = solution.steps.times
+    ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
+    if times[0] < ends[0]:
+        ends = np.concatenate([times[:1], ends])
+    points, weights = np.polynomial.legendre.leggauss(NODES)
+    lengths = np.diff(ends)
+    nodes = ends[:-1, None] + 0.5 * (points + 1.0) * lengths[:, None]
+    run = solution.at(nodes.ravel())
+    works = {}
+    place = np.searchsorted(ends, solution.t)
+    for term in TERMS:
+        for name, power in term(run, system).items():
+            pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
+            works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
+    kinetic = np.array([system.kinetic_energy(*state) for state in zip(solution.q, solution.v)])
+    start = float(system.energy(solution.steps.states[0]))
+    return EnergyBalance(
+        solution.t,
+        kinetic,
+        solution.energy - kinetic,
+        works,
+        start,
+        _rounding(solution.mechanism, [start, *kinetic, *solution.energy]),
+    )
+
+
+def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
+    """What rounding may leave (J) of these energies, whose zero is where potentials cancel."""
+    model = mechanism.model
+    mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
+    weight = mass * float(np.linalg.norm(model.gravity.linear))
+    largest = float(np.abs(energies).max(initial=0.0))
+    return float(ROUNDING * (weight * mechanism.structure.units.length + largest))
+
+
+def joined_balance(
+    segments: Sequence[Solution], parts: Sequence[Solution], order: IndexArray | None
+) -> EnergyBalance:
+    """The balance of a run of several segments, with what happened between them as ``events``.
+
+    Parameters
+    ----------
+    segments
+        The whole segments.
+    parts
+        The same ones, read at the times that are wanted.
+    order
+        Where the rows of all parts go; None where they stay.
+    """
+    balances = [part.energy_balance for part in parts]
+    ends = [segment.at([segment.steps.end]).energy_balance for segment in segments]
+    names = dict.fromkeys(name for end in ends for name in end.works)
+    rows: dict[str, list[FloatArray]] = {name: [] for name in (*names, "events")}
+    before, jumped = dict.fromkeys(names, 0.0), 0.0
+    for k, (balance, end) in enumerate(zip(balances, ends)):
+        nothing = np.zeros(len(balance.t))
+        for name in names:
+            rows[name].append(before[name] + balance.works.get(name, nothing))
+            before[name] += float(end.works.get(name, np.zeros(1))[-1])
+        rows["events"].append(nothing + jumped)
+        if k + 1 < len(ends):
+            jumped += ends[k + 1].start - float(end.kinetic[-1] + end.potential[-1])
+
+    def joined(pieces: Sequence[FloatArray]) -> FloatArray:
+        whole = np.concatenate(pieces)
+        return whole if order is None else whole[order]
+
+    return EnergyBalance(
+        joined([balance.t for balance in balances]),
+        joined([balance.kinetic for balance in balances]),
+        joined([balance.potential for balance in balances]),
+        {name: joined(pieces) for name, pieces in rows.items()},
+        ends[0].start,
+        max(balance.rounding for balance in balances),
+    )

@@ -1,0 +1,143 @@
+"""Degrees of freedom along a run: what the closures leave, and where that changes.
+
+The momentary degrees of freedom are nv minus the rank of G.  They exceed the structural number only
+on singular configurations, which a run passes between two output times: those come from
+``solution.crossings`` and ``solution.bifurcations``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.errors import InputError
+from srm_mbs.model.coordinates import coordinate_names
+from srm_mbs.simulation.segmented_result import SegmentedSolution
+
+if TYPE_CHECKING:
+    from srm_mbs.simulation.result import Solution
+
+
+@dataclass(frozen=True)
+class MobilityChange:
+    """Where a run met a singular configuration.
+
+    Attributes
+    ----------
+    time
+        When it was closest to it (s).
+    degrees_of_freedom
+        Momentary degrees of freedom on it.
+    loops
+        The loops whose rows lose rank there.
+    """
+
+    time: float
+    degrees_of_freedom: int
+    loops: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MobilityMap:
+    """Degrees of freedom along a run.
+
+    Attributes
+    ----------
+    t : (n,) s
+        The times of the solution.
+    degrees_of_freedom : (n,) int
+        nv minus the rank of the closures, momentarily.
+    rank : (n,) int
+        Rank of the closures.
+    singular_values : (n, k)
+        Singular values of G in units, rows over their usual size, falling.
+    distance : (n,)
+        The last of them that the structural rank counts: 0 on a singular configuration; inf
+        without closures.
+    participation : (n, nv)
+        How much each coordinate takes part in what the closures leave free: 1 freely, 0 not at all.
+    coordinates : nv names
+        Of the coordinates.
+    """
+
+    t: FloatArray
+    degrees_of_freedom: NDArray[np.int_]
+    rank: NDArray[np.int_]
+    singular_values: FloatArray
+    distance: FloatArray
+    participation: FloatArray
+    coordinates: tuple[str, ...]
+    _solution: Solution = field(repr=False)
+
+    @cached_property
+    def changes(self) -> tuple[MobilityChange, ...]:
+        """Singular configurations that the run met, in order of time."""
+        return _changes(self._solution)
+
+
+def mobility_map(solution: Solution) -> MobilityMap:
+    """Degrees of freedom, rank and what can move at the times of ``solution``; see
+    :meth:`srm_mbs.simulation.result.Solution.at` for other times.
+
+    Raises
+    ------
+    InputError
+        For a run of several segments, which may have different mechanisms.
+    """
+    if isinstance(solution, SegmentedSolution):
+        raise InputError(
+            "a run with event actions has no single map: its mechanism may change",
+            element="solution",
+            remedy="Give one of solution.segments",
+        )
+    mechanism = solution.mechanism
+    model = mechanism.model
+    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
+    everything = np.arange(model.nv)
+    bases, values = [], []
+    for q in solution.q:
+        basis, singular = tangent_basis(geometry, q, everything)
+        bases.append(basis)
+        values.append(singular)
+    freedom = np.array([basis.shape[1] for basis in bases], dtype=int)
+    structural = mechanism.structure.loop_rank
+    table = np.array(values)
+    if not len(table):  # as wide as at any configuration
+        table = np.zeros((0, len(tangent_basis(geometry, mechanism.q0, everything)[1])))
+    parts = [np.linalg.norm(basis, axis=1) for basis in bases]
+    return MobilityMap(
+        solution.t,
+        freedom,
+        model.nv - freedom,
+        table,
+        table[:, structural - 1] if structural else np.full(len(bases), np.inf),
+        np.array(parts).reshape(len(bases), model.nv),
+        coordinate_names(mechanism),
+        solution,
+    )
+
+
+def _changes(solution: Solution) -> tuple[MobilityChange, ...]:
+    if not solution.mechanism.structure.loop_rank:
+        return ()
+    mechanism = solution.mechanism
+    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
+    everything = np.arange(mechanism.model.nv)
+    met = [(passage.time, passage.configuration, passage.loops) for passage in solution.crossings]
+    met += [(stay.start, stay.configuration, stay.loops) for stay in solution.bifurcations]
+    changes = []
+    for time, q, loops in sorted(met, key=lambda entry: entry[0]):
+        if q is None:
+            continue
+        freedom = tangent_basis(geometry, q, everything)[0].shape[1]
+        # Where only the drives lose rank, what the closures leave free is the same.
+        if freedom > mechanism.model.nv - mechanism.structure.loop_rank:
+            changes.append(MobilityChange(time, freedom, loops))
+    return tuple(changes)

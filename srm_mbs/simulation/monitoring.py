@@ -1,0 +1,153 @@
+"""Progress bars: of a run (simulated time, step size, drift), of a sweep; on a terminal only.
+
+What a run says in the log: how it is made, how it ended, which singular passages it had.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import TYPE_CHECKING
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.driver import Tick
+from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.singular_passages import Crossing
+
+if TYPE_CHECKING:
+    from srm_mbs.simulation.dae_result import DaeSolution
+    from srm_mbs.simulation.result import Solution
+
+log = logging.getLogger(__name__)
+
+TOLD = 50
+"""Passages of a run that are listed."""
+
+
+def log_start(
+    name: str, t0: float, t_end: float, method: Method, norm: ErrorNorm, step: float | None, by: str
+) -> None:
+    """The settings of a run of ``name``, which ``by`` computes."""
+    if not log.isEnabledFor(logging.INFO):
+        return
+    size = f"rtol {norm.rtol:g}" if step is None else f"steps of {step:g} s"
+    log.info(
+        "%s: from t = %g to %g s with %s %s, %s, by the %s",
+        name,
+        t0,
+        t_end,
+        type(method).__name__,
+        method.scheme.name,
+        size,
+        by,
+    )
+
+
+def log_end(name: str, solution: Solution | DaeSolution) -> None:
+    """Statistics, and the passages, which are looked for only if they are wanted.
+
+    Looking for thousands of them takes seconds: who pressed Ctrl-C has the solution before it.
+    """
+    stats = solution.stats
+    log.info(
+        "%s: %s after %d steps (%d rejected, %d redone at singular configurations) and "
+        "%d evaluations in %.3g s",
+        name,
+        solution.status,
+        stats.steps,
+        stats.rejected,
+        stats.replaced,
+        stats.evaluations,
+        stats.wall_time,
+    )
+    log.info("%s: %s", name, solution.message)
+    if log.isEnabledFor(logging.DEBUG) and solution.status != "interrupted":
+        _log_passages(name, getattr(solution, "crossings", ()))
+
+
+def _log_passages(name: str, crossings: Sequence[Crossing]) -> None:
+    for crossing in crossings[:TOLD]:
+        log.debug(
+            "%s: singular configuration of %s passed at t = %.9g s",
+            name,
+            crossing.participants.names,
+            crossing.time,
+        )
+    if len(crossings) > TOLD:
+        log.debug("%s: and %d more", name, len(crossings) - TOLD)
+
+
+Counted = Callable[[int, int], object]
+"""Told (done, total)."""
+REFRESH = 0.1
+"""Seconds between two updates; more often would slow the run."""
+
+
+def progress_of(
+    progress: bool | Tick, system: System, t_end: float
+) -> AbstractContextManager[Tick | None]:
+    """What the option ``progress`` asks for: the caller's own tick, a bar, or nothing."""
+    if callable(progress):
+        return nullcontext(progress)
+    return progress_bar(system, t_end) if progress else nullcontext(None)
+
+
+@contextmanager
+def _bar(label: str, counted: str, total: float) -> Iterator[Callable[[float, str], None] | None]:
+    """A function (completed, detail) that draws a bar on standard error; None if no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn(label),
+        BarColumn(),
+        TextColumn(counted),
+        TextColumn("{task.fields[detail]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("run", total=total, detail="")
+        yield lambda completed, detail: bar.update(task, completed=completed, detail=detail)
+
+
+@contextmanager
+def progress_bar(system: System, t_end: float) -> Iterator[Tick | None]:
+    """A tick that draws a progress bar on standard error; None where that is no terminal."""
+    with _bar("simulating", "t = {task.completed:.3f} / {task.total:.6g} s", t_end) as draw:
+        if draw is None:
+            yield None
+            return
+        last = 0.0
+
+        def tick(t: float, h: float, state: FloatArray) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            if now - last < REFRESH and t < t_end:
+                return
+            last = now
+            detail = f"h = {h:.2e} s"
+            if system.has_constraints:
+                detail += f"  drift = {system.closure_gap(t, state):.1e}"
+            draw(t, detail)
+
+        yield tick
+
+
+@contextmanager
+def counting(progress: bool | Counted, what: str, total: int) -> Iterator[Counted | None]:
+    """What is told after each of ``total`` things: the caller's function, a bar, or nothing."""
+    if callable(progress):
+        yield progress
+    elif not progress:
+        yield None
+    else:
+        counted = f"{{task.completed:.0f}} / {{task.total:.0f}} {what}"
+        with _bar("sweeping", counted, total) as draw:
+            yield None if draw is None else lambda done, _: draw(done, "")

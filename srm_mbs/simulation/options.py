@@ -1,0 +1,349 @@
+"""Checks of the options that ``simulate`` and ``solve_dae`` share."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.integration.control.prescribed_times import PLACEMENTS
+from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepSizeControl
+from srm_mbs.integration.methods.base import Method
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.srm import SRM
+
+LOOSEST_RTOL = 1e-4
+"""Looser tolerances let sweeps jump to another branch at a change point."""
+LOOSEST_OF_SPLIT = {8: 1e-2, 1: 1e-3}
+"""The split PSRM, which watches its branch itself: order of the error estimate, from which order on
+-> loosest rtol.  Estimates of low order let a run drift away altogether at 1e-2."""
+TIGHTEST_RTOL = 100 * np.finfo(float).eps
+TIGHTEST_OF_CLOSURES = {5: 1e-12, 1: 1e-11}
+"""Where closures or drives act: order of the error estimate, from which order on -> tightest rtol.
+Next to singular configurations corrections know positions to rounding / sigma, the less the shorter
+the steps.  Errors then fall no further: the largest of 63 runs through one to three of them is,
+against dop853 at 1e-12, 3e-11 at 1e-11 and 9e-11 at 2e-13; tvd32 would still gain at 1e-12 (1e-10
+instead of 9e-10), with nothing to spare."""
+AVOIDABLE = 1e-9
+"""Fraction of the run within which of its ends a given singular time cannot be avoided."""
+SAMPLED = 1e-9
+"""Part of a sample time before the end of a run from which no sample is taken."""
+MOST_SAMPLES = 10**8
+METHODS: dict[str, Callable[..., Method]] = {
+    "psrm": PSRM,
+    "srm": partial(SRM, restart=True, carry=True),
+}
+"""Methods that can be given by name; sweeps that restart, because own histories and step-size
+control do not go together (:class:`srm_mbs.SRM`)."""
+
+
+def positive(value: Any, what: str, unit: str = "") -> float:
+    """``value`` as a positive finite float."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(
+            f"{what} = {value!r} is not a positive number{unit}",
+            element=what,
+            remedy="Give a positive number",
+        )
+    return number
+
+
+def check_progress(progress: Any, arguments: str) -> None:
+    """Refuse what is neither a boolean nor a function of ``arguments``, as messages name them.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if not (callable(progress) or isinstance(progress, bool | np.bool_)):
+        raise InputError(
+            f"progress = {progress!r} is neither True or False nor a function",
+            element="progress",
+            remedy=f"Give True for a progress bar, or a function of {arguments}",
+        )
+
+
+def finite(value: Any, what: str) -> float:
+    """``value`` as a finite number of seconds."""
+    if type(value) is float and math.isfinite(value):
+        return value
+    (number,) = numbers([value], what, "Give a number of seconds").tolist()
+    return float(number)
+
+
+def numbers(values: Any, what: str, remedy: str) -> FloatArray:
+    """``values`` as an array of finite numbers."""
+    try:
+        # NumPy would drop imaginary parts with no more than a warning.
+        array = np.array(values, dtype=float) if np.isrealobj(values) else np.full(1, np.nan)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if not np.isfinite(array).all():
+        raise InputError(
+            f"{what} = {values!r} does not consist of finite numbers", element=what, remedy=remedy
+        )
+    return array
+
+
+def loosest_rtol(method: Method) -> float:
+    """The loosest rtol with which ``method`` keeps to its branch of the motion."""
+    if not (isinstance(method, PSRM) and method.correction == "split"):
+        return LOOSEST_RTOL
+    order = method.scheme.controller_order or 1
+    return next(rtol for least, rtol in LOOSEST_OF_SPLIT.items() if order >= least)
+
+
+def tightest_rtol(scheme: ButcherTableau, constrained: bool) -> float:
+    """The tightest rtol that rounding leaves ``scheme``, of mechanisms ``constrained`` by closures
+    or drives and of others."""
+    if not constrained:
+        return float(TIGHTEST_RTOL)
+    order = scheme.controller_order or 1
+    return next(rtol for least, rtol in TIGHTEST_OF_CLOSURES.items() if order >= least)
+
+
+def checked_rtol(
+    value: Any, loosest: float = LOOSEST_RTOL, tightest: float = float(TIGHTEST_RTOL)
+) -> float:
+    """rtol within what the methods can use, from ``tightest`` to ``loosest``; warns where it is
+    changed."""
+    rtol = positive(value, "rtol")
+    if rtol > loosest:
+        warnings.warn(
+            f"rtol = {rtol:g} is looser than {loosest:g}, from where a step may jump to "
+            f"another branch at a singular configuration: using {loosest:g}",
+            SrmWarning,
+            stacklevel=3,
+        )
+        return loosest
+    if rtol < tightest:
+        where = "" if rtol < TIGHTEST_RTOL else " next to singular configurations of closures"
+        warnings.warn(
+            f"rtol = {rtol:g} is below round-off{where}: using {tightest:.1e}",
+            SrmWarning,
+            stacklevel=3,
+        )
+        return tightest
+    return rtol
+
+
+@lru_cache(maxsize=64)
+def _named(name: str, tableau: str | ButcherTableau | None) -> Method:
+    kind = METHODS[name]
+    return kind() if tableau is None else kind(tableau)
+
+
+def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
+    """A method object from a name or an object."""
+    if isinstance(method, str):
+        if method.lower() not in METHODS:
+            raise InputError(
+                f"there is no method {method!r}",
+                element="method",
+                remedy=f"Known: {', '.join(repr(name) for name in METHODS)}",
+            )
+        return _named(method.lower(), tableau)
+    if tableau is not None:
+        raise InputError(
+            "tableau is given beside a method object",
+            element="tableau",
+            remedy="Give the tableau to the method: PSRM(tableau=...)",
+        )
+    if isinstance(method, type) or not all(
+        hasattr(method, name) for name in ("scheme", "start", "step", "accept")
+    ):
+        raise InputError(
+            f"method = {method!r} is not a method",
+            element="method",
+            remedy='Give "psrm" or an object such as PSRM(tableau="dopr54")',
+        )
+    return method
+
+
+def checked_times(t_eval: Any, t0: float, t_end: float) -> FloatArray | None:
+    """Output times within the run, increasing; None if none are given."""
+    if t_eval is None:
+        return None
+    remedy = f"Give increasing times between {t0:g} and t_end = {t_end:g} s"
+    times = numbers(t_eval, "t_eval", remedy)
+    slack = 1e-12 * max(abs(t0), abs(t_end))  # np.arange(4) * 0.1 ends a rounding error after 0.3
+    if times.ndim != 1 or (
+        times.size and (times.min() < t0 - slack or times.max() > t_end + slack)
+    ):
+        raise InputError(
+            f"t_eval must be one-dimensional and lie within {t0:g} and t_end",
+            element="t_eval",
+            remedy=remedy,
+        )
+    if np.any(np.diff(times) <= 0.0):
+        raise InputError("t_eval must increase", element="t_eval", remedy=remedy)
+    return np.clip(times, t0, t_end)
+
+
+def checked_placement(placement: Any) -> str:
+    """One of the known placements around singular configurations."""
+    if placement not in PLACEMENTS:
+        raise InputError(
+            f"there is no placement {placement!r}",
+            element="placement",
+            remedy=f"Known: {', '.join(repr(name) for name in PLACEMENTS)}",
+        )
+    return str(placement)
+
+
+def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> FloatArray:
+    """The given times within the run, in order."""
+    if isinstance(singular_times, tuple) and not singular_times:
+        return np.zeros(0)
+    remedy = "Give times (s) between the start and the end of the run"
+    times = numbers(singular_times, "singular_times", remedy)
+    if times.ndim != 1:
+        raise InputError(
+            f"singular_times has shape {times.shape}", element="singular_times", remedy=remedy
+        )
+    times = np.unique(times)
+    slack = AVOIDABLE * (t_end - t0)
+    for end in (t0, t_end):
+        if np.any(np.abs(times - end) <= slack):
+            raise InputError(
+                f"the run starts or ends at {end:g} s, where a step must begin or end",
+                element="singular_times",
+                remedy=remedy,
+            )
+    inside: FloatArray = times[(times > t0) & (times < t_end)]
+    return inside
+
+
+def checked_breakpoints(breakpoints: Any) -> FloatArray:
+    """The given times, in any order."""
+    if isinstance(breakpoints, tuple) and not breakpoints:
+        return np.zeros(0)
+    remedy = "Give times (s) at which a force jumps or has a kink"
+    times = numbers(breakpoints, "breakpoints", remedy)
+    if times.ndim != 1:
+        raise InputError(
+            f"breakpoints has shape {times.shape}", element="breakpoints", remedy=remedy
+        )
+    return times
+
+
+def check_avoidable(singular_times: FloatArray, breakpoints: FloatArray, t_end: float) -> None:
+    """Refuse singular times on breakpoints, on which a step has to end."""
+    if not len(singular_times):
+        return
+    apart = np.abs(singular_times[:, None] - breakpoints).min(axis=1)
+    if np.any(apart <= AVOIDABLE * t_end):
+        raise InputError(
+            f"a step must end at {singular_times[int(np.argmin(apart))]:g} s, a breakpoint",
+            element="singular_times",
+            remedy="Leave it out, or move the breakpoint",
+        )
+
+
+def checked_span(t0: Any, t_end: Any) -> tuple[float, float]:
+    """Start and end (s) of a run."""
+    start = finite(t0, "t0")
+    if start == 0.0:
+        return 0.0, positive(t_end, "t_end", " of seconds")
+    end = finite(t_end, "t_end")
+    if not end > start:
+        raise InputError(
+            f"the run ends at {end:g} s, before it starts at {start:g} s",
+            element="t_end",
+            remedy="Give a time after t0",
+        )
+    return start, end
+
+
+def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) -> FloatArray:
+    """Multiples (s) of ``sample_time`` within a run, at which a controller is sampled; often
+    none."""
+    if sample_time is None:
+        return np.zeros(0)
+    period = positive(sample_time, "sample_time", " of seconds")
+    if controller is None:
+        raise InputError(
+            "sample_time is given, but no controller",
+            element="sample_time",
+            remedy="Give controller=, a function of (t, q, v)",
+        )
+    count = (t_end - t0) / period
+    if not count < MOST_SAMPLES:
+        raise InputError(
+            f"sample_time = {period:g} s makes {count:.3g} samples",
+            element="sample_time",
+            remedy=f"Give at least {(t_end - t0) / MOST_SAMPLES:.1e} s for a run of this length",
+        )
+    first: int = math.floor(t0 / period + SAMPLED) + 1
+    end: int = math.ceil(t_end / period - SAMPLED)
+    return np.arange(first, end, dtype=np.float64) * np.float64(period)
+
+
+def checked_atol(atol: Any, lengths: tuple[int, ...], remedy: str) -> FloatArray:
+    """``atol`` as one positive number () or several, as many as one of ``lengths``.
+
+    Raises
+    ------
+    InputError
+        With ``remedy``, if it is something else.
+    """
+    array = numbers(atol, "atol", remedy)
+    if array.shape not in ((), *((length,) for length in lengths)):
+        raise InputError(f"atol has shape {array.shape}", element="atol", remedy=remedy)
+    if not (array > 0.0).all():
+        raise InputError(
+            f"atol = {array.min():g} is not positive"
+            if array.ndim == 0
+            else f"the smallest atol, {array.min():g}, is not positive",
+            element="atol",
+            remedy=remedy,
+        )
+    return array
+
+
+def check_embedded(scheme: ButcherTableau, step: float | None) -> None:
+    """Refuse step-size control for a scheme without an embedded pair.
+
+    Raises
+    ------
+    InputError
+        If ``step`` is None and the scheme has no embedded pair.
+    """
+    if step is None and scheme.controller_order is None:
+        raise InputError(
+            f"the tableau {scheme.name!r} has no embedded pair to estimate its error",
+            element="tableau",
+            remedy="Give a step, or use tvd32, dopr54 or dop853",
+        )
+
+
+def step_size_control(
+    scheme: ButcherTableau,
+    t0: float,
+    t_end: float,
+    step: float | None,
+    first_step: Callable[[], float],
+) -> StepSizeControl:
+    """Fixed steps if ``step`` is given, otherwise control of the embedded pair's error.
+
+    Raises
+    ------
+    InputError
+        If the scheme has no embedded pair.
+    """
+    check_embedded(scheme, step)
+    if step is not None:
+        return FixedStep(t0, t_end, step)
+    return PIControl(t_end, first_step(), scheme.controller_order or 1)

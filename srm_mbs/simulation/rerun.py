@@ -1,0 +1,79 @@
+"""Making a run again with another accuracy, everything else being as it was."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from srm_mbs.api import simulate
+from srm_mbs.errors import InputError
+from srm_mbs.simulation.result import Solution
+
+BEYOND = 0.1
+"""How much longer a second run of one that failed may be: it tells whether that one goes on."""
+
+
+def why_not(solution: Solution) -> str:
+    """Why ``solution`` cannot be made again; empty if it can."""
+    request = solution.request
+    if request is None:
+        return "the file that it was loaded from does not hold how it was made"
+    if request.lost:
+        return f"saved runs hold no Python functions, and it had {', '.join(request.lost)}"
+    return ""
+
+
+def second_run(
+    solution: Solution,
+    *,
+    rtol: float | None = None,
+    step: float | None = None,
+    progress: Any = False,
+) -> Solution:
+    """The run again, from the same start with the same options but another accuracy.
+
+    Functions of the user (controllers, events, forces) are called again.  A run that failed is
+    made again for a little longer than it lasted, one that was interrupted as far as it came.
+
+    Parameters
+    ----------
+    rtol
+        Relative tolerance; the absolute ones are changed by the same factor.
+    step
+        Length (s) of the steps of a run with fixed steps.
+    progress
+        As for :func:`srm_mbs.simulate`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made again; the message says why.
+    """
+    reason, request = why_not(solution), solution.request
+    if reason or request is None:
+        raise InputError(
+            f"the run cannot be made again: {reason}",
+            element="solution",
+            remedy="Give the solution itself, before it is saved",
+        )
+    settings = solution.settings
+    start, end = solution.span
+    t_end = request.t_end
+    if solution.status == "interrupted":
+        t_end = end
+    elif solution.status == "failed":
+        t_end = min(t_end, end + BEYOND * max(end - start, BEYOND * (t_end - start)))
+    asked = settings.rtol if rtol is None else rtol
+    options = dict(request.options)
+    if settings.backend == "python" and options["backend"] == "auto":
+        options["backend"] = "python"
+    return simulate(
+        solution.mechanism,
+        t_end,
+        **options,
+        rtol=asked,
+        atol=np.array(settings.atol) * (asked / settings.rtol),
+        step=settings.step if step is None else step,
+        progress=progress,
+    )

@@ -1,0 +1,530 @@
+"""What a run returns: states, statistics, and quantities computed when they are read.
+
+What a run records about itself: work done, settings, and the steps that did not stand.
+
+What runs of mechanisms and of DAEs tell about their steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.reactions import drive_forces_at, reactions_at
+from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.errors import InputError
+from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read, wound_angles
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.singular_passages import (
+    Bifurcation,
+    Crossing,
+    find_bifurcations,
+    find_crossings,
+)
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.visualization.animation.joint_motion import Shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from srm_mbs.simulation.energy_balance import EnergyBalance
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Work done by a run.
+
+    Attributes
+    ----------
+    steps, rejected
+        Accepted steps, and steps rejected for their error.
+    placements, replaced
+        Steps shortened in advance, and redone, so that no stage lies on a singular point.
+    zone_steps
+        Accepted steps with a stage so close to a singular configuration that rows were dropped.
+    evaluations
+        Evaluations of the equations of motion, the initial step's included.
+    factorisations
+        Factorisations of the constraint algebra; 0 for an open chain.
+    wall_time
+        Seconds.
+    """
+
+    steps: int
+    rejected: int
+    placements: int
+    replaced: int
+    zone_steps: int
+    evaluations: int
+    factorisations: int
+    wall_time: float
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a run was made; kept for saving and for reports."""
+
+    method: str
+    tableau: str
+    rtol: float
+    atol: tuple[float, ...]
+    step: float | None
+    controlled: bool
+    placement: str = "automatic"
+    singular_times: tuple[float, ...] = ()
+    backend: str = "python"
+
+
+_REPEATED = (
+    *("t0", "method", "tableau", "first_step", "max_step", "events", "controller", "sample_time"),
+    *("breakpoints", "placement", "singular_times", "backend"),
+)
+"""Options of a run that it takes to make it again; those of its start, its accuracy and its output
+are elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What a run was asked for, so that it can be made again with another accuracy.
+
+    Attributes
+    ----------
+    t_end
+        End that was asked for (s).
+    options
+        Options of :func:`srm_mbs.simulate`, without start, tolerances, step and output.
+    lost
+        What a saved run does not keep of them, in words.
+    """
+
+    t_end: float
+    options: Mapping[str, Any]
+    lost: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, t_end: float, options: Mapping[str, Any]) -> Request:
+        """From all options of ``simulate``."""
+        return cls(t_end, {name: options[name] for name in _REPEATED})
+
+
+ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
+"""A step that did not stand: its start and length (s), error estimate over tolerance, and whether
+it was ``"rejected"`` for its error or ``"replaced"`` because of a singular configuration."""
+
+
+def attempt_array(attempts: Iterable[Any]) -> NDArray[np.void]:
+    """The ``attempts`` of a run as a structured array (k,) of :data:`ATTEMPT`."""
+    rows = [(a.t, a.h, a.error_ratio, a.verdict.value) for a in attempts]
+    return np.array(rows, dtype=ATTEMPT)
+
+
+class Stepped:
+    """A run of steps.
+
+    Attributes
+    ----------
+    steps
+        The accepted steps.
+    attempts
+        The attempted ones: structured array with t, h and verdict.
+    status
+        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``.
+    """
+
+    steps: StepData
+    attempts: NDArray[np.void]
+    status: str
+
+    @property
+    def success(self) -> bool:
+        """Whether the end, or a terminal event, was reached."""
+        return self.status in ("finished", "event")
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the run, whatever ``t`` holds."""
+        return float(self.steps.times[0]), self.steps.end
+
+    @property
+    def rejected(self) -> FloatArray:
+        """Start and length (k, 2) s of the steps rejected for their error."""
+        return self._attempted("rejected")
+
+    @property
+    def replaced(self) -> FloatArray:
+        """Start and length (k, 2) s of the steps redone because of a singular configuration."""
+        return self._attempted("replaced")
+
+    def _attempted(self, verdict: str) -> FloatArray:
+        chosen = self.attempts[self.attempts["verdict"] == verdict]
+        return np.column_stack([chosen["t"], chosen["h"]])
+
+
+class Solution(Stepped, Shown):
+    """Result of :func:`srm_mbs.simulate`.
+
+    Attributes
+    ----------
+    mechanism
+        What was simulated.
+    t : (n,) s
+        ``t_eval``, or the ends of the accepted steps, the start first and a terminal event last.
+    q : (n, nq), v : (n, nv)
+        Configurations and velocities there.
+    status, message
+        ``finished``, ``event``, ``failed`` or ``interrupted``; when and why.
+    stats
+        :class:`Statistics`.
+    settings
+        :class:`Settings`.
+    attempts : (k,)
+        The steps that did not stand, a structured array of :data:`ATTEMPT`.
+    t_events, q_events, v_events
+        For each event in turn its times (k,) s, and the states (k, nq), (k, nv) there; None if
+        no events were given.
+    request
+        :class:`~srm_mbs.simulation.result.Request`: what else it takes to make the run again; None
+        if the file that it is from does not say.
+    """
+
+    request: Request | None = None
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        system: OpenSystem | ClosedSystem,
+        scheme: ButcherTableau,
+        steps: StepData,
+        *,
+        dense: DenseOutput | None = None,
+        t_eval: FloatArray | None,
+        attempts: NDArray[np.void],
+        events: tuple[list[FloatArray], list[FloatArray]] | None = None,
+        status: str,
+        message: str,
+        stats: Statistics,
+        settings: Settings,
+    ) -> None:
+        self.mechanism = mechanism
+        self.steps = steps
+        self.scheme = scheme
+        self.attempts = attempts
+        self.status = status
+        self.message = message
+        self.stats = stats
+        self.settings = settings
+        self._system = system
+        self._dense = DenseOutput(system, scheme, steps) if dense is None else dense
+        # q and v are views: writing to them would change the dense output.
+        steps.states.setflags(write=False)
+        steps.times.setflags(write=False)
+        self.t_eval = t_eval
+        if t_eval is None:
+            self.t, states = self._dense.nodes()
+            states.setflags(write=False)
+            self.t.setflags(write=False)
+        else:
+            self.t = t_eval[t_eval <= steps.end]
+            states = self._dense(self.t)
+        nq = mechanism.model.nq
+        self.q, self.v = states[:, :nq], states[:, nq:]
+        self._events = events
+        self.t_events: list[FloatArray] | None = None
+        self.q_events: list[FloatArray] | None = None
+        self.v_events: list[FloatArray] | None = None
+        if events is not None:
+            self.t_events, found = events
+            self.q_events = [states[:, :nq] for states in found]
+            self.v_events = [states[:, nq:] for states in found]
+
+    @property
+    def held(self) -> HeldForce | None:
+        """What a sampled controller held; None without one."""
+        return self._system.held
+
+    @property
+    def steps_to_save(self) -> StepData:
+        """The steps; complete where the controller, which is not saved, would be needed to read
+        between them."""
+        called = self.settings.controlled and self._system.controlled and self.held is None
+        return self._dense.complete() if called else self.steps
+
+    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
+        """Dense output: q and v at time ``t`` (s), a scalar or an array of any order.
+
+        Returns shapes (nq,), (nv,) for a scalar, (k, nq), (k, nv) for an array.
+
+        Raises
+        ------
+        InputError
+            If a time lies outside the run, or t has more than one dimension.
+        """
+        times = times_to_read(t, scalar=True)
+        states = self._dense(np.atleast_1d(times))
+        nq = self.mechanism.model.nq
+        q, v = states[:, :nq], states[:, nq:]
+        return (q[0], v[0]) if times.ndim == 0 else (q, v)
+
+    def at(self, t: Any) -> Solution:
+        """The same run read at other times: q, v, drift, energy, reactions, joints.
+
+        Parameters
+        ----------
+        t : (k,) s
+            Times within the run, in any order.
+
+        Raises
+        ------
+        InputError
+            If a time lies outside the run, or ``t`` has not one dimension.
+        """
+        times = times_to_read(t)
+        self._dense.check(times)
+        run = Solution(
+            self.mechanism,
+            self._system,
+            self.scheme,
+            self.steps,
+            dense=self._dense,
+            t_eval=np.clip(times, self.steps.times[0], self.steps.end),
+            attempts=self.attempts,
+            events=self._events,
+            status=self.status,
+            message=self.message,
+            stats=self.stats,
+            settings=self.settings,
+        )
+        run.request = self.request
+        return run
+
+    @property
+    def segments(self) -> tuple[Solution, ...]:
+        """The smooth parts of the run: itself, unless events acted on it."""
+        return (self,)
+
+    def joint(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Position and rate (n,), (n,) of a one-degree joint at ``t``; angles are unwrapped.
+
+        Raises
+        ------
+        InputError
+            If there is no such joint, or it has more than one degree of freedom.
+        """
+        joint = self.mechanism.joint(name)
+        if joint.nv != 1:
+            raise InputError(
+                f"joint {name!r} has {joint.nv} degrees of freedom",
+                remedy=f"Use solution.v[:, {joint.idx_v}:{joint.idx_v + joint.nv}]",
+            )
+        rate = self.v[:, joint.idx_v]
+        if joint.nq == 1:
+            return self.q[:, joint.idx_q], rate
+        states = np.hstack([self.q, self.v])
+        nq = self.mechanism.model.nq
+        return wound_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
+
+    @cached_property
+    def crossings(self) -> tuple[Crossing, ...]:
+        """Passages through singular configurations, in order of time."""
+        return find_crossings(self._system, self.scheme, self.steps, self._dense)
+
+    @cached_property
+    def bifurcations(self) -> tuple[Bifurcation, ...]:
+        """Singular configurations that the run reached without the momentum to choose a branch."""
+        failed = self.status == "failed"
+        return find_bifurcations(self._system, self.steps, self._dense, self.settings.rtol, failed)
+
+    @cached_property
+    def drift(self) -> FloatArray:
+        """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
+        the drives; all rows, unscaled."""
+        g, c = constraint_errors(self.mechanism, self.t, self.q, self.v)
+        return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
+
+    @cached_property
+    def energy(self) -> FloatArray:
+        """Kinetic plus potential energy (n,) J: gravity, springs and bushings.
+
+        Constant torques and wrenches have no potential here.
+        """
+        return np.array([self._system.energy(np.concatenate(x)) for x in zip(self.q, self.v)])
+
+    @cached_property
+    def accelerations(self) -> FloatArray:
+        """v' (n, nv) of the equations of motion at ``t``, controller included.
+
+        Raises
+        ------
+        InputError
+            For a loaded run that had a controller.
+        """
+        self._need_controller("acceleration")
+        states = np.hstack([self.q, self.v])
+        nv = self.mechanism.model.nv
+        rates = [self._system.evaluate(t, x).rate()[nv:].copy() for t, x in zip(self.t, states)]
+        return np.array(rates).reshape(len(rates), nv)
+
+    @property
+    def degrees_of_freedom(self) -> NDArray[np.int_]:
+        """Momentary degrees of freedom (n,) at ``t``; more in :func:`srm_mbs.mobility_map`."""
+        from srm_mbs.simulation.mobility import mobility_map
+
+        return mobility_map(self).degrees_of_freedom
+
+    @cached_property
+    def energy_balance(self) -> EnergyBalance:
+        """Energies and the works of everything that acts; see
+        :class:`srm_mbs.simulation.energy_balance.EnergyBalance`.
+
+        Raises
+        ------
+        InputError
+            For a loaded run that had a controller.
+        """
+        from srm_mbs.simulation.energy_balance import energy_balance
+
+        self._need_controller("energy balance")
+        return energy_balance(self, self._system)
+
+    def _need_controller(self, what: str) -> None:
+        acting = self._system.controlled or self._system.calls_forces
+        if self.settings.controlled and not acting:
+            raise InputError(
+                f"the {what} of a loaded run with a controller cannot be computed: "
+                "controllers are not saved",
+                remedy="Read it before saving, or simulate again",
+            )
+
+    @cached_property
+    def _reactions(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        self._need_controller("reactions")
+        return reactions_at(self._system, self.t, self.q, self.v)
+
+    @property
+    def reactions(self) -> Mapping[str, FloatArray]:
+        """Per loop (n, 6): force (N) then moment (N m) that a exerts on b, at b's origin, world
+        axes.  Where redundancy makes them non-unique: the values of least norm."""
+        return self._reactions[0]
+
+    @property
+    def reaction_multipliers(self) -> Mapping[str, FloatArray]:
+        """Per loop (n, rows): the multipliers lam of M v' = f - G^T lam, rows unscaled."""
+        return self._reactions[1]
+
+    @cached_property
+    def drive_forces(self) -> Mapping[str, FloatArray]:
+        """Per drive (n,): the force (N) or torque (N m) that it exerts on its coordinate, in the
+        positive sense, and the opposite one on what carries it: what an actuator has to give.
+        Where drives and closures are redundant: the values of least norm."""
+        self._need_controller("drive forces")
+        return drive_forces_at(self._system, self.t, self.q, self.v)
+
+    @cached_property
+    def drive_rates(self) -> Mapping[str, FloatArray]:
+        """Per drive (n,): the prescribed rate s'(t) (rad/s, m/s); times the force its power."""
+        curves = self.mechanism.drive_curves
+        return {name: np.array([curve(t)[1] for t in self.t]) for name, curve in curves.items()}
+
+    @property
+    def coupling_forces(self) -> Mapping[str, FloatArray]:
+        """Per coupling (n, joints): generalised forces on its joints, in their order, N m or N."""
+        out = {}
+        for loop in self.mechanism.loops:
+            for row, lam in zip(loop.rows.joint_rows, self.reaction_multipliers[loop.name].T):
+                out[loop.name] = -np.outer(lam, row.coefficients)
+        return out
+
+    @property
+    def indeterminate_reactions(self) -> tuple[str, ...]:
+        """Closure rows, ``loop.row``, whose reactions equilibrium alone does not determine.
+
+        For these :attr:`reactions`, :attr:`reaction_multipliers` and :attr:`coupling_forces` hold
+        the values of least norm (docs/closures.md); all others are unique.
+        """
+        return self.mechanism.mobility.indeterminate_rows
+
+    def to_csv(self, path: str | Path, t: Any = None) -> None:
+        """Write the motion as a table; see :func:`srm_mbs.simulation.csv_export.write_csv`.
+
+        Parameters
+        ----------
+        path
+            File name; ``.csv`` is usual and is not added.
+        t : (k,) s
+            Times of its rows, in any order; by default ``solution.t``.
+        """
+        from srm_mbs.simulation.csv_export import write_csv
+
+        write_csv(self if t is None else self.at(t), Path(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write everything needed to replay and interpolate the run, description included.
+
+        Parameters
+        ----------
+        path
+            File name; ``.npz`` is usual and is not added.
+        """
+        from srm_mbs.simulation.storage import save_solution
+
+        save_solution(self, Path(path))
+
+    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
+        """A picture of the run; docs/plots.md shows each kind.
+
+        Parameters
+        ----------
+        path
+            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
+            omitted.
+        kind
+            ``run``: drift, energy, sigma and step sizes with rejected steps and singular passages
+            marked.  ``state``: positions and rates of joints.  ``balance``: energies, works, and
+            the residual of the energy balance.  ``reactions``: forces and moments in the closures.
+            ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
+            position of joints.  ``path``: paths of points in space.
+        **options
+            ``joints`` of ``state`` and ``phase``: names, by default as many as fit.  ``loops`` of
+            ``reactions``: names; ``rows``: whether to draw the multiplier of each row.  ``points``
+            of ``path``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Without pyplot: it is on no screen, and need not be closed.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind, option, joint, loop, point or suffix; if the run has not what is
+            to be drawn; for balance and reactions of a loaded run that had a controller.
+        ControllerError, EvaluationError
+            If forces cannot be evaluated again.
+        OSError
+            If the file cannot be written.
+        """
+        from srm_mbs.visualization.plotting import plot_solution
+
+        return plot_solution(self, path, kind, **options)
+
+    def report(self, path: str | Path, **options: Any) -> None:
+        """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`."""
+        from srm_mbs.analysis.report.report import write_report
+
+        write_report(self, Path(path), **options)
+
+    def __repr__(self) -> str:
+        return (
+            f"Solution({self.mechanism.name!r}, t={self.t[0] if len(self.t) else 0:.6g}.."
+            f"{self.t[-1] if len(self.t) else 0:.6g} s, {len(self.t)} points, "
+            f"{self.stats.steps} steps, {self.status})"
+        )

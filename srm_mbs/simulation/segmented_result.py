@@ -1,0 +1,272 @@
+"""Runs whose state or mechanism was changed by the actions of events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.integration.dense_output import StepData, check_within, times_to_read
+from srm_mbs.integration.singular_passages import Bifurcation, Crossing
+from srm_mbs.simulation.result import Solution, Statistics
+
+if TYPE_CHECKING:
+    from srm_mbs.simulation.energy_balance import EnergyBalance
+
+
+class SegmentedSolution(Solution):
+    """Result of a run with event actions: smooth segments on one time axis.
+
+    ``t``, ``q`` and ``v`` have two rows at each jump, before and after; dense output, ``t_eval``
+    and :meth:`at` give the state after it.
+
+    Attributes
+    ----------
+    segments
+        The :class:`~srm_mbs.Solution` of each segment, with the mechanism that it had.
+    mechanism
+        That of the first segment.
+    """
+
+    def __init__(
+        self,
+        segments: Sequence[Solution],
+        *,
+        t_eval: FloatArray | None,
+        status: str,
+        message: str,
+    ) -> None:
+        self._segments = tuple(segments)
+        first = self.segments[0]
+        self.mechanism = first.mechanism
+        self.scheme, self.settings = first.scheme, first.settings
+        self.status, self.message = status, message
+        self.attempts = np.concatenate([segment.attempts for segment in self.segments])
+        self._starts = np.array([segment.steps.times[0] for segment in self.segments])
+        self.stats = _added([segment.stats for segment in self.segments])
+        self.t_eval = t_eval
+        self._parts: tuple[Solution, ...] = self.segments
+        self._order = np.zeros(0, dtype=int)
+        if t_eval is not None:
+            t_eval = t_eval[t_eval <= self.segments[-1].steps.end]
+            self._read_at(t_eval)
+        self.t = self._rows(lambda part: part.t)
+        self.q = self._rows(lambda part: part.q)
+        self.v = self._rows(lambda part: part.v)
+        self.t_events = self.q_events = self.v_events = None
+        if first.t_events is not None:
+            count = range(len(first.t_events))
+            self.t_events, self.q_events, self.v_events = (
+                [np.concatenate([getattr(s, name)[i] for s in self.segments]) for i in count]
+                for name in ("t_events", "q_events", "v_events")
+            )
+
+    @property
+    def segments(self) -> tuple[Solution, ...]:
+        """The smooth parts of the run, between the actions of events."""
+        return self._segments
+
+    def _index(self, t: FloatArray) -> Any:
+        """The segment of each time; the later one at a jump."""
+        return np.clip(np.searchsorted(self._starts, t, side="right") - 1, 0, None)
+
+    def _read_at(self, t: FloatArray) -> None:
+        index = self._index(t)
+        chosen = np.argsort(index, kind="stable")
+        self._order = np.argsort(chosen, kind="stable")
+        self._parts = tuple(segment.at(t[index == k]) for k, segment in enumerate(self.segments))
+
+    def _rows(self, read: Callable[[Any], FloatArray]) -> FloatArray:
+        """What ``read`` gives for each segment, in the order of ``t``."""
+        rows = np.concatenate([read(part) for part in self._parts])
+        rows = rows if self._parts is self.segments else rows[self._order]
+        rows.setflags(write=False)
+        return rows
+
+    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
+        """Dense output, right-continuous; see :class:`~srm_mbs.Solution`."""
+        times = times_to_read(t, scalar=True)
+        found = self.at(np.atleast_1d(times))
+        return (found.q[0], found.v[0]) if times.ndim == 0 else (found.q, found.v)
+
+    def at(self, t: Any) -> Solution:
+        """The same run read at other times; see :meth:`~srm_mbs.Solution.at`."""
+        times = times_to_read(t)
+        start, end = self.span
+        check_within(times, start, end)
+        run = SegmentedSolution(
+            self.segments,
+            t_eval=np.clip(times, start, end),
+            status=self.status,
+            message=self.message,
+        )
+        run.request = self.request
+        return run
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end of the run (s)."""
+        return float(self._starts[0]), self.segments[-1].steps.end
+
+    @property
+    def held(self) -> HeldForce | None:
+        """What a sampled controller held in the first segment; None without one."""
+        return self.segments[0].held
+
+    @cached_property
+    def steps(self) -> StepData:  # type: ignore[override]
+        """All steps, for plots; a jump is the end of a step."""
+        return _joined([segment.steps for segment in self.segments])
+
+    def joint(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Position and rate of a one-degree joint; see :meth:`~srm_mbs.Solution.joint`."""
+        pairs = [part.joint(name) for part in self._parts]
+        positions = [position for position, _ in pairs]
+        if self.mechanism.joint(name).nq > 1:
+            # An angle goes on from where it was: which turn it is in is not in q.
+            whole = [segment.joint(name)[0] for segment in self.segments]
+            shift = 0.0
+            for k in range(1, len(whole)):
+                shift += 2.0 * np.pi * np.round((whole[k - 1][-1] - whole[k][0]) / (2.0 * np.pi))
+                positions[k] = positions[k] + shift
+        rates = [rate for _, rate in pairs]
+        return self._ordered(positions), self._ordered(rates)
+
+    def _ordered(self, rows: list[FloatArray]) -> FloatArray:
+        joined = np.concatenate(rows)
+        return joined if self._parts is self.segments else joined[self._order]
+
+    @cached_property
+    def crossings(self) -> tuple[Crossing, ...]:
+        """Passages through singular configurations, in order of time."""
+        return tuple(c for segment in self.segments for c in segment.crossings)
+
+    @cached_property
+    def bifurcations(self) -> tuple[Bifurcation, ...]:
+        """See :attr:`~srm_mbs.Solution.bifurcations`."""
+        return tuple(b for segment in self.segments for b in segment.bifurcations)
+
+    @cached_property
+    def drift(self) -> FloatArray:
+        """Closure errors (n, 2), of the closures that were there."""
+        return self._rows(lambda part: part.drift)
+
+    @cached_property
+    def energy(self) -> FloatArray:
+        """Kinetic plus potential energy (n,) J."""
+        return self._rows(lambda part: part.energy)
+
+    @cached_property
+    def accelerations(self) -> FloatArray:
+        """See :attr:`~srm_mbs.Solution.accelerations`."""
+        return self._rows(lambda part: part.accelerations)
+
+    @cached_property
+    def degrees_of_freedom(self) -> Any:
+        """See :attr:`~srm_mbs.Solution.degrees_of_freedom`."""
+        return self._rows(lambda part: part.degrees_of_freedom)
+
+    @cached_property
+    def energy_balance(self) -> EnergyBalance:
+        """See :attr:`~srm_mbs.Solution.energy_balance`; what actions change is in ``events``."""
+        from srm_mbs.simulation.energy_balance import joined_balance
+
+        order = None if self._parts is self.segments else self._order
+        return joined_balance(self.segments, self._parts, order)
+
+    def _named(self, which: str) -> Mapping[str, FloatArray]:
+        tables = [getattr(part, which) for part in self._parts]
+        shapes = {name: rows.shape[1:] for table in tables for name, rows in table.items()}
+        return {
+            name: self._ordered(
+                [
+                    table.get(name, np.zeros((len(part.t), *shape)))
+                    for table, part in zip(tables, self._parts)
+                ]
+            )
+            for name, shape in shapes.items()
+        }
+
+    @cached_property
+    def reactions(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.reactions`; 0 while a closure is not there."""
+        return self._named("reactions")
+
+    @cached_property
+    def reaction_multipliers(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.reaction_multipliers`; 0 while a closure is not there."""
+        return self._named("reaction_multipliers")
+
+    @cached_property
+    def drive_forces(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.drive_forces`; 0 while a drive is not there."""
+        return self._named("drive_forces")
+
+    @cached_property
+    def drive_rates(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.drive_rates`; 0 while a drive is not there."""
+        return self._named("drive_rates")
+
+    @cached_property
+    def coupling_forces(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.coupling_forces`; 0 while a coupling is not there."""
+        return self._named("coupling_forces")
+
+    @property
+    def indeterminate_reactions(self) -> tuple[str, ...]:
+        """See :attr:`~srm_mbs.Solution.indeterminate_reactions`; those of any segment."""
+        rows = (row for segment in self.segments for row in segment.indeterminate_reactions)
+        return tuple(dict.fromkeys(rows))
+
+    def save(self, path: str | Path) -> None:
+        """Write all segments into one file; see :meth:`~srm_mbs.Solution.save`."""
+        from srm_mbs.simulation.storage import save_segments
+
+        save_segments(self, Path(path))
+
+
+def _added(parts: Sequence[Statistics]) -> Statistics:
+    names = [field.name for field in fields(Statistics)]
+    return Statistics(**{name: sum(getattr(part, name) for part in parts) for name in names})
+
+
+def _joined(parts: Sequence[StepData]) -> StepData:
+    """One set of steps; the states are those before the jumps."""
+    width = max(part.corrections.shape[1] for part in parts)
+    stopped = [
+        part.times if part.stop is None else np.append(part.times[:-1], part.stop) for part in parts
+    ]
+    at = np.cumsum([0, *(part.count for part in parts)])
+
+    def rows(name: str) -> FloatArray:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return replace(
+        parts[-1],
+        times=np.concatenate([stopped[0][:1], *(times[1:] for times in stopped)]),
+        states=np.concatenate([parts[0].states[:1], *(part.states[1:] for part in parts)]),
+        corrections=np.concatenate(
+            [
+                part.corrections if part.corrections.shape[1] else np.zeros((part.count, width))
+                for part in parts
+            ]
+        ),
+        zones={
+            int(start) + step: zone
+            for start, part in zip(at, parts)
+            for step, zone in part.zones.items()
+        },
+        stop=None,
+        breaks=np.concatenate([part.breaks + start for start, part in zip(at, parts)]),
+        break_rates=rows("break_rates"),
+        **{
+            name: rows(name)
+            for name in ("rates", "sigmas", "ranks", "error_ratios", "placements", "held")
+        },
+    )

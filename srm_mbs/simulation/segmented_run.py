@@ -1,0 +1,400 @@
+"""Runs with event actions, segment by segment.
+
+What happens at events: actions that change the state, or the mechanism.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.api import simulate
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
+from srm_mbs.dynamics.system import onto_closures
+from srm_mbs.errors import EvaluationError, EventError, InputError, SimulationError
+from srm_mbs.integration.events import EventFunction, prepare_events, together
+from srm_mbs.model.drives import positions
+from srm_mbs.model.laws import Curve
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.options import checked_times, numbers, positive
+from srm_mbs.simulation.result import Request, Solution
+from srm_mbs.simulation.runner import check_consistent
+from srm_mbs.simulation.segmented_result import SegmentedSolution
+
+
+class Event:
+    """An event function with its attributes in one call.
+
+    Parameters
+    ----------
+    function
+        (t, q, v) -> float; the event is where it passes zero.
+    direction
+        > 0 for zeros passed upwards, < 0 downwards, 0 for both.
+    terminal
+        Whether it ends the run, or after how many occurrences.
+    action
+        (t, q, v) -> what goes on from there, called at each occurrence that does not end the run:
+        None if nothing changes, a consistent (q, v), or a :class:`Switch`.  The state that it gets
+        is on the closures.
+
+    Raises
+    ------
+    InputError
+        If ``function`` or ``action`` cannot be called.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[float, FloatArray, FloatArray], Any],
+        *,
+        direction: float = 0.0,
+        terminal: bool | int = False,
+        action: Callable[[float, FloatArray, FloatArray], Any] | None = None,
+    ) -> None:
+        for given, what in ((function, "function"), (action, "action")):
+            if given is not None and not callable(given):
+                raise InputError(
+                    f"the {what} {given!r} of an event cannot be called",
+                    element=what,
+                    remedy="Give a function of (t, q, v)",
+                )
+        self.__name__ = getattr(function, "__name__", "<lambda>")
+        self.function, self.action = function, action
+        self.direction, self.terminal = direction, terminal
+
+    def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
+        """The value of the function."""
+        return self.function(t, q, v)
+
+
+@dataclass(frozen=True, eq=False)
+class Switch:
+    """Another mechanism from here on, as the answer of an action.
+
+    Parameters
+    ----------
+    mechanism
+        With the same joints: other closures (:meth:`srm_mbs.Mechanism.with_loop`,
+        :meth:`~srm_mbs.Mechanism.without_loop`), drives or forces.
+    q : (nq,), v : (nv,)
+        By default as they are.  The positions must satisfy its closures, but for the tolerance of
+        the run.  The velocities are projected on them, M-orthogonally: constraint impulses act, as
+        in an inelastic impact, and nothing else.
+
+    Drives that the mechanism had go on.  A new one engages: its law counts in the time of the run,
+    from the position in which it finds its coordinate, s(t) = s(t_s) + law(t) - law(t_s); an
+    absolute one must find it where it prescribes it.
+    """
+
+    mechanism: Mechanism
+    q: Any = None
+    v: Any = None
+
+
+def impact(
+    mechanism: Mechanism, q: Any, v: Any, normal: Any, restitution: float = 0.0
+) -> FloatArray:
+    """Velocities after an impact that closures take part in.
+
+    An impulse acts along ``normal`` and along the closures, so that the rate n.v turns into
+    -e n.v while G v = 0 stays: v + a mu with a = (1 - P) M^{-1} n (Newton's law of restitution).
+
+    Parameters
+    ----------
+    mechanism
+        What is hit.
+    q : (nq,), v : (nv,)
+        State before.
+    normal : (nv,)
+        n: gradient of the distance to the stop in the coordinates of v.
+    restitution
+        e, from 0 (it stays) to 1 (elastic).
+
+    Returns
+    -------
+    v : (nv,)
+
+    Raises
+    ------
+    InputError
+        For another shape, a restitution that is none, or if the closures do not let the mechanism
+        move along ``normal``.
+    """
+    import pinocchio as pin
+
+    if not 0.0 <= restitution <= 1.0:
+        raise InputError(
+            f"restitution = {restitution!r} is not between 0 and 1",
+            element="restitution",
+            remedy="Give 0 (nothing springs back) to 1 (all of it)",
+        )
+    here = mechanism.with_state(q, v)
+    remedy = f"Give {here.model.nv} numbers"
+    n = numbers(normal, "normal", remedy)
+    if n.shape != here.v0.shape:
+        raise InputError(
+            f"normal has shape {n.shape}, not {here.v0.shape}", element="normal", remedy=remedy
+        )
+    M = pin.crba(here.model, workspace(here.model), here.q0, pin.Convention.WORLD)
+    along = np.linalg.solve(np.triu(M) + np.triu(M, 1).T, n)
+    terms = make_system(here).evaluate(0.0, np.concatenate([here.q0, here.v0]))
+    free = along - terms.project(along)
+    gain = float(n @ free)
+    if not gain > 1e-12 * float(n @ along):
+        raise InputError(
+            "the closures do not let the mechanism move along this normal",
+            element="normal",
+            remedy="Give the gradient of the gap, which some motion of the mechanism changes",
+        )
+    out: FloatArray = here.v0 - (1.0 + restitution) * float(n @ here.v0) / gain * free
+    return out
+
+
+log = logging.getLogger(__name__)
+
+MANY = 10
+CHATTERS = 1e-8
+"""An event that occurs MANY times within this part of the run chatters."""
+HELD = 1e-9
+"""Rounding of an event that closures hold at zero, over its values before."""
+SNAPS = 1e-4
+"""Largest motion (units) onto the closures of another mechanism: more is an inconsistent state."""
+INTERRUPTED = "Interrupted at t = {:.6g} s; everything up to there is kept."
+ON = 1e-13
+"""Closure error that is rounding, in scaled rows, and over 1 + |v| that of rates."""
+LEFT = 1e-12
+"""Part of the run too short for another segment."""
+
+
+class _Armed:
+    """An event of the user, (t, q, v) -> float, within one segment."""
+
+    def __init__(
+        self,
+        event: Any,
+        prepared: EventFunction,
+        before: int,
+        departs: bool,
+        floor: float,
+        guard: float | None,
+    ) -> None:
+        self._event = event
+        self.__name__ = prepared.name.strip("'")
+        self.direction = prepared.direction
+        self.left = prepared.occurrences - before
+        self.terminal = int(self.left) if math.isfinite(self.left) else None
+        self.acts = getattr(event, "action", None) is not None
+        self.departs = departs and floor == 0.0
+        self.floor = floor
+        self.guard = guard
+
+    def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
+        return self._event(t, q, v)
+
+
+class _Sampled:
+    """A controller whose samples go on over the segments of a run."""
+
+    def __init__(self, controller: Callable[..., Any], period: float) -> None:
+        self._controller, self._period = controller, period
+        self._last: Any = None
+
+    def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
+        off = abs(t / self._period - round(t / self._period))
+        if self._last is None or off < 1e-9:
+            self._last = self._controller(t, q, v)
+        return self._last
+
+
+def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any]) -> Solution:
+    """:func:`srm_mbs.simulate` with events that have actions.
+
+    Parameters
+    ----------
+    options
+        All others of ``simulate``.
+    """
+    t_end = float(t_end)
+    given = options["events"]
+    events = [given] if callable(given) else list(given)
+    prepared = prepare_events(given, lambda event: lambda t, x: 0.0)
+    if options["t0"] == 0.0 and not (options["q0"] is None and options["v0"] is None):
+        # Drives begin with this state.
+        q0, v0 = options["q0"], options["v0"]
+        mechanism = mechanism.with_state(
+            mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
+        )
+    t_eval = checked_times(options["t_eval"], options["t0"], t_end)
+    asked = options["raise_on_failure"]
+    here = options | {"t_eval": None, "raise_on_failure": False}
+    if options["sample_time"] is not None and callable(options["controller"]):
+        period = positive(options["sample_time"], "sample_time", " of seconds")
+        here["controller"] = _Sampled(options["controller"], period)
+    counts = [0] * len(events)
+    last_times: list[list[float]] = [[] for _ in events]
+    floors = [0.0] * len(events)
+    parts: list[Solution] = []
+    acted: list[int] = []
+    guards: list[float | None] = [None] * len(events)
+    t = float(options["t0"])
+    span = t_end - t
+    status, message = "", ""
+    while not status:
+        armed = [
+            _Armed(event, prepared[i], counts[i], i in acted, floors[i], guards[i])
+            for i, event in enumerate(events)
+        ]
+        try:
+            solution = simulate(mechanism, t_end, **here | {"events": armed})
+        except InputError as error:
+            if not parts:
+                raise
+            status, message = "failed", f"Stopped at t = {t:.9g} s: after the action {error}."
+            break
+        except KeyboardInterrupt:
+            if not parts:
+                raise
+            status, message = "interrupted", INTERRUPTED.format(t)
+            break
+        parts.append(solution)
+        status, message = solution.status, solution.message
+        found = solution.t_events or []
+        counts = [n + len(times) for n, times in zip(counts, found)]
+        t = solution.steps.end
+        due = [i for i, times in enumerate(found) if len(times) and times[-1] == t]
+        if status != "event" or any(len(found[i]) >= armed[i].left for i in due):
+            break
+        acted = [i for i in due if armed[i].acts]
+        # What was counted here is not counted again just after; the rest has still to be.
+        near = 2.0 * together(*solution.steps.times[-2:].tolist())
+        guards = [near if len(times) and times[-1] >= t - near else 0.0 for times in found]
+        try:
+            names = [armed[i].__name__ for i in acted]
+            log.debug("%s: action of %s at t = %.9g s", mechanism.name, ", ".join(names), t)
+            mechanism, q, v = _after(solution, t, [(events[i], armed[i].__name__) for i in acted])
+            switched = mechanism.loops != solution.mechanism.loops
+            for i in acted:
+                floors[i] = _rounding(events[i], solution) if switched else 0.0
+                last_times[i] = [*last_times[i][1 - MANY :], t]
+                _check_chatter(last_times[i], span, armed[i].__name__)
+        except EventError as error:
+            status = "failed"
+            message = f"Stopped at t = {t:.9g} s: {error}. Everything up to there is kept."
+            break
+        except KeyboardInterrupt:
+            status, message = "interrupted", INTERRUPTED.format(t)
+            break
+        here |= {"t0": t, "q0": q, "v0": v}
+        status = "" if t_end - t > LEFT * span else "finished"
+    if len(parts) > 1:
+        message += f" Event actions divide the run into {len(parts)} segments."
+    whole = SegmentedSolution(parts, t_eval=t_eval, status=status, message=message)
+    whole.request = Request.of(t_end, options)
+    if asked and not whole.success:
+        raise SimulationError(message, whole)
+    return whole
+
+
+def _rounding(event: Callable[..., Any], solution: Solution) -> float:
+    """Size of the value of an event that new closures hold at zero."""
+    rows = zip(solution.t, solution.q, solution.v)
+    return HELD * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
+
+
+def _check_chatter(times: list[float], span: float, name: str) -> None:
+    if len(times) == MANY and times[-1] - times[0] < CHATTERS * span:
+        raise EventError(
+            f"the event {name!r} occurred {MANY} times within {times[-1] - times[0]:.1e} s: it "
+            "chatters. Let its action hold what it hits (srm.Switch with a closure) when the "
+            "impact is slow"
+        )
+
+
+def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
+    """Whether ``x`` is on the closures to rounding.  Moving it onto them would gain nothing, and
+    next to a singular configuration take it off its branch by that rounding over sigma."""
+    if not isinstance(system, ClosedSystem):
+        return True
+    g, c = system.residuals(x, t)
+    speed = 1.0 + float(np.abs(x[system.nq :]).max())
+    return bool((np.abs(g) < ON).all() and (np.abs(c) < ON * speed).all())
+
+
+def _after(
+    solution: Solution, t: float, actions: list[tuple[Any, str]]
+) -> tuple[Mechanism, FloatArray, FloatArray]:
+    """Mechanism and state after ``actions``, events with their names, at the end of a segment."""
+    mechanism = solution.mechanism
+    nq = mechanism.model.nq
+    x = np.concatenate([solution.q[-1], solution.v[-1]])
+    try:
+        # The dense output is on the closures within the tolerance only.
+        system = make_system(mechanism)
+        if not _closed(system, t, x):
+            x = onto_closures(system, t, x)
+    except EvaluationError as error:
+        raise EventError(f"no action could be taken: {error}") from error
+    q, v = x[:nq], x[nq:]
+    for event, name in actions:
+        try:
+            answer = event.action(t, q.copy(), v.copy())
+        except Exception as error:
+            raise EventError(f"the action of the event {name!r} raised {error!r}") from error
+        if answer is None:
+            continue
+        try:
+            if isinstance(answer, Switch):
+                mechanism, q, v = _switched(mechanism, answer, t, q, v)
+            else:
+                q, v = (np.asarray(part, dtype=float) for part in answer)
+                moved = mechanism.moved(q, v)
+                check_consistent(moved, t)
+                q, v = moved.q0, moved.v0
+        except (InputError, EvaluationError, TypeError, ValueError) as error:
+            raise EventError(
+                f"the action of the event {name!r} cannot be carried out: {error}"
+            ) from error
+    return mechanism, q, v
+
+
+def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:
+    """The motions of the drives of ``new`` from ``t`` (s) on: those that ``old`` has go on, others
+    engage where they find their coordinate, unless they prescribe positions."""
+    found = positions(new.model, new.drives, new.q0)
+    curves = {}
+    for drive in new.drives:
+        if drive in old.drives:
+            curves[drive.name] = old.drive_curves[drive.name]
+            continue
+        curve = drive.curve(0.0)
+        moved = 0.0 if drive.absolute else found[drive.name] - curve(t)[0]
+        curves[drive.name] = curve.shifted(moved)
+    return curves
+
+
+def _switched(
+    mechanism: Mechanism, switch: Switch, t: float, q: FloatArray, v: FloatArray
+) -> tuple[Mechanism, FloatArray, FloatArray]:
+    new = switch.mechanism
+    if not isinstance(new, Mechanism) or list(new.model.names) != list(mechanism.model.names):
+        raise InputError(
+            "a switch leads to something else than a mechanism with the same joints",
+            remedy="Give a mechanism made from this one, for example with dataclasses.replace",
+        )
+    new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
+    new.__dict__["drive_curves"] = _curves_from(t, mechanism, new)
+    given = np.concatenate([new.q0, new.v0])
+    system = make_system(new)
+    x = onto_closures(system, t, given)
+    if system.size(system.difference(given, x)) > SNAPS:
+        check_consistent(new, t)
+    nq = new.model.nq
+    return new, x[:nq], x[nq:]

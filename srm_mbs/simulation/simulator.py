@@ -1,0 +1,377 @@
+"""``Simulator``: a mechanism that is stepped from outside, for control loops and learning."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.system import onto_closures
+from srm_mbs.errors import EvaluationError, InputError, SimulationError
+from srm_mbs.integration.breakpoints import pieces_between
+from srm_mbs.integration.kernel.backend import uses_kernel
+from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.incremental_run import KernelRun, ReferenceRun
+from srm_mbs.simulation.options import (
+    check_embedded,
+    checked_placement,
+    checked_rtol,
+    finite,
+    loosest_rtol,
+    positive,
+    tightest_rtol,
+)
+from srm_mbs.simulation.result import Statistics
+from srm_mbs.simulation.runner import (
+    absolute_tolerance,
+    check_consistent,
+    check_mechanism,
+    mechanism_method,
+    placed_control,
+)
+
+SHORT = 8.0
+"""Steps up to this many units of rounding of the time move nothing but the time."""
+LONGER = 1e10
+"""Where a step is longer than its predecessor by this factor, inner steps are chosen anew."""
+NEAR = 1e-14
+"""Distance of a breakpoint from the end of a step that is rounding, over the time."""
+_NONE = np.zeros(0)
+
+
+class Simulator:
+    """A mechanism at a time, with a state, that :meth:`step` moves on.
+
+    One compiled run is kept alive; nothing is recorded, so that memory does not grow.  Each step
+    takes as many inner steps as the tolerance needs; singular configurations are passed as in
+    :func:`srm_mbs.simulate`.  The same calls give the same numbers, bit by bit.
+
+    Parameters
+    ----------
+    mechanism
+        From :func:`srm_mbs.load`, or built from a ``pin.Model``.  It starts in its initial state.
+    method, tableau, rtol, atol, max_step, placement, backend
+        As for :func:`srm_mbs.simulate`.
+    step
+        Longest inner step (s) of fixed steps, instead of step-size control: each call is divided
+        into equal ones.
+
+    Raises
+    ------
+    InputError
+        For invalid input.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        *,
+        method: str | Method = "psrm",
+        tableau: str | ButcherTableau | None = None,
+        rtol: float = 1e-6,
+        atol: Any = None,
+        step: float | None = None,
+        max_step: float | None = None,
+        placement: str = "automatic",
+        backend: str = "auto",
+    ) -> None:
+        check_mechanism(mechanism)
+        for value, what in ((step, "step"), (max_step, "max_step")):
+            if value is not None:
+                positive(value, what, " of seconds")
+        checked = mechanism_method(method, tableau)
+        rtol = checked_rtol(
+            rtol, loosest_rtol(checked), tightest_rtol(checked.scheme, mechanism.constrained)
+        )
+        check_embedded(checked.scheme, step)
+        check_consistent(mechanism)
+        self._mechanism = mechanism
+        self._step = step
+        self._norm = ErrorNorm(
+            absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
+        )
+        self._method = checked
+        self._placement = checked_placement(placement)
+        self._max_step = np.inf if max_step is None else float(max_step)
+        self._on_kernel = uses_kernel(backend, checked, self._placement, _NONE)
+        self._no_force = np.zeros(mechanism.model.nv)
+        self._make()
+        self.reset()
+
+    def _make(self) -> None:
+        """A run of its own."""
+        mechanism, method, norm = self._mechanism, self._method, self._norm
+        held = HeldForce()
+        held.only(self._no_force)
+        system = make_system(mechanism, held)
+        self._system = system
+        self._run: KernelRun | ReferenceRun
+        if self._on_kernel and isinstance(method, PSRM):
+            self._run = KernelRun(
+                system, held, method, norm, self._step, self._max_step, self._placement
+            )
+        else:
+            self._run = ReferenceRun(
+                system,
+                held,
+                method,
+                norm,
+                self._max_step,
+                lambda first: placed_control(
+                    system, method, self._step, lambda: first, (0.0, np.inf), self._placement, _NONE
+                ),
+            )
+        self._nq = mechanism.model.nq
+        self._wall_time = 0.0
+        self._last = math.inf
+        # Where it starts, until the first step knows what acts.
+        self._begins: tuple[float, FloatArray] | None = None
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What is simulated."""
+        return self._mechanism
+
+    @property
+    def t(self) -> float:
+        """Time (s)."""
+        return self._run.t if self._begins is None else self._begins[0]
+
+    @property
+    def q(self) -> FloatArray:
+        """Configuration (nq,), a copy."""
+        return self._state()[: self._nq]
+
+    @property
+    def v(self) -> FloatArray:
+        """Velocity (nv,), a copy."""
+        return self._state()[self._nq :]
+
+    def _state(self) -> FloatArray:
+        return self._run.state.copy() if self._begins is None else self._begins[1].copy()
+
+    @property
+    def stats(self) -> Statistics:
+        """Work done since it was made: inner steps, evaluations, seconds within :meth:`step`."""
+        return Statistics(**self._run.counts(), wall_time=self._wall_time)
+
+    def step(self, dt: float, tau: Any = None) -> tuple[FloatArray, FloatArray]:
+        """Move on by ``dt`` (s).
+
+        Parameters
+        ----------
+        dt
+            Positive; need not be the same every time.  One that is within rounding of ``t`` moves
+            the time only.
+        tau : (nv,)
+            Generalised forces held during the step, N and N m, beside those of the mechanism;
+            none by default.
+
+        Returns
+        -------
+        q (nq,), v (nv,)
+            At the end; arrays of the caller's own.
+
+        Raises
+        ------
+        InputError
+            For a bad ``dt`` or ``tau``; before the first step after a :meth:`reset`, also if that
+            was to a singular configuration from where the motion is not determined.
+        SimulationError
+            If the mechanism cannot move on: ``t``, ``q`` and ``v`` are then those of the last good
+            inner step.
+        """
+        started = time.perf_counter()
+        dt = positive(dt, "dt", " of seconds")
+        force = self._no_force
+        if tau is not None:
+            force = self._force(tau)
+        t = self.t
+        end = t + dt
+        if dt <= SHORT * math.ulp(t):
+            self._begins = self._later(t, end, dt), self._state()
+            return self.q, self.v
+        if dt > LONGER * self._last:
+            self._begins = t, self._state()
+        self._last = dt
+        if self._begins is not None:
+            if not np.isfinite(force).all():
+                raise _bad_force(tau)
+            self._begin(*self._begins, force, dt)
+        run = self._run
+        try:
+            # Those at the ends count, too: what acts just before and behind them differs.
+            beside = NEAR * (abs(t) + dt)
+            kinks = self._mechanism.breakpoints(t - beside, end + beside)
+            if len(kinks):
+                trouble = self._piecewise(np.asarray(kinks, dtype=float), t, end, force)
+            else:
+                trouble = run.go_on(end, -math.inf, math.inf, force, False, self._grid(dt))
+        except ValueError as error:
+            raise _bad_force(tau) from error
+        finally:
+            self._wall_time += time.perf_counter() - started
+        if trouble:
+            raise SimulationError(trouble, None)
+        state = run.state
+        return state[: self._nq], state[self._nq :]
+
+    def _later(self, t: float, end: float, dt: float) -> float:
+        """``end`` (s), if that is later than ``t``."""
+        if end > t:
+            return end
+        raise InputError(
+            f"dt = {dt!r} s is below the rounding of t = {t!r} s",
+            element="dt",
+            remedy="Give a longer one, or reset to an earlier time",
+        )
+
+    def _force(self, tau: Any) -> FloatArray:
+        try:
+            force = np.array(tau, dtype=float)  # the caller may change it afterwards
+        except (TypeError, ValueError) as error:
+            raise _bad_force(tau) from error
+        if force.shape != self._no_force.shape:
+            raise _bad_force(tau)
+        return force
+
+    def _grid(self, length: float) -> float:
+        """Length of fixed steps that divide ``length`` (s); 0 with step-size control."""
+        return 0.0 if self._step is None else length / math.ceil(length / self._step - 1e-9)
+
+    def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> str:
+        pieces = pieces_between(kinks, _NONE, t, end)
+        for k, until in enumerate(pieces.ends.tolist()):
+            first, last = float(pieces.first[k]), float(pieces.last[k])
+            anew = k > 0 or first > -math.inf
+            grid = self._grid(until - self._run.t)
+            trouble = self._run.go_on(until, first, last, force, anew, grid)
+            if trouble:
+                return trouble
+        return ""
+
+    def _begin(self, t: float, state: FloatArray, force: FloatArray, dt: float) -> None:
+        """Start from where it was reset to."""
+        try:
+            self._run.begin(t, state, force, dt)
+        except EvaluationError as error:
+            raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
+        self._begins = None
+
+    def reset(
+        self, q: Any = None, v: Any = None, t: float = 0.0, *, project: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Go to a state, as a new simulator would start there; the statistics go on.
+
+        Parameters
+        ----------
+        q : (nq,), v : (nv,)
+            By default the mechanism's own.
+        t
+            Time (s).
+        project
+            Move the state onto the closures (:meth:`set_state`) instead of refusing one that
+            violates them.
+
+        Returns
+        -------
+        q (nq,), v (nv,)
+
+        Raises
+        ------
+        InputError
+            If the state violates the closures, or has another shape, or ``t`` is no finite number.
+        """
+        mechanism = self._mechanism
+        t = finite(t, "t")
+        if q is None and v is None and not project:
+            state = np.concatenate([mechanism.q0, mechanism.v0])
+        else:
+            q = mechanism.q0 if q is None else q
+            v = mechanism.v0 if v is None else v
+            state = self._consistent(q, v, t, project)
+        self._begins = t, state
+        self._last = math.inf
+        return self.q, self.v
+
+    def set_state(self, q: Any = None, v: Any = None, *, project: bool = False) -> None:
+        """Change the state at the current time.
+
+        Parameters
+        ----------
+        q : (nq,), v : (nv,)
+            By default as they are.  They must satisfy the closures to 1e-8, as in
+            :func:`srm_mbs.simulate`.
+        project
+            Move them onto the closures instead: q along the normals, v to the M-orthogonal
+            projection v - P v, as after an inelastic impact.
+
+        Raises
+        ------
+        InputError
+            If the state violates the closures, has another shape, or cannot be projected.
+        """
+        q = self.q if q is None else q
+        v = self.v if v is None else v
+        self._begins = self.t, self._consistent(q, v, self.t, project)
+
+    def _consistent(self, q: Any, v: Any, t: float, project: bool) -> FloatArray:
+        if project:
+            try:
+                given = self._mechanism.moved(q, v)
+                state = np.concatenate([given.q0, given.v0])
+                state = onto_closures(self._system, t, state)
+            except EvaluationError as error:
+                raise InputError(
+                    f"the state cannot be projected: {error}",
+                    element="q",
+                    remedy="Use srm.assemble(mechanism, q=..., v=...)",
+                ) from error
+            q, v = state[: self._nq], state[self._nq :]
+        moved = self._mechanism.moved(q, v)
+        check_consistent(moved, t)
+        return np.concatenate([moved.q0, moved.v0])
+
+    def clone(self) -> Simulator:
+        """An independent copy, which continues identically; its statistics start at 0."""
+        other = Simulator.__new__(Simulator)
+        other.__dict__.update(self.__dict__)
+        other._make()
+        other._last = self._last
+        if self._begins is None:
+            other._run.restore(self._run.snapshot())
+        else:
+            other._begins = self._begins[0], self._begins[1].copy()
+        return other
+
+    def __copy__(self) -> Simulator:
+        return self.clone()
+
+    def __deepcopy__(self, memo: Any) -> Simulator:
+        return self.clone()
+
+    def __reduce__(self) -> Any:
+        raise InputError(
+            "a simulator cannot be sent to another process, or kept in a file",
+            element="simulator",
+            remedy="Give its mechanism and t, q and v instead, and reset a new one to them",
+        )
+
+    def __repr__(self) -> str:
+        return f"Simulator({self._mechanism.name!r}, t={self.t:.6g} s)"
+
+
+def _bad_force(tau: Any) -> InputError:
+    return InputError(
+        f"tau = {tau!r} is not a vector of finite generalised forces",
+        element="tau",
+        remedy="Give nv numbers, N and N m",
+    )

@@ -1,1 +1,0 @@
-"""The one driver, step-size control, placement around singular configurations, dense output."""

@@ -1,1 +1,0 @@
-"""What is integrated: the contract (``base``), mechanisms on Pinocchio, and their algebra."""

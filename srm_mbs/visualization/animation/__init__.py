@@ -1,0 +1,1 @@
+"""Animations with Meshcat: pages, pictures, videos, live views."""

@@ -1,0 +1,199 @@
+"""A run seen in the browser while it is computed."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.errors import InputError
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.visualization.animation.joint_motion import JointMotion
+from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat, node_names
+from srm_mbs.visualization.animation.overlays import Overlays, Wanted
+from srm_mbs.visualization.animation.page import DRIFT, ENERGY, as_json, drift_unit, make_page
+from srm_mbs.visualization.animation.playback import (
+    REPLY_TIME,
+    about_picture,
+    answered,
+    close,
+    serve,
+    show,
+    wait,
+)
+from srm_mbs.visualization.animation.scene import make_picture
+
+if TYPE_CHECKING:
+    from srm_mbs.visualization.animation.joint_motion import Playable
+
+log = logging.getLogger(__name__)
+
+SHARE = 0.03
+"""Part of the time of the run that showing it may take."""
+OFTEN, SELDOM = 0.01, 0.04
+"""Seconds between two calls below and above which they come after twice, or half, as many steps."""
+MOST = 4096
+PATIENCE = 2.0
+"""Seconds for the server to accept one state."""
+ANEW = "Use solution.play(), which starts a server, or solution.export_html(path), which needs none"
+"""Remedy where the server of a view is gone."""
+WIDER = 1.6
+"""How much farther away the camera is than the start needs: where the motion goes is not known."""
+
+
+class LiveView:
+    """Shows the state of a run in the browser: ``simulate(mechanism, 10.0, progress=view)``.
+
+    It takes at most :data:`SHARE` of the run's time, by leaving states out.  The panel has the
+    time, the closure error and the change of the energy since the first step.  Bodies only, springs
+    and the like come with :meth:`play`.  It is a context manager, which stops serving at its end.
+
+    Parameters
+    ----------
+    mechanism
+        What is simulated.  The closure error and the energy are those of its closures and forces,
+        also where an event lets one go.
+    open_browser
+        Open a browser window; otherwise only serve the page.  Its address is logged.
+
+    Attributes
+    ----------
+    visualizer
+        The meshcat Visualizer.
+    shown, spent
+        How many states were shown, and the time that it took, s.
+    stride
+        Steps between two calls that it asks of the run for.
+
+    Raises
+    ------
+    InputError
+        If meshcat is missing or cannot start.
+    """
+
+    def __init__(self, mechanism: Mechanism, *, open_browser: bool = True) -> None:
+        self._meshcat = import_meshcat()
+        start = JointMotion(mechanism, np.zeros(1), np.array(mechanism.q0)[None])
+        picture = make_picture(start, 1.0, Wanted())
+        view = replace(picture.view, distance=WIDER * picture.view.distance)
+        picture = replace(picture, view=view, overlays=Overlays())
+        about = about_picture(start, picture, panel=True)
+        self._system, self._energy = make_system(mechanism), math.nan
+        unit = drift_unit(start)
+        about["values"] = [{"label": DRIFT, "unit": unit, "live": 1}] if unit else []
+        about["values"].append({"label": ENERGY, "unit": "J", "live": 2})
+        names = node_names(mechanism)
+        self._joints = sorted({visual.joint for visual in picture.visuals} - {0})
+        about["live"] = [names[joint] for joint in self._joints]
+        page = make_page(self._meshcat, mechanism.name, about, None)
+        self.visualizer = serve(self._meshcat, page, picture)
+        self._mechanism = mechanism
+        self._model, self._data = mechanism.model, workspace(mechanism.model)
+        self._node = self.visualizer["/live"]
+        self._began = self._last = 0.0
+        self.spent, self.shown, self.stride = 0.0, 0, 1
+        # What a state costs is known before the run.
+        began = time.perf_counter()
+        try:
+            self._send(0.0, np.concatenate([mechanism.q0, mechanism.v0]), REPLY_TIME)
+        except BaseException:
+            self.close()
+            raise
+        self._cost = time.perf_counter() - began
+        self.shown, self._energy = 0, math.nan
+        show(self.visualizer, mechanism.name, open_browser=open_browser)
+
+    def __call__(self, t: float, h: float, state: FloatArray) -> None:
+        """Show the state (nq + nv,) at t (s), if there is time for it."""
+        now = time.perf_counter()
+        if not self._began:
+            self._began = self._last = now
+            self._energy = self._system.energy(state)
+            return
+        if now - self._last < OFTEN:
+            self.stride = min(2 * self.stride, MOST)
+        elif now - self._last > SELDOM:
+            self.stride = max(self.stride // 2, 1)
+        self._last = now
+        if self.spent + self._cost > SHARE * (now - self._began):
+            return
+        try:
+            self.send(t, state)
+        except InputError:  # what has become of the page must not stop the run
+            log.warning("the page no longer follows the run: its server does not answer")
+            self.spent = math.inf
+            return
+        self._last = time.perf_counter()
+        self._cost = self._last - now
+        self.spent += self._cost
+
+    def send(self, t: float, state: FloatArray) -> None:
+        """Show the state (nq + nv,) at t (s).
+
+        Raises
+        ------
+        InputError
+            If the server does not answer, or has stopped.
+        """
+        self._send(t, state, PATIENCE)
+
+    def _send(self, t: float, state: FloatArray, patience: float) -> None:
+        q, v = np.split(state, [self._model.nq])
+        pin.forwardKinematics(self._model, self._data, q)
+        energy = self._system.energy(state)
+        if math.isnan(self._energy):
+            self._energy = energy
+        g, _ = constraint_errors(self._mechanism, np.array([t]), q[None], v[None])
+        head = np.zeros((4, 4))
+        head[:3, 0] = t, np.linalg.norm(g), energy - self._energy
+        # One command for all, which the page takes apart: each waits for the server's answer.
+        places = [self._data.oMi[joint].homogeneous for joint in self._joints]
+        with answered(self.visualizer.window, patience, ANEW):
+            self._node.set_transform(np.hstack([head, *places]))
+        self.shown += 1
+
+    def play(self, solution: Playable, **drawn: Any) -> None:
+        """Play the run in the same page.
+
+        Parameters
+        ----------
+        solution
+            The run.
+        drawn
+            ``trace``, ``gaps`` and ``reactions`` of
+            :func:`srm_mbs.visualization.animation.playback.play`.
+
+        Raises
+        ------
+        InputError
+            If the server does not answer, or has stopped, or what is asked for cannot be drawn.
+        """
+        picture = make_picture(solution, 60.0, Wanted(**drawn))
+        about = about_picture(solution, picture, panel=True)
+        with answered(self.visualizer.window, REPLY_TIME, ANEW):
+            self.visualizer["/about"].set_property("about", as_json(about))
+            draw_picture(self._meshcat, self.visualizer, picture)
+
+    def wait(self) -> None:
+        """Serve until Ctrl-C."""
+        wait(self.visualizer)
+
+    def close(self) -> None:
+        """Stop serving; a page that is open stays as it is."""
+        close(self.visualizer)
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self.visualizer.window.zmq_socket.closed:
+            self.close()

@@ -1,0 +1,379 @@
+"""What a mechanism looks like: coloured shapes, each fixed to one joint of the tree.
+
+The shapes are the ``<visual>`` elements of the URDF.  Each is attached through the frame of its
+link in the model that is simulated, so that locked joints and moving bases need no special care.
+A mechanism without visuals is drawn as bars between its joints and loop anchors.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.formats.xml import parse_urdf
+from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.visualization.animation.trajectory import Spans
+
+log = logging.getLogger(__name__)
+
+Colour = tuple[float, float, float, float]
+
+PALETTE: tuple[Colour, ...] = (  # after Okabe and Ito: told apart by colour-blind readers too
+    (0.000, 0.447, 0.698, 1.0),
+    (0.902, 0.624, 0.000, 1.0),
+    (0.000, 0.620, 0.451, 1.0),
+    (0.800, 0.475, 0.655, 1.0),
+    (0.337, 0.706, 0.914, 1.0),
+)
+GROUND_COLOUR: Colour = (0.55, 0.57, 0.60, 1.0)
+PIN_COLOUR: Colour = (0.15, 0.16, 0.18, 1.0)
+ANCHOR_COLOUR: Colour = (0.835, 0.369, 0.000, 1.0)
+BAR_THICKNESS = 0.025  # of the mechanism's extent, in drawings without visuals
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box centred at the origin; ``size`` (3,) m along x, y, z."""
+
+    size: tuple[float, float, float]
+
+    def extent(self) -> FloatArray:
+        """Lower and upper corner (2, 3) m of the bounding box."""
+        half = 0.5 * np.array(self.size)
+        return np.array([-half, half])
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder about the z axis, centred at the origin; m."""
+
+    radius: float
+    length: float
+
+    def extent(self) -> FloatArray:
+        """Lower and upper corner (2, 3) m of the bounding box."""
+        half = np.array([self.radius, self.radius, 0.5 * self.length])
+        return np.array([-half, half])
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere about the origin; m."""
+
+    radius: float
+
+    def extent(self) -> FloatArray:
+        """Lower and upper corner (2, 3) m of the bounding box."""
+        return np.array([[-self.radius] * 3, [self.radius] * 3])
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: ``vertices`` (n, 3) m, ``faces`` (k, 3) indices."""
+
+    vertices: FloatArray
+    faces: Any
+
+    def extent(self) -> FloatArray:
+        """Lower and upper corner (2, 3) m of the bounding box."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+Shape = Box | Cylinder | Sphere | Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """One shape on one body.
+
+    Attributes
+    ----------
+    joint
+        Index of the joint that carries it; 0 is the ground.
+    placement
+        Of the shape in the joint's frame.
+    colour
+        Red, green, blue and opacity, 0 to 1.
+    spans
+        When it is there (s); None for always.
+    """
+
+    joint: int
+    placement: pin.SE3
+    shape: Shape
+    colour: Colour
+    spans: Spans | None = None
+
+    def corners(self) -> FloatArray:
+        """Corners (8, 3) m of its bounding box, in the joint's frame."""
+        low, high = self.shape.extent()
+        choice = np.array(list(np.ndindex(2, 2, 2)))
+        corners = np.where(choice == 0, low, high)
+        return np.asarray(corners @ self.placement.rotation.T + self.placement.translation)
+
+
+def visuals_of(
+    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, Spans | None]] | None = None
+) -> list[Visual]:
+    """Shapes of ``mechanism``: those of its URDF or, if there are none, bars.
+
+    ``loops`` are the closures whose anchors the bars reach and mark, with when they are there;
+    those of ``mechanism`` by default.
+
+    Mesh files are looked for beside the URDF, in the folders above it (``package://``), and in
+    the data of ``example-robot-data``; one that cannot be read is left out with a warning.
+    """
+    found = list(_urdf_visuals(mechanism))
+    if found:
+        return found
+    return _skeleton(
+        mechanism, [(loop, None) for loop in mechanism.loops] if loops is None else loops
+    )
+
+
+# The URDF -----------------------------------------------------------------------------------
+
+
+def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
+    source, model = mechanism.source, mechanism.model
+    if source is None:
+        return
+    root = parse_urdf(source.urdf, source.urdf_path)
+    # A colour may be defined anywhere, and be used by its name anywhere else.
+    materials: dict[str, Element] = {}
+    for material in root.iter("material"):
+        if material.find("color") is not None:
+            materials.setdefault(material.get("name", ""), material)
+    meshes = _MeshFiles(Path(source.urdf_path))
+    for link in root.findall("link"):
+        for element in link.findall("visual"):
+            name = link.get("name")
+            frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+            try:
+                yield Visual(
+                    int(frame.parentJoint),
+                    frame.placement * _origin(element),
+                    _shape(element, meshes),
+                    _colour(element, materials) or _default_colour(int(frame.parentJoint)),
+                )
+            except InputError as error:
+                log.warning("link %r is drawn without one of its visuals: %s", name, error)
+
+
+def _numbers(element: Element, key: str, default: str) -> list[float]:
+    """As many finite numbers of attribute ``key`` as ``default`` has."""
+    text = element.get(key, default)
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        values = []
+    count = len(default.split())
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise InputError(
+            f"<{element.tag} {key}={text!r}> is not {count} finite number(s)",
+            remedy=f"Write {count} number(s)",
+        )
+    return values
+
+
+def _default_colour(joint: int) -> Colour:
+    return PALETTE[(joint - 1) % len(PALETTE)] if joint else GROUND_COLOUR
+
+
+def _colour(visual: Element, materials: dict[str, Element]) -> Colour | None:
+    material = visual.find("material")
+    if material is None:
+        return None
+    colour = material.find("color")
+    if colour is None:
+        shared = materials.get(material.get("name", ""))
+        colour = None if shared is None else shared.find("color")
+    if colour is None:
+        return None
+    red, green, blue, opacity = np.clip(_numbers(colour, "rgba", "1 1 1 1"), 0.0, 1.0).tolist()
+    return (red, green, blue, opacity)
+
+
+def _origin(visual: Element) -> pin.SE3:
+    origin = visual.find("origin")
+    if origin is None:
+        return pin.SE3.Identity()
+    rpy = np.array(_numbers(origin, "rpy", "0 0 0"))
+    return pin.SE3(pin.rpy.rpyToMatrix(rpy), np.array(_numbers(origin, "xyz", "0 0 0")))
+
+
+def _shape(visual: Element, meshes: _MeshFiles) -> Shape:
+    """The shape of a ``<visual>``; raises InputError if it cannot be drawn."""
+    element = visual.find("geometry/*")
+    if element is None:
+        raise InputError("it has no geometry", remedy="Add <geometry>")
+    match element.tag:
+        case "box":
+            x, y, z = _numbers(element, "size", "0 0 0")
+            return Box((x, y, z))
+        case "cylinder":
+            (radius,), (length,) = (_numbers(element, key, "0") for key in ("radius", "length"))
+            return Cylinder(radius, length)
+        case "sphere":
+            (radius,) = _numbers(element, "radius", "0")
+            return Sphere(radius)
+        case "mesh":
+            scale = np.array(_numbers(element, "scale", "1 1 1"))
+            return meshes.read(element.get("filename", ""), scale)
+        case tag:
+            raise InputError(
+                f"there is no geometry {tag!r}", remedy="Known: box, cylinder, sphere, mesh"
+            )
+
+
+class _MeshFiles:
+    """Finds and reads the mesh files that a URDF names."""
+
+    def __init__(self, urdf: Path) -> None:
+        self.folder = urdf.parent
+        self.packages = [self.folder, *self.folder.absolute().parents, *_robot_data()]
+
+    def find(self, name: str) -> Path:
+        """Path of the mesh ``name``; raises InputError if there is no such file."""
+        url = urlsplit(name)
+        if url.scheme == "package":
+            below = unquote(f"{url.netloc}{url.path}")
+            candidates = [folder / below for folder in self.packages]
+        elif url.scheme == "file":
+            candidates = [Path(unquote(url.path))]
+        else:
+            candidates = [self.folder / name]
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+        raise InputError(f"there is no mesh file {name!r}", remedy="Check the path")
+
+    def read(self, name: str, scale: FloatArray) -> Mesh:
+        """Triangles of the mesh ``name`` in metres.
+
+        Raises
+        ------
+        InputError
+            If the file does not exist or is no mesh.
+        """
+        path = self.find(name)
+        # Pinocchio's own reader: it honours the units and the up axis that a file declares.
+        import coal  # type: ignore[import-untyped]
+
+        try:
+            mesh = coal.MeshLoader().load(str(path), scale)
+            triangles = (mesh.tri_indices(i) for i in range(mesh.num_tris))
+            faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.uint32)
+            vertices = np.array(mesh.vertices(), dtype=float)
+        except Exception as error:  # Boost.Python raises whatever the C++ reader throws
+            raise InputError(
+                f"the mesh file {str(path)!r} cannot be read: {error}",
+                remedy="Give an STL, OBJ or DAE file",
+            ) from error
+        if not len(faces):
+            raise InputError(
+                f"the mesh file {str(path)!r} holds no triangles", remedy="Give one with triangles"
+            )
+        return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3))
+
+
+def _robot_data() -> list[Path]:
+    """Folder that holds ``example-robot-data``, installed under the same prefix as Pinocchio."""
+    for prefix in Path(pin.__file__).parents:
+        if (prefix / "share" / "example-robot-data").is_dir():
+            return [prefix / "share"]
+    return []
+
+
+# Bars ---------------------------------------------------------------------------------------
+
+
+def _skeleton(
+    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, Spans | None]]
+) -> list[Visual]:
+    """Bars from each joint to the joints and loop anchors behind it, and markers at them."""
+    model = mechanism.model
+    ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
+    for joint in range(1, model.njoints):
+        ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
+    anchors = [(*side.resolve(model), spans) for loop, spans in loops for side in loop.anchors]
+    for joint, placement, _ in anchors:
+        ends[joint].append(placement.translation)
+    # The last body of a chain ends in its centre of mass, for want of anything else.
+    masses = [
+        joint
+        for joint in range(1, model.njoints)
+        if not ends[joint] and np.linalg.norm(model.inertias[joint].lever) > 0.0
+    ]
+    for joint in masses:
+        ends[joint].append(model.inertias[joint].lever)
+
+    width = BAR_THICKNESS * _extent(mechanism, ends)
+    out = []
+    for joint in range(1, model.njoints):
+        colour = _default_colour(joint)
+        # Bars of a planar mechanism cross in one plane: unequal ones do not flicker there.
+        thick = width * (1.0 - 0.08 * (joint % 3))
+        for end in ends[joint]:
+            length = float(np.linalg.norm(end))
+            if length > 0.0:
+                bar = Box((thick, thick, length))
+                out.append(Visual(joint, _along(0.5 * end, end), bar, colour))
+        out.append(_marker(mechanism, joint, width))
+    for joint in masses:
+        centre = pin.SE3(np.eye(3), model.inertias[joint].lever)
+        colour = _default_colour(joint)
+        out.append(Visual(joint, centre, Sphere(1.5 * width), colour))
+    for joint, placement, spans in anchors:
+        if joint:
+            out.append(Visual(joint, placement, Sphere(0.9 * width), ANCHOR_COLOUR, spans))
+    for end in ends[0]:
+        block = Box((2.0 * width,) * 3)
+        out.append(Visual(0, pin.SE3(np.eye(3), end), block, GROUND_COLOUR))
+    return out
+
+
+def _extent(mechanism: Mechanism, ends: list[list[FloatArray]]) -> float:
+    """Diagonal (m) of the box around all joints and bar ends at the initial configuration."""
+    data = workspace(mechanism.model)
+    pin.forwardKinematics(mechanism.model, data, np.array(mechanism.q0))
+    points = [data.oMi[joint].act(end) for joint, own in enumerate(ends) for end in own]
+    points += [data.oMi[joint].translation for joint in range(1, mechanism.model.njoints)]
+    diagonal = float(np.linalg.norm(np.ptp(np.array(points), axis=0)))
+    return diagonal if diagonal > 0.0 else 1.0
+
+
+def _along(centre: FloatArray, direction: FloatArray) -> pin.SE3:
+    """Placement at ``centre`` whose z axis points along ``direction``."""
+    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), direction).matrix()
+    return pin.SE3(rotation, centre)
+
+
+def _marker(mechanism: Mechanism, joint: int, width: float) -> Visual:
+    """A pin along the axis of a hinge, a block along that of a slide, otherwise a ball."""
+    model = mechanism.model
+    kind = model.joints[joint]
+    # The joint moves itself only by its own columns, which are constant for a hinge or a slide.
+    jacobian = pin.computeJointJacobian(model, workspace(model), np.array(mechanism.q0), joint)
+    # With one column it comes as a vector.
+    linear, angular = np.split(jacobian.reshape(6, model.nv)[:, kind.idx_v], 2)
+    if kind.nv == 1 and np.any(angular):
+        hinge = Cylinder(0.8 * width, 2.4 * width)
+        return Visual(joint, _along(np.zeros(3), angular), hinge, PIN_COLOUR)
+    if kind.nv == 1:
+        block = Box((1.6 * width, 1.6 * width, 3.2 * width))
+        return Visual(joint, _along(np.zeros(3), linear), block, PIN_COLOUR)
+    return Visual(joint, pin.SE3.Identity(), Sphere(1.2 * width), PIN_COLOUR)

@@ -1,0 +1,226 @@
+"""A still picture of a run without a browser: triangles into a buffer of depths, in NumPy.
+
+It shows what the page of the animation shows, from the same place
+(:func:`srm_mbs.visualization.animation.scene.choose_view`) or, of a mechanism that is about to
+drive far away, from nearer. It is there for print and where no Chromium is installed that could
+photograph that page.
+
+Matplotlib has no buffer of depths.  It draws whole polygons from the farthest to the nearest, and
+then a rod shows through the sleeve around it unless both are cut into pieces about as small as the
+gap between them, which takes many times as long.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.simulation.result import Solution
+from srm_mbs.visualization.animation.overlays import Wanted, springs_of
+from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
+from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Shape
+from srm_mbs.visualization.animation.trajectory import within
+
+SIZE = (900, 600)
+"""Width and largest height in pixels."""
+FINER = 2
+"""Samples per pixel in each direction."""
+SIDES = 20
+"""Of a cylinder, and of a sphere along its equator."""
+FRAMES = 200
+"""Frames of the motion that decide the place of the camera."""
+TOGETHER = (4, 8, 16, 32)
+"""Triangles of up to these sizes (samples) are drawn many at a time."""
+SAMPLES = 1_000_000
+"""Most samples that are looked at together."""
+FAR = 4.0
+"""How many times as far as the mechanism alone asks for the camera may stand to show the motion."""
+MARGIN = 24
+"""Pixels left above and below."""
+LIGHT = np.array([-0.4, 0.65, -0.65]) / np.linalg.norm([-0.4, 0.65, -0.65])
+"""Direction to the light: right, up, forward as the camera sees them."""
+AMBIENT = 0.45
+BACKGROUND = (1.0, 1.0, 1.0)
+
+
+def still_picture(solution: Solution, t: float) -> bytes:
+    """The bodies and springs at ``t`` (s) as a PNG.
+
+    Raises
+    ------
+    InputError
+        If the visuals of its description cannot be read.
+    """
+    from PIL import Image
+
+    start, end = solution.span
+    picture = make_picture(solution, FRAMES / (end - start) if end > start else 1.0, Wanted())
+    mechanism, now = solution.mechanism, np.array([t])
+    data = workspace(mechanism.model)
+    pin.forwardKinematics(mechanism.model, data, solution(t)[0])
+    triangles, colours = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
+    for visual in picture.visuals:
+        if not within(now, visual.spans, end).all():
+            continue
+        own = _triangles(visual.shape)
+        triangles.append(_placed(own, data.oMi[visual.joint] * visual.placement))
+        colours.append(np.tile(visual.colour[:3], (len(own), 1)))
+    for (spring, spans), moving in zip(springs_of(solution), picture.overlays.moving, strict=True):
+        if not within(now, spans, end).all():
+            continue
+        (ja, a), (jb, b) = (x.resolve(mechanism.model) for x in (spring.a, spring.b))
+        ends = (data.oMi[ja] * a).translation, (data.oMi[jb] * b).translation
+        for shape, placement, colour in moving.parts:
+            own = _stretched(_placed(_triangles(shape), placement), ends[0], ends[1])
+            triangles.append(own)
+            colours.append(np.tile(colour[:3], (len(own), 1)))
+    corners = np.concatenate(triangles)
+    view = picture.view
+    if len(corners):
+        here = choose_view(mechanism, corners.reshape(-1, 3))
+        view = here if FAR * here.distance < view.distance else view
+    pixels = _drawn(corners, np.concatenate(colours), view)
+    out = io.BytesIO()
+    image = Image.fromarray((255.0 * _trimmed(pixels)).round().astype(np.uint8))
+    # Few colours: a third of the size, and no loss that is seen.
+    image.quantize(128, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+# --- shapes --------------------------------------------------------------------------------------
+
+
+def _triangles(shape: Shape) -> FloatArray:
+    """Corners (n, 3, 3) m of the triangles of a shape, in its own frame."""
+    if isinstance(shape, Mesh):
+        corners: FloatArray = np.asarray(shape.vertices, dtype=float)[np.asarray(shape.faces)]
+        return corners
+    if isinstance(shape, Box):
+        corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+        sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+        return _of_quads(corners[np.array(sides)] * np.array(shape.size))
+    turn = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
+    if isinstance(shape, Cylinder):
+        # The outline from axis to axis, turned about it.
+        r, half = shape.radius, 0.5 * shape.length
+        outline = np.array([(0.0, -half), (r, -half), (r, half), (0.0, half)])
+    else:
+        rise = np.linspace(-0.5 * np.pi, 0.5 * np.pi, SIDES // 2 + 1)
+        outline = shape.radius * np.column_stack([np.cos(rise), np.sin(rise)])
+    grid = np.stack(
+        [
+            np.outer(outline[:, 0], np.cos(turn)),
+            np.outer(outline[:, 0], np.sin(turn)),
+            np.repeat(outline[:, 1:], len(turn), axis=1),
+        ],
+        axis=-1,
+    )
+    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2)
+    return _of_quads(quads.reshape(-1, 4, 3))
+
+
+def _of_quads(quads: FloatArray) -> FloatArray:
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def _placed(triangles: FloatArray, placement: pin.SE3) -> FloatArray:
+    return np.asarray(triangles @ placement.rotation.T + placement.translation)
+
+
+def _stretched(triangles: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """What lies along z from 0 to 1, from a to b (m)."""
+    length = float(np.linalg.norm(b - a))
+    if length == 0.0:
+        return np.zeros((0, 3, 3))
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (b - a) / length)
+    return _placed(triangles * [1.0, 1.0, length], pin.SE3(turn.matrix(), a))
+
+
+# --- drawing -------------------------------------------------------------------------------------
+
+
+class _Canvas:
+    """Pixels, and the depth of what each shows."""
+
+    def __init__(self) -> None:
+        self.width, self.height = FINER * SIZE[0], FINER * SIZE[1]
+        self._depths = np.full(self.height * self.width, np.inf)
+        self._image = np.tile(np.array(BACKGROUND), (self.height * self.width, 1))
+
+    def paint(self, corners: FloatArray, colours: FloatArray, columns: Any, rows: Any) -> None:
+        """Triangles, corners (n, 3, 3) as x, y and depth, on the samples (n, h, w) around them.
+
+        One over the depth is linear on the screen.
+        """
+        (xa, ya), (xb, yb), (xc, yc) = corners[:, :, :2, None, None].transpose(1, 2, 0, 3, 4)
+        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+        dx, dy = columns + 0.5 - xa, rows + 0.5 - ya
+        with np.errstate(divide="ignore", invalid="ignore"):  # seen edge on: covers nothing
+            b = (dx * (yc - ya) - (xc - xa) * dy) / area
+            c = ((xb - xa) * dy - dx * (yb - ya)) / area
+            inside = (b >= 0.0) & (c >= 0.0) & (b + c <= 1.0)
+        inside &= (columns >= 0) & (columns < self.width) & (rows >= 0) & (rows < self.height)
+        owner, *_ = np.nonzero(inside)
+        b, c, near = b[inside], c[inside], 1.0 / corners[owner, :, 2]
+        depth = 1.0 / ((1.0 - b - c) * near[:, 0] + b * near[:, 1] + c * near[:, 2])
+        place = (rows * self.width + columns)[inside]
+        nearer = np.flatnonzero(depth < self._depths[place])
+        order = nearer[np.argsort(-depth[nearer], kind="stable")]  # the nearest is written last
+        self._depths[place[order]] = depth[order]
+        self._image[place[order]] = colours[owner[order]]
+
+    def pixels(self) -> FloatArray:
+        """(height, width, 3), 0 to 1."""
+        fine = self._image.reshape(SIZE[1], FINER, SIZE[0], FINER, 3)
+        return np.asarray(fine.mean(axis=(1, 3)))
+
+
+def _drawn(triangles: FloatArray, colours: FloatArray, view: View) -> FloatArray:
+    """Pixels (height, width, 3), 0 to 1, of triangles (n, 3, 3) m with colours (n, 3)."""
+    canvas = _Canvas()
+    seen = (triangles - view.target) @ view.axes.T
+    normals = np.cross(seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0])
+    sizes = np.linalg.norm(normals, axis=1)
+    far = view.distance + seen[:, :, 2]
+    kept = (sizes > 0.0) & (far > 0.0).all(axis=1)
+    seen, colours, far = seen[kept], colours[kept], far[kept]
+    normals = normals[kept] / sizes[kept, None]
+    # Both sides are lit, as meshes turn their triangles either way.
+    towards = seen.mean(axis=1) + np.array([0.0, 0.0, view.distance])
+    normals *= -np.sign(np.sum(normals * towards, axis=1))[:, None]
+    light = AMBIENT + (1.0 - AMBIENT) * np.clip(normals @ LIGHT, 0.0, None)
+    shaded = np.clip(colours * light[:, None], 0.0, 1.0)
+    scale = 0.5 * canvas.height / math.tan(math.radians(0.5 * FIELD_OF_VIEW))
+    x = 0.5 * canvas.width + scale * seen[:, :, 0] / far
+    y = 0.5 * canvas.height - scale * seen[:, :, 1] / far
+    corners = np.stack([x, y, far], axis=2)
+    low = np.floor(corners[:, :, :2].min(axis=1)).astype(int)
+    extent = np.ceil(corners[:, :, :2].max(axis=1)).astype(int) - low
+    widest = extent.max(axis=1)
+    before = -1
+    for side in TOGETHER:
+        chosen = np.flatnonzero((widest > before) & (widest <= side))
+        before = side
+        rows, columns = np.mgrid[:side, :side]
+        for part in np.array_split(chosen, 1 + len(chosen) * side**2 // SAMPLES):
+            around = low[part][:, :, None, None]
+            canvas.paint(corners[part], shaded[part], around[:, 0] + columns, around[:, 1] + rows)
+    for k in np.flatnonzero(widest > before):
+        (left, top), (right, bottom) = low[k].clip(0), low[k] + extent[k]
+        rows, columns = np.mgrid[top : min(bottom, canvas.height), left : min(right, canvas.width)]
+        canvas.paint(corners[k : k + 1], shaded[k : k + 1], columns[None], rows[None])
+    return canvas.pixels()
+
+
+def _trimmed(pixels: FloatArray) -> FloatArray:
+    """Without most of what is empty above and below."""
+    rows = np.flatnonzero((pixels < 1.0).any(axis=(1, 2)))
+    if not len(rows):
+        return pixels
+    return pixels[max(rows[0] - MARGIN, 0) : rows[-1] + MARGIN + 1]

@@ -1,0 +1,322 @@
+"""Pictures and films of a run, drawn by a browser without a window.
+
+The page of :func:`srm_mbs.visualization.animation.playback.export_html` is opened in headless
+Chromium, which playwright drives, and photographed at the wanted times: what is seen is what the
+browser plays.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.visualization.animation.overlays import Wanted
+from srm_mbs.visualization.animation.page import write_page
+from srm_mbs.visualization.animation.playback import check_fps, page_of
+
+if TYPE_CHECKING:
+    from srm_mbs.visualization.animation.joint_motion import Playable
+
+log = logging.getLogger(__name__)
+
+SIZE = (900, 600)
+"""Width and height of a picture in pixels; other shapes than 3 to 2 leave margins."""
+FILMS = (".gif", ".mp4")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+BROWSER_OPTIONS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+)
+"""Chromium as root, without a graphics card and without a network."""
+_SETTLED = """async t => {
+  viewer.animator.pause();
+  viewer.animator.seek(t);
+  viewer.set_dirty();
+  const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
+  await frame(); await frame();
+}"""
+BARE = "#bar, .dg { display: none !important; }"
+"""Style of a page that is photographed: nothing that one operates."""
+
+
+@contextmanager
+def browser() -> Iterator[Any]:
+    """A headless Chromium, playwright's ``Browser``.
+
+    Raises
+    ------
+    InputError
+        If playwright or Chromium is missing.
+    """
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError as error:
+        raise InputError(
+            "pictures and films need playwright, which is not installed",
+            remedy='Install it: pip install "srm-mbs[render]"; or use solution.export_html(path)',
+        ) from error
+    with sync_playwright() as playwright:
+        found = [shutil.which(name) for name in BROWSERS]
+        found.append(playwright.chromium.executable_path)
+        path = next((path for path in found if path and Path(path).exists()), None)
+        if path is None:
+            raise InputError(
+                "pictures and films need Chromium, which is not installed",
+                remedy="Install chromium from your system, or run: playwright install chromium",
+            )
+        chromium = playwright.chromium.launch(executable_path=path, args=list(BROWSER_OPTIONS))
+        try:
+            yield chromium
+        finally:
+            chromium.close()
+
+
+@contextmanager
+def photographer(
+    solution: Playable,
+    size: tuple[int, int],
+    fps: float,
+    drawn: dict[str, Any],
+    times: Sequence[float],
+    chromium: Any = None,
+    style: str = BARE,
+) -> Iterator[Callable[[float], bytes]]:
+    """A function from a time of the run (s) to a PNG.
+
+    Parameters
+    ----------
+    solution
+        The run.
+    size
+        Width and height in pixels.
+    fps
+        Key frames per second; between them bodies go straight.
+    drawn
+        ``trace``, ``gaps`` and ``reactions`` of
+        :func:`srm_mbs.visualization.animation.playback.export_html`.
+    times
+        Those (s) of the pictures, which get key frames of their own.
+    chromium
+        A :func:`browser` that goes on being used; by default one of its own.
+    style
+        Added to that of the page.
+
+    Raises
+    ------
+    InputError
+        If ``size`` is none, something wanted cannot be drawn, or Chromium or playwright is missing.
+    """
+    width, height = size
+    if not (isinstance(width, int) and isinstance(height, int) and min(size) > 0):
+        raise InputError(
+            f"size = {size!r} is not a width and a height in pixels",
+            element="size",
+            remedy="Give for example size=(900, 600)",
+        )
+    own = browser() if chromium is None else nullcontext(chromium)
+    with tempfile.TemporaryDirectory() as folder, own as opened:
+        file = Path(folder) / "page.html"
+        write_page(page_of(solution, fps, Wanted(**drawn), panel=False, extra=times), file)
+        page = opened.new_page(viewport={"width": width, "height": height})
+        page.goto(file.as_uri())
+        page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
+        page.add_style_tag(content=style)
+        start = solution.span[0]
+
+        def photograph(t: float) -> bytes:
+            page.evaluate(_SETTLED, t - start)
+            picture: bytes = page.screenshot()
+            return picture
+
+        yield photograph
+        page.close()
+
+
+def _written(path: Path, content: bytes) -> None:
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise InputError(
+            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
+        ) from error
+    log.info("written: %s", path)
+
+
+def export_image(
+    solution: Playable,
+    path: str | Path,
+    *,
+    t: float | None = None,
+    size: tuple[int, int] = SIZE,
+    **drawn: Any,
+) -> None:
+    """Write a picture of a run at one time.
+
+    Parameters
+    ----------
+    solution
+        The run.
+    path
+        Name of the ``.png``; an existing one is replaced.
+    t
+        Time (s) in the run; its end by default.
+    size
+        Width and height in pixels.
+    drawn
+        ``trace``, ``gaps`` and ``reactions`` of
+        :func:`srm_mbs.visualization.animation.playback.export_html`.
+
+    Raises
+    ------
+    InputError
+        If ``t`` lies outside the run, ``path`` is no ``.png`` or cannot be written, or Chromium or
+        playwright is missing.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise InputError(
+            f"pictures are PNG files, not {path.suffix!r}", file=str(path), remedy="Name it .png"
+        )
+    start, end = solution.span
+    t = end if t is None else t
+    if not start <= t <= end:
+        raise InputError(
+            f"t = {t!r} lies outside the run, from {start:g} to {end:g} s",
+            element="t",
+            remedy="Give a time of the run",
+        )
+    with photographer(solution, size, 60.0, drawn, [t]) as photograph:
+        _written(path, photograph(t))
+
+
+def export_video(
+    solution: Playable,
+    path: str | Path,
+    *,
+    fps: float = 25.0,
+    speed: float = 1.0,
+    size: tuple[int, int] = (720, 480),
+    **drawn: Any,
+) -> None:
+    """Write a film of a run.
+
+    Parameters
+    ----------
+    solution
+        The run.
+    path
+        Name of the ``.gif``, which Pillow writes, or ``.mp4``, for which ``ffmpeg`` or the
+        package imageio-ffmpeg must be installed; an existing one is replaced.
+    fps
+        Pictures per second of film; browsers slow a GIF of more than 50 down.
+    speed
+        Seconds of the run per second of film.
+    size
+        Width and height in pixels.
+    drawn
+        ``trace``, ``gaps`` and ``reactions`` of
+        :func:`srm_mbs.visualization.animation.playback.export_html`.
+
+    Raises
+    ------
+    InputError
+        If ``path`` has another suffix or cannot be written, a number is not positive, or Chromium,
+        playwright or ffmpeg is missing.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    fps = check_fps(fps)
+    if kind not in FILMS:
+        raise InputError(
+            f"films are .gif or .mp4 files, not {path.suffix!r}",
+            file=str(path),
+            element="path",
+            remedy="Name it .gif or .mp4",
+        )
+    if not (math.isfinite(speed) and speed > 0.0):
+        raise InputError(
+            f"speed = {speed!r} is not a positive number",
+            element="speed",
+            remedy="Give a positive number: 1 is real time",
+        )
+    encoder = encoder_of(path)
+    start, end = solution.span
+    count = max(1, math.floor((end - start) / speed * fps * (1.0 + 1e-12)) + 1)
+    times = np.minimum(start + np.arange(count) * (speed / fps), end).tolist()
+    with photographer(solution, size, fps / min(speed, 1.0), drawn, times) as photograph:
+        pictures = [photograph(t) for t in times]
+    if encoder is None:
+        _written(path, _gif(pictures, fps))
+    else:
+        _encode(encoder, pictures, fps, path)
+
+
+def encoder_of(film: Path) -> str | None:
+    """ffmpeg of the system, or the one that the package imageio-ffmpeg brings; None for a ``.gif``.
+
+    Raises
+    ------
+    InputError
+        If the film needs one and there is none.
+    """
+    if film.suffix.lower() == ".gif":
+        return None
+    found = shutil.which("ffmpeg")
+    if found is None:
+        try:
+            import imageio_ffmpeg
+
+            found = imageio_ffmpeg.get_ffmpeg_exe()
+        except (ImportError, RuntimeError) as error:
+            raise InputError(
+                "an .mp4 needs the encoder ffmpeg, which is not installed",
+                file=str(film),
+                remedy="Install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
+            ) from error
+    return str(found)
+
+
+def _gif(pictures: Sequence[bytes], fps: float) -> bytes:
+    from PIL import Image
+
+    first, *others = [
+        Image.open(io.BytesIO(picture)).convert("P", palette=Image.Palette.ADAPTIVE)
+        for picture in pictures
+    ]
+    out = io.BytesIO()
+    # The format counts hundredths of a second: the film as a whole keeps time.
+    ends = [round(100.0 * k / fps) for k in range(len(pictures) + 1)]
+    waits = [10 * (end - begin) for begin, end in pairwise(ends)]
+    first.save(out, "GIF", save_all=True, append_images=others, duration=waits, loop=0)
+    return out.getvalue()
+
+
+def _encode(encoder: str, pictures: Sequence[bytes], fps: float, path: Path) -> None:
+    """Feed the pictures to ffmpeg as H.264 that every player shows."""
+    command = [
+        *(encoder, "-loglevel", "error", "-y", "-f", "image2pipe", "-framerate", f"{fps:g}"),
+        # H.264 wants even sides.
+        *("-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", str(path)),
+    ]
+    done = subprocess.run(command, input=b"".join(pictures), capture_output=True, check=False)
+    if done.returncode:
+        words = done.stderr.decode(errors="replace").strip().splitlines()
+        raise InputError(
+            f"ffmpeg cannot write it: {words[-1] if words else done.returncode}",
+            file=str(path),
+            remedy="Write a .gif, which needs no encoder",
+        )
+    log.info("written: %s", path)

@@ -1,0 +1,99 @@
+"""The energy balance over time: energies, works, and what is left."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from srm_mbs.simulation.result import Solution
+from srm_mbs.visualization.plotting.figure import (
+    BLACK,
+    LINES,
+    Draw,
+    curve,
+    draw_line,
+    finite,
+    line_styles,
+    linear_axis,
+    mark_times,
+    marks_note,
+    plain,
+    time_panels,
+)
+from srm_mbs.visualization.plotting.sampling import read_smoothly
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srm_mbs._typing import FloatArray
+    from srm_mbs.simulation.energy_balance import EnergyBalance
+
+SMOOTH_UP_TO = 400
+"""Pieces from which steps are divided no further: works are integrated within each."""
+
+
+def draw_balance(solution: Solution) -> Figure:
+    """Kinetic and potential energy, the work of all that acts, and the residual of the balance.
+
+    The residual is drawn at ``solution.t``: between the steps it is that of the dense output.
+
+    Raises
+    ------
+    InputError
+        For a loaded run that had a controller.
+    """
+    balance = read_smoothly(solution, SMOOTH_UP_TO).energy_balance
+    draws: list[Draw] = [partial(_energies, solution=solution, balance=balance)]
+    # What is smaller than the error of the balance is rounding.
+    error = np.nanmax(np.abs(finite(solution.energy_balance.residual)), initial=0.0)
+    sizes = {n: np.nanmax(np.abs(finite(own)), initial=0.0) for n, own in balance.works.items()}
+    works = {name: balance.works[name] for name, size in sizes.items() if size > error}
+    less = [name for name, size in sizes.items() if 0.0 < size <= error]
+    notes = [f"Work of no more than the residual is left out: {', '.join(less)}."] if less else []
+    if works:
+        draws.append(partial(_works, solution=solution, t=balance.t, works=works))
+    draws.append(partial(_residual, solution=solution, balance=solution.energy_balance))
+    return time_panels(solution, draws, [*marks_note(solution), *notes], height=1.9)
+
+
+def _lines(
+    axes: Axes, solution: Solution, t: FloatArray, lines: Mapping[str, FloatArray], name: str
+) -> None:
+    mark_times(axes, solution, labelled=False)
+    factor = linear_axis(axes, list(lines.values()), name, "J", size=0.0)
+    for (label, values), style in zip(lines.items(), line_styles(len(lines))):
+        draw_line(axes, t, values / factor, label=plain(label), **style)
+
+
+def _energies(axes: Axes, solution: Solution, balance: EnergyBalance) -> str:
+    # Where potential energy is zero is a convention.
+    potential = balance.potential - balance.potential[:1]
+    total = balance.kinetic + potential
+    lines = {"kinetic": balance.kinetic, "potential": potential, "sum": total}
+    _lines(axes, solution, balance.t, lines, "energy ")
+    return "energies, the potential one from its start"
+
+
+def _works(axes: Axes, solution: Solution, t: FloatArray, works: Mapping[str, FloatArray]) -> str:
+    lines = dict(works)
+    if len(lines) > len(LINES):
+        sizes = {name: np.abs(finite(work)) for name, work in works.items()}
+        largest = sorted(sizes, key=lambda name: -np.nanmax(sizes[name], initial=0.0))
+        shown, others = largest[: len(LINES) - 1], largest[len(LINES) - 1 :]
+        lines = {name: works[name] for name in works if name in shown}
+        lines[f"{len(others)} others together"] = np.sum([works[name] for name in others], axis=0)
+    _lines(axes, solution, t, lines, "work ")
+    return "work done on the mechanism"
+
+
+def _residual(axes: Axes, solution: Solution, balance: EnergyBalance) -> str:
+    mark_times(axes, solution, labelled=False)
+    residual = balance.residual
+    factor = linear_axis(axes, [residual], "residual ", "J", size=0.0)
+    draw_line(axes, balance.t, residual / factor, color=BLACK, **curve(len(residual)))
+    return f"energy gained less work: at most {balance.relative:.1e} of what took part"

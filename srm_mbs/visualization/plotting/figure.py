@@ -1,0 +1,394 @@
+"""One look for all pictures: colours, line styles, axes, legends, and how figures are saved.
+
+Matplotlib's object interface only: no pyplot, so no display and no global state.
+
+Figures of panels over one time axis, with titles, legends, marks and notes.
+"""
+
+from __future__ import annotations
+
+import logging
+import string
+import textwrap
+from collections.abc import Callable, Sequence
+from itertools import cycle, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import (
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+    ScalarFormatter,
+)
+
+from srm_mbs.errors import InputError
+from srm_mbs.simulation.result import Solution
+from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinned
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srm_mbs._typing import FloatArray
+
+log = logging.getLogger(__name__)
+
+FORMATS = (".png", ".pdf", ".svg")
+"""Suffixes under which a figure can be saved."""
+FEW_DECADES = 50.0
+"""Below this ratio of its limits a logarithmic axis has ticks within the decades."""
+NARROWEST = 8.0
+"""Smallest ratio of the limits of such an axis, so that there are always ticks on it."""
+LARGE_DOTS = 400
+"""Up to this many steps their dots are large."""
+FEW_POINTS = 50
+"""Lines through fewer points have dots on them, without which a single one would be invisible."""
+ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
+"""First digits of the distance of ticks."""
+PLAIN_POWERS = range(-2, 4)
+"""Powers of ten of values that are written in full on the ticks."""
+NARROW = 1e-6
+"""Smallest length of an axis over its values: ticks that differ in the seventh digit are noise."""
+
+# Okabe and Ito's palette: distinct for the colour-blind, and of different lightness in print.
+BLACK, BLUE, VERMILION, GREY = "#000000", "#0072B2", "#D55E00", "#8C8C8C"
+GREEN, ORANGE, PURPLE, SKY = "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
+PALETTE = (BLACK, ORANGE, BLUE, GREEN, VERMILION, PURPLE, SKY, GREY)
+LINES: tuple[tuple[str, Any], ...] = (
+    (BLUE, "-"),
+    (VERMILION, (0, (5, 1.5))),
+    (BLACK, (0, (1.2, 1.2))),
+    (GREEN, (0, (6, 1.5, 1.2, 1.5))),
+    (ORANGE, (0, (9, 2))),
+    (PURPLE, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2))),
+)
+"""Colours of lines with their dashes, by which they are told apart in grey print."""
+
+WIDTH = 7.0
+"""Width of the figure (inch), within the text of an A4 or letter page."""
+FONT_SIZE = 8.5
+RESOLUTION = 200
+"""Dots per inch of a png."""
+TITLE_LINE = 92
+"""Characters on the line of a panel's title; a legend that does not fit stands beside the panel."""
+NAME_WIDTH = 22
+"""Characters of a line of a legend beside a panel."""
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file name whose suffix is no format of figures.
+
+    Raises
+    ------
+    InputError
+        Naming the suffixes that are.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(
+            f"figures cannot be saved as {path.suffix!r}",
+            file=str(path),
+            remedy=f"Known: {', '.join(FORMATS)}",
+        )
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write ``figure`` in the format that the suffix of ``path`` names.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    figure.savefig(path, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    log.info("written: %s", path)
+
+
+def prepare(axes: Axes, grid: str = "y", size: float = FONT_SIZE) -> None:
+    """Ticks, grid (``x``, ``y`` or ``both``) and frame."""
+    axes.tick_params(labelsize=size - 0.5, which="both", direction="in")
+    axes.grid(axis=grid, color="#E4E4E4", linewidth=0.5)  # type: ignore[arg-type]
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def wrapped(name: str, width: int = NAME_WIDTH) -> str:
+    """``name`` in lines of at most ``width`` characters, broken behind spaces, or else behind "_",
+    "-", "." or "/", where there are any."""
+    lines, rest = [], name
+    while len(rest) > width:
+        cuts = (max(rest.rfind(mark, 0, width) for mark in marks) + 1 for marks in (" ", "_-./"))
+        cut = next((cut for cut in cuts if cut > width // 3), width)
+        lines.append(rest[:cut].rstrip())
+        rest = rest[cut:]
+    return "\n".join([*lines, rest])
+
+
+def fits(axes: Axes, title: str, line: int = TITLE_LINE) -> bool:
+    """Whether the legend has room on the line of the panel's ``title``, of ``line`` characters."""
+    labels = axes.get_legend_handles_labels()[1]
+    # A "$" of a formula is not seen, nor is the command between it and its pair.
+    seen = sum(5 if "$" in label else len(label) for label in labels)
+    return seen + 5 * len(labels) + len(title) <= line
+
+
+def legend(axes: Axes, *, beside: bool) -> None:
+    """A legend where there are no data: beside the panel, or above it, on the line of its title."""
+    handles, labels = axes.get_legend_handles_labels()
+    if not handles:
+        return
+    options: dict[str, Any] = {"frameon": False, "fontsize": FONT_SIZE - 0.5}
+    options["borderaxespad"] = 0.0
+    if beside:
+        labels = [label if "$" in label else wrapped(label) for label in labels]
+        options |= {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "handlelength": 2.6}
+    else:
+        options |= {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": len(handles)}
+        options |= {"borderpad": 0.2, "handlelength": 1.9, "columnspacing": 1.2}
+    axes.legend(handles, labels, **options)
+
+
+def line_styles(count: int) -> list[dict[str, Any]]:
+    """Colour and dashes of ``count`` lines of a panel; behind the sixth they begin again."""
+    styles = islice(cycle(LINES), count)
+    return [{"color": c, "linestyle": dashes, "linewidth": 0.9} for c, dashes in styles]
+
+
+def curve(count: int) -> dict[str, Any]:
+    """Properties of a line through ``count`` points."""
+    return {"linewidth": 0.9, "marker": "." if count < FEW_POINTS else "", "markersize": 3.0}
+
+
+def dots(count: int) -> dict[str, Any]:
+    """Properties of one mark per step: smaller where there are many."""
+    size = 3.5 if count <= LARGE_DOTS else 2.0
+    return {"linestyle": "none", "marker": ".", "markersize": size}
+
+
+def marks(colour: str, marker: str, size: float = 4.0) -> dict[str, Any]:
+    """Properties of marks that are not filled."""
+    return {
+        "color": colour,
+        "marker": marker,
+        "markersize": size,
+        "markeredgewidth": 0.9,
+        "fillstyle": "none",
+        "linestyle": "none",
+    }
+
+
+def log_axis(axes: Axes) -> None:
+    """A logarithmic axis with labelled ticks, whatever the range of its data."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    if high / low < FEW_DECADES:
+        if high / low < NARROWEST:
+            middle = np.sqrt(low * high)
+            axes.set_ylim(middle / np.sqrt(NARROWEST), middle * np.sqrt(NARROWEST))
+        low, high = axes.get_ylim()
+        subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10.0 else (1.0, 2.0, 5.0)
+        axes.yaxis.set_major_locator(LogLocator(subs=subs))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+        axes.yaxis.set_minor_locator(NullLocator())
+    else:
+        axes.yaxis.set_major_locator(LogLocator(numticks=6))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def linear_axis(
+    axes: Axes,
+    values: Sequence[FloatArray],
+    name: str,
+    unit: str,
+    *,
+    size: float = 1.0,
+    noise: float = 1e-9,
+    axis: str = "y",
+    ticks: int = 5,
+) -> float:
+    """Label and few ticks, written in full, of an axis for ``values``.
+
+    A power of ten goes into the label: matplotlib's own would lie on the panel's title.
+
+    Parameters
+    ----------
+    values
+        All that is drawn along this axis.
+    name, unit
+        The label; a name that ends with a line break stands above the unit.
+    size
+        What is of ordinary size here.
+    noise
+        Changes below this part of it are no motion, and drawn as constant; so are those below
+        :data:`NARROW` of the values.
+    axis
+        ``x`` or ``y``.
+    ticks
+        Intervals between ticks, at most.
+
+    Returns
+    -------
+    float
+        The power of ten: divide by it what is drawn.
+    """
+    known = [v[np.isfinite(v)] for v in values]
+    low = min((float(v.min()) for v in known if v.size), default=0.0)
+    high = max((float(v.max()) for v in known if v.size), default=0.0)
+    largest = max(abs(low), abs(high))
+    least = noise * size
+    if not largest > least:
+        largest = size
+    power = int(np.floor(np.log10(largest))) if largest > 0.0 else 0
+    power = 0 if power in PLAIN_POWERS else power
+    factor = 10.0**power
+    own = axes.yaxis if axis == "y" else axes.xaxis
+    own.set_major_locator(MaxNLocator(ticks, steps=ROUND))
+    formatter = ScalarFormatter(useOffset=False)
+    formatter.set_scientific(False)
+    own.set_major_formatter(formatter)
+    prefix = "" if power == 0 else rf"$10^{{{power}}}$ "
+    measured = f"{prefix}{unit}".rstrip()
+    own.set_label_text(f"{name}({measured})" if measured else name, fontsize=FONT_SIZE)
+    if high - low <= max(least, NARROW * largest):
+        half = max(0.1 * abs(0.5 * (low + high)), 0.0 if largest > size else least)
+        if max(abs(low), abs(high)) <= least:
+            half = size or 1.0
+        ends = (0.5 * (low + high) - half) / factor, (0.5 * (low + high) + half) / factor
+        (axes.set_ylim if axis == "y" else axes.set_xlim)(*ends)
+    return factor
+
+
+def plain(name: str) -> str:
+    """A name of the user as it is: neither a formula, nor hidden from legends by its "_"."""
+    return f" {name}" if name.startswith("_") else name.replace("$", r"\$")
+
+
+def finite(values: FloatArray) -> FloatArray:
+    """Values with gaps where they are not finite: nothing is drawn there."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+FULL_LINES = 80
+"""More singular passages than this are marked by ticks: full lines would fill the panels."""
+NOTE_WIDTH = 122
+"""Characters of a line of notes below the panels."""
+SHOWN_NAMES = 6
+"""Names that a note lists of those that are left out."""
+MARKED: tuple[tuple[str, str, float, Any], ...] = (
+    ("singular passages (dashed)", BLACK, 0.5, (0, (4, 3))),
+    ("actions of events (dotted)", GREY, 0.9, (0, (1, 1.5))),
+)
+"""Vertical lines: their meaning in a note, colour, width and dashes."""
+Draw = Callable[["Axes"], str]
+"""Draws into a panel and returns its title."""
+
+
+def time_panels(
+    solution: Run, draws: Sequence[Draw], notes: Sequence[str] = (), height: float = 1.65
+) -> Figure:
+    """Panels below each other, each by one of ``draws``, of ``height`` (inch)."""
+    figure = Figure(figsize=(WIDTH, 0.7 + height * len(draws)), layout="constrained")
+    panels = list(figure.subplots(len(draws), sharex=True, squeeze=False)[:, 0])
+    # A state that runs away overflows in its drift and energy: the curves just end there.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for letter, draw, axes in zip(string.ascii_lowercase, draws, panels):
+            prepare(axes)
+            title = draw(axes)
+            axes.set_title(f"({letter}) {title}", loc="left", fontsize=FONT_SIZE + 0.5)
+    # All alike: one beside its panel makes all panels narrower.
+    beside = not all(fits(axes, axes.get_title(loc="left")) for axes in panels)
+    for axes in panels:
+        legend(axes, beside=beside)
+    time_axis(solution, panels)
+    figure.align_ylabels(panels)
+    finish(figure, solution, notes)
+    return figure
+
+
+def time_axis(solution: Run, panels: Sequence[Axes]) -> None:
+    """The time of the whole run below the last of ``panels``, which share it."""
+    start, end = solution.span
+    margin = 0.01 * (end - start) or 1.0
+    panels[-1].set_xlim(start - margin, end + margin)
+    panels[-1].xaxis.set_major_locator(MaxNLocator(10, steps=ROUND))
+    panels[-1].set_xlabel(f"time{seconds(solution)}", fontsize=FONT_SIZE)
+
+
+def finish(figure: Figure, solution: Run, notes: Sequence[str] = ()) -> None:
+    """The title of a figure, and what has to be said below its panels."""
+    # Names are the user's: a "$" in them is no formula.
+    figure.suptitle(run_title(solution), fontsize=FONT_SIZE + 1.5, parse_math=False)
+    if notes:
+        text = "\n".join(line for note in notes for line in textwrap.wrap(note, NOTE_WIDTH))
+        figure.supxlabel(text, x=0.01, ha="left", fontsize=FONT_SIZE - 1.0, parse_math=False)
+
+
+def run_title(solution: Run) -> str:
+    """Mechanism, method, tableau and tolerance; where the run ended if it failed."""
+    settings, unit = solution.settings, " s" if seconds(solution) else ""
+    name = solution.mechanism.name if isinstance(solution, Solution) else "index-2 DAE"
+    control = f"rtol = {settings.rtol:.3g}"
+    if settings.step is not None:
+        control = f"fixed step {settings.step:.6g}{unit}"
+    parts = [name, settings.method, settings.tableau, control]
+    title = ", ".join(part for part in parts if part)
+    if not solution.success:
+        title += f"\n{solution.status} at t = {solution.span[1]:.6g}{unit}"
+    return title
+
+
+def seconds(solution: Run) -> str:
+    """The unit of time behind a word; a DAE has none."""
+    return " (s)" if isinstance(solution, Solution) else ""
+
+
+def some_of(names: Sequence[str]) -> str:
+    """The first of ``names``, and how many more there are."""
+    shown = ", ".join(names[:SHOWN_NAMES])
+    more = len(names) - SHOWN_NAMES
+    return shown if more <= 0 else f"{shown} and {more} more"
+
+
+def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
+    """A line through as many of the points as are seen, with gaps where they are not finite."""
+    values = finite(values)
+    seen = thinned(t, values)
+    axes.plot(t[seen], values[seen], **style)
+
+
+def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
+    """Mark singular passages, and where the actions of events changed something.
+
+    By thin vertical lines, or by ticks where they are many.
+
+    Parameters
+    ----------
+    labelled
+        Whether the legend says so; otherwise :func:`marks_note` does.
+    """
+    for times, label, (_, colour, width, dashes) in zip(
+        (passages(solution), jumps(solution)), ("singular passage", "action of an event"), MARKED
+    ):
+        if times:
+            axes.vlines(
+                times,
+                0.0,
+                1.0 if len(times) <= FULL_LINES else 0.06,
+                transform=axes.get_xaxis_transform(),
+                color=colour,
+                linewidth=width,
+                linestyle=dashes,
+                label=label if labelled else "",
+            )
+
+
+def marks_note(solution: Run) -> list[str]:
+    """What the vertical lines are, as a note below the panels; none where there are none."""
+    there = (bool(passages(solution)), bool(jumps(solution)))
+    words = [words for shown, (words, *_) in zip(there, MARKED) if shown]
+    return [f"Vertical lines: {'; '.join(words)}."] if words else []

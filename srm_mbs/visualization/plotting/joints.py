@@ -1,0 +1,332 @@
+"""Joints as curves: what is drawn of a joint of one or several degrees of freedom.
+
+Phase portraits: the rate of a joint over its position.
+
+Positions and rates of joints over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+from matplotlib.figure import Figure
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.scaling import coordinate_units, joint_turns
+from srm_mbs.errors import InputError
+from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.simulation.result import Solution
+from srm_mbs.visualization.plotting.figure import (
+    BLACK,
+    BLUE,
+    FONT_SIZE,
+    VERMILION,
+    WIDTH,
+    draw_line,
+    finish,
+    legend,
+    line_styles,
+    linear_axis,
+    mark_times,
+    marks,
+    marks_note,
+    plain,
+    prepare,
+    some_of,
+    time_axis,
+    wrapped,
+)
+from srm_mbs.visualization.plotting.sampling import broken, read_smoothly
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from srm_mbs._typing import FloatArray
+
+XYZ = ("x", "y", "z")
+CERTAIN = 0.1
+"""Part of the tolerance of a run below which changes of its coordinates are drawn as none."""
+LOOSE = 1e-6
+"""The largest tolerance that is taken for this: of loose runs, small motions are seen as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """Coordinates of a joint that share an axis.
+
+    Attributes
+    ----------
+    joint
+        Its name.
+    what
+        What of it, or "" where it has only this.
+    unit
+        Of the positions; the rates are per second.
+    names
+        Of the curves; one "" where there is one only.
+    positions : (n, k), rates : (n, k)
+        Angles unwrapped, and rotations as vectors; rates linear or angular, in the axes of the
+        moving body where there are several.
+    sizes
+        What is of ordinary size for positions and rates.
+    """
+
+    joint: str
+    what: str
+    unit: str
+    names: tuple[str, ...]
+    positions: FloatArray
+    rates: FloatArray
+    sizes: tuple[float, float]
+
+
+def chosen_joints(mechanism: Mechanism, joints: Sequence[str] | None) -> tuple[str, ...]:
+    """The names ``joints``, each checked; all that there are if it is None.
+
+    Raises
+    ------
+    InputError
+        If one is not there, is named twice, or none is named.
+    """
+    if joints is None:
+        return mechanism.joint_names
+    names = checked_names(joints, "joints", 'Give for example joints=["crank"]')
+    for name in names:
+        try:
+            mechanism.joint(name)
+        except InputError as error:
+            error.element = "joints"
+            raise
+    return names
+
+
+def checked_names(names: Any, element: str, remedy: str) -> tuple[str, ...]:
+    """``names`` as a tuple of different names.
+
+    Raises
+    ------
+    InputError
+        About ``element`` if they are none, one is there twice, or they are no strings.
+    """
+    single = isinstance(names, str)
+    found = () if single or not isinstance(names, Sequence) else tuple(names)
+    if not found or not all(isinstance(name, str) for name in found):
+        raise InputError(f"{names!r} is not a list of names", element=element, remedy=remedy)
+    for name in found:
+        if found.count(name) > 1:
+            raise InputError(f"{name!r} is named twice", element=element, remedy="Name it once")
+    return found
+
+
+def components(run: Solution, joint: str) -> Iterator[Component]:
+    """What is drawn of the joint, read at ``run.t``."""
+    mechanism = run.mechanism
+    data = mechanism.joint(joint)
+    units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
+    q = run.q[:, data.idx_q : data.idx_q + data.nq]
+    v = run.v[:, data.idx_v : data.idx_v + data.nv]
+
+    def component(
+        what: str, own: slice, positions: FloatArray, names: tuple[str, ...], turns: bool
+    ) -> Component:
+        size = 1.0 if turns else units.length
+        unit = "rad" if turns else "m"
+        sizes = (size, size * units.rate)
+        return Component(joint, what, unit, names, positions, v[:, own], sizes)
+
+    kind = data.shortname().removeprefix("JointModel")
+    if data.nv == 1:
+        turns = joint_turns(mechanism.model, joint)
+        yield component("", slice(0, 1), run.joint(joint)[0][:, None], ("",), turns)
+    elif kind == "FreeFlyer":
+        yield component("position", slice(0, 3), q[:, :3], XYZ, turns=False)
+        yield component("rotation", slice(3, 6), rotation_vectors(q[:, 3:]), XYZ, turns=True)
+    elif kind == "Spherical":
+        yield component("rotation", slice(0, 3), rotation_vectors(q), XYZ, turns=True)
+    elif kind == "Planar":
+        angle = np.unwrap(np.arctan2(q[:, 3], q[:, 2]))[:, None]
+        yield component("position", slice(0, 2), q[:, :2], XYZ[:2], turns=False)
+        yield component("angle", slice(2, 3), angle, ("",), turns=True)
+    else:
+        numbers = tuple(str(i + 1) for i in range(data.nv))
+        names = XYZ if kind == "Translation" else numbers
+        same = q if data.nq == data.nv else q[:, : data.nv]
+        yield component("", slice(0, data.nv), same, names, turns=kind != "Translation")
+
+
+def noise(run: Solution) -> float:
+    """Part of the ordinary size below which coordinates of ``run`` do not move."""
+    return CERTAIN * min(run.settings.rtol, LOOSE)
+
+
+def rotation_vectors(quaternions: FloatArray) -> FloatArray:
+    """Rotation vectors (n, 3) rad of ``quaternions`` (n, 4) x, y, z, w along a motion.
+
+    Each is the one nearest to its predecessor of all that mean the same rotation, so that turns
+    count and no jump is seen where the angle passes pi.
+    """
+    out = np.empty((len(quaternions), 3))
+    last = np.zeros(3)
+    for i, (x, y, z, w) in enumerate(quaternions):
+        vector = pin.log3(pin.Quaternion(w, x, y, z).toRotationMatrix())
+        angle = float(np.linalg.norm(vector))
+        # Of the identity, a whole turn about any axis means the same.
+        axis = vector / angle if angle > 1e-9 else last / (np.linalg.norm(last) or 1.0)
+        whole = np.round((last @ axis - angle) / (2.0 * np.pi))
+        last = vector + 2.0 * np.pi * whole * axis
+        out[i] = last
+    return out
+
+
+MOST_PORTRAITS = 6
+COLUMNS = 3
+NARROW_TICKS = 4
+"""Intervals between the ticks of a panel that shares its row."""
+MARKS = "Circles: start; squares: end"
+
+
+def draw_phase(solution: Solution, joints: Sequence[str] | None = None) -> Figure:
+    """Rate over position of joints with one degree of freedom.
+
+    Parameters
+    ----------
+    joints
+        Names of joints; by default the first ones that have one degree of freedom, and a note
+        names the others.
+
+    Raises
+    ------
+    InputError
+        If there is no such joint, or it has more than one degree of freedom.
+    """
+    mechanism = solution.mechanism
+    names = chosen_joints(mechanism, joints)
+    single = [name for name in names if mechanism.joint(name).nv == 1]
+    for name in names:
+        if name not in single and (joints is not None or not single):
+            raise InputError(
+                f"joint {name!r} has {mechanism.joint(name).nv} degrees of freedom, and no "
+                "phase portrait",
+                element="joints",
+                remedy=f"Known: {', '.join(single)}" if single else 'Draw the kind "state"',
+            )
+    shown = single if joints is not None else single[:MOST_PORTRAITS]
+    run, passages = read_smoothly(solution), None
+    if solution.crossings:
+        passages = solution.at([crossing.time for crossing in solution.crossings])
+    columns = min(COLUMNS, len(shown))
+    rows = -(-len(shown) // columns)
+    height = 2.1 if columns > 1 else 3.4
+    figure = Figure(figsize=(WIDTH, 0.9 + height * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for name, axes in zip(shown, panels):
+        _portrait(axes, solution, run, passages, name, alone=len(shown) == 1)
+    for axes in panels[len(shown) :]:
+        axes.set_axis_off()
+    left = [name for name in names if name not in shown]
+    notes = [MARKS + ("; plus signs: singular passages." if solution.crossings else ".")]
+    if left:
+        notes.append(f"Left out: {some_of(left)}; joints=[...], or --joint, names others.")
+    finish(figure, solution, notes)
+    return figure
+
+
+def _portrait(
+    axes: Axes, solution: Solution, run: Solution, passages: Solution | None, name: str, alone: bool
+) -> None:
+    prepare(axes, "both")
+    (component,) = components(run, name)
+    position, rate = component.positions[:, 0], component.rates[:, 0]
+    unit, sizes = component.unit, component.sizes
+    options: dict[str, Any] = {"noise": noise(solution), "ticks": 5 if alone else NARROW_TICKS}
+    x = linear_axis(axes, [position], "position ", unit, size=sizes[0], axis="x", **options)
+    y = linear_axis(axes, [rate], "rate ", f"{unit}/s", size=sizes[1], **options)
+    _, line = broken(solution, run.t, rate)
+    _, along = broken(solution, run.t, position)
+    axes.plot(along / x, line / y, color=BLUE, linewidth=0.9)
+    if passages is not None:
+        at = passages.joint(name)
+        axes.plot(at[0] / x, at[1] / y, **marks(VERMILION, "+", 6.0))
+    for index, marker in ((0, "o"), (-1, "s")):
+        axes.plot(position[index] / x, rate[index] / y, **marks(BLACK, marker, 5.5))
+    axes.set_title(plain(name), loc="left", fontsize=FONT_SIZE + 0.5)
+
+
+MOST_ROWS = 8
+"""Rows of panels that fit on a page."""
+LABEL_WIDTH = 16
+SEVERAL = (
+    "Joints of several degrees of freedom: rotations as vectors (axis times angle); rates in the "
+    "moving body's axes."
+)
+
+
+def draw_state(solution: Solution, joints: Sequence[str] | None = None) -> Figure:
+    """Position and rate of each joint over time.
+
+    Parameters
+    ----------
+    joints
+        Names of joints; by default all, as far as they fit on a page, and a note names the others.
+
+    Raises
+    ------
+    InputError
+        If there is no such joint.
+    """
+    names = chosen_joints(solution.mechanism, joints)
+    run = read_smoothly(solution)
+    rows: list[Component] = []
+    left: list[str] = []
+    for name in names:
+        own = list(components(run, name))
+        # Those that were asked for by name are drawn however long the picture gets.
+        if joints is None and (left or (rows and len(rows) + len(own) > MOST_ROWS)):
+            left.append(name)
+        else:
+            rows += own
+    figure = Figure(figsize=(WIDTH, 0.9 + 1.2 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
+    for row, pair in zip(rows, panels):
+        what = f"{row.what} " if row.what else ""
+        name = f"{plain(wrapped(row.joint, LABEL_WIDTH))}\n{what}"
+        for axes, values, label, unit, size in zip(
+            pair, (row.positions, row.rates), (name, ""), (row.unit, f"{row.unit}/s"), row.sizes
+        ):
+            _panel(axes, solution, run.t, values, row.names, size, (label, unit))
+    for axes, title in zip(panels[0], ("position", "rate")):
+        axes.set_title(title, loc="left", fontsize=FONT_SIZE + 0.5)
+    for axes in panels.flat:
+        legend(axes, beside=False)
+    for column in panels.T:
+        time_axis(solution, list(column))
+        figure.align_ylabels(list(column))
+    notes = marks_note(solution)
+    if any(len(row.names) > 1 for row in rows):
+        notes.append(SEVERAL)
+    if left:
+        notes.append(
+            f"Left out: {some_of(left)}; joints=[...], or --joint, draws those that it names."
+        )
+    finish(figure, solution, notes)
+    return figure
+
+
+def _panel(
+    axes: Axes,
+    solution: Solution,
+    t: FloatArray,
+    values: FloatArray,
+    names: tuple[str, ...],
+    size: float,
+    label: tuple[str, str],
+) -> None:
+    prepare(axes)
+    mark_times(axes, solution, labelled=False)
+    factor = linear_axis(axes, [values], *label, size=size, noise=noise(solution))
+    for name, own, style in zip(names, np.transpose(values), line_styles(len(names))):
+        draw_line(axes, t, own / factor, label=name or None, **style)

@@ -1,0 +1,236 @@
+"""Reactions of the closures, and the forces of couplings and drives, over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from srm_mbs.dynamics.scaling import joint_turns
+from srm_mbs.errors import ControllerError, EvaluationError, InputError
+from srm_mbs.simulation.result import Solution
+from srm_mbs.visualization.plotting.figure import (
+    LINES,
+    Draw,
+    draw_line,
+    finite,
+    line_styles,
+    linear_axis,
+    mark_times,
+    marks_note,
+    plain,
+    some_of,
+    time_panels,
+)
+from srm_mbs.visualization.plotting.joints import checked_names
+from srm_mbs.visualization.plotting.sampling import read_smoothly
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srm_mbs._typing import FloatArray
+    from srm_mbs.model.closures import LoopClosure
+
+SMOOTH_UP_TO = 1000
+"""Pieces from which steps are divided no further: each reaction is a solution of its own."""
+HIGH = 98.0
+"""Percentile of what is drawn from which peaks are judged."""
+PEAK = 6.0
+"""Values above this times the percentile are cut: at singular passages reactions have peaks."""
+ABOVE = 1.6
+"""Where the axis ends then, over the percentile."""
+MOST_PANELS = 8
+
+Lines = Mapping[str, "FloatArray"]
+
+
+def draw_reactions(
+    solution: Solution, loops: Sequence[str] | None = None, rows: bool = False
+) -> Figure:
+    """Forces and moments in the closures, and the forces of couplings and drives.
+
+    Parameters
+    ----------
+    loops
+        Names of closures; by default those with the largest forces, as many as a panel takes, and
+        a note names the others.  Drives are drawn if none are named.
+    rows
+        Draw the multipliers of the rows of each closure instead of the norms of force and moment.
+
+    Raises
+    ------
+    InputError
+        If there is no such closure, nothing has a reaction, or the run was loaded and had a
+        controller.
+    """
+    found = {loop.name: loop for each in solution.segments for loop in each.mechanism.loops}
+    drives = any(each.mechanism.drives for each in solution.segments)
+    if not found and not drives:
+        raise InputError(
+            f"the mechanism {solution.mechanism.name!r} has neither closures nor drives, and so no "
+            "reactions",
+            element="kind",
+            remedy='Draw another kind, for example "state" or "balance"',
+        )
+    names = None
+    if loops is not None:
+        names = checked_names(loops, "loops", 'Give for example loops=["pin"]')
+        for name in names:
+            if name not in found:
+                raise InputError(
+                    f"there is no closure {name!r}",
+                    element="loops",
+                    remedy=f"Known: {', '.join(found) or 'none'}",
+                )
+    run = _readable(solution)
+    draws, left = (_by_row if rows else _by_loop)(run, found, names)
+    if drives and loops is None:
+        draws += _drives(run)
+    notes = [*marks_note(solution), *_indeterminate(solution, [*(names or found)])]
+    if left:
+        notes.append(
+            f"Left out: {some_of(left)}; loops=[...], or --loop, draws those that it names."
+        )
+    return time_panels(solution, draws, notes, height=1.9)
+
+
+def _readable(solution: Solution) -> Solution:
+    """The run read smoothly; of one that failed, without the end if there are no forces there."""
+    run = read_smoothly(solution, SMOOTH_UP_TO)
+    try:
+        _ = run.reactions
+    except (ControllerError, EvaluationError) as error:
+        if solution.success:
+            raise
+        if len(run.t) < 2:
+            raise InputError(
+                f"the run has no reactions: {error}",
+                element="kind",
+                remedy='Draw another kind, for example "state"',
+            ) from error
+        run = solution.at(run.t[:-1])
+    return run
+
+
+def _indeterminate(solution: Solution, loops: Sequence[str]) -> list[str]:
+    own = [row for row in solution.indeterminate_reactions if row.rpartition(".")[0] in loops]
+    if not own:
+        return []
+    return [f"Equilibrium does not determine {some_of(own)}: values of least norm."]
+
+
+def _by_loop(
+    run: Solution, found: Mapping[str, LoopClosure], names: Sequence[str] | None
+) -> tuple[list[Draw], list[str]]:
+    """Norms of force and moment of closures, couplings by the force on their first joint."""
+    tied = [name for name in names or found if found[name].anchors]
+    coupled = [name for name in names or found if not found[name].anchors]
+    forces = {name: np.linalg.norm(run.reactions[name][:, :3], axis=1) for name in tied}
+    moments = {name: np.linalg.norm(run.reactions[name][:, 3:], axis=1) for name in tied}
+    left: list[str] = []
+    if names is None and len(tied) > len(LINES):
+        large = {name: _high([forces[name]]) for name in tied}
+        ordered = sorted(tied, key=lambda name: -large[name])
+        left = [name for name in tied if name in ordered[len(LINES) :]]
+        tied = [name for name in tied if name not in left]
+    draws: list[Draw] = []
+    if tied:
+        forces, moments = ({name: all_[name] for name in tied} for all_ in (forces, moments))
+        draws.append(_panel(run, forces, "force ", "N", "forces in the closures"))
+        moments = {name: own for name, own in moments.items() if _takes_moments(found[name])}
+        if moments:
+            title = "moments in the closures, about the origins of their anchors b"
+            draws.append(_panel(run, moments, "moment ", "N m", title))
+    for turning, unit in ((True, "N m"), (False, "N")):
+        lines = {}
+        for name in coupled:
+            first = found[name].rows.joint_rows[0].joints[0]
+            if joint_turns(run.mechanism.model, first) == turning:
+                own = found[name].rows.joint_rows[0].coefficients[0]
+                values = -own * run.reaction_multipliers[name][:, 0]
+                lines[f"{name}, on {first}"] = values
+        for first_line in range(0, len(lines), len(LINES)):
+            part = dict(list(lines.items())[first_line : first_line + len(LINES)])
+            what = "torque " if turning else "force "
+            draws.append(_panel(run, part, what, unit, "couplings, on their first joints"))
+    return draws, left
+
+
+def _takes_moments(loop: LoopClosure) -> bool:
+    """Whether it has more than a force through the origin of b, but for the gap of the closure."""
+    return bool(len(loop.rows.alignments)) or 0 < len(loop.rows.directions) < 3
+
+
+def _by_row(
+    run: Solution, found: Mapping[str, LoopClosure], names: Sequence[str] | None
+) -> tuple[list[Draw], list[str]]:
+    """The multipliers of each closure, rows of one unit in a panel."""
+    draws: list[Draw] = []
+    left: list[str] = []
+    for name in names or found:
+        loop = found[name]
+        panels = []
+        _, alignments, joints = loop.rows.blocks
+        turning = [joint_turns(run.mechanism.model, r.joints[0]) for r in loop.rows.joint_rows]
+        numbers = range(loop.rows.count)
+        angles = [*numbers[alignments], *(i for i, t in zip(numbers[joints], turning) if t)]
+        for own, unit in (
+            ([i for i in numbers if i not in angles], "N"),
+            (angles, "N m"),
+        ):
+            lines = {loop.rows.labels[i]: run.reaction_multipliers[name][:, i] for i in own}
+            if lines:
+                title = f"multipliers of {plain(name)}"
+                panels.append(_panel(run, lines, "multiplier ", unit, title))
+        if names is None and (left or (draws and len(draws) + len(panels) > MOST_PANELS)):
+            left.append(name)
+        else:
+            draws += panels
+    return draws, left
+
+
+def _drives(run: Solution) -> list[Draw]:
+    model = run.mechanism.model
+    turning = {
+        drive.name: drive.joint is not None and joint_turns(model, drive.joint)
+        for each in run.segments
+        for drive in each.mechanism.drives
+    }
+    draws = []
+    for turns, unit, what in ((True, "N m", "torque "), (False, "N", "force ")):
+        lines = {n: own for n, own in run.drive_forces.items() if turning[n] == turns}
+        if lines:
+            draws.append(_panel(run, lines, what, unit, "drives"))
+    return draws
+
+
+def _panel(run: Solution, lines: Lines, name: str, unit: str, title: str) -> Draw:
+    return partial(_draw, run=run, lines=lines, name=name, unit=unit, title=title)
+
+
+def _draw(axes: Axes, run: Solution, lines: Lines, name: str, unit: str, title: str) -> str:
+    mark_times(axes, run, labelled=False)
+    top = ABOVE * _high(list(lines.values()))
+    cut = _largest(lines) > PEAK / ABOVE * top > 0.0
+    shown = [np.clip(values, -top, top) for values in lines.values()] if cut else lines.values()
+    factor = linear_axis(axes, list(shown), name, unit, size=0.0)
+    for (label, values), style in zip(lines.items(), line_styles(len(lines))):
+        draw_line(axes, run.t, values / factor, label=plain(label), **style)
+    if cut:
+        low = min(float(np.nanmin(finite(values))) for values in shown)
+        axes.set_ylim(min(0.0, 1.05 * low / factor), top / factor)
+        title += f"; peaks to {_largest(lines):.2g} {unit} are cut"
+    return title
+
+
+def _high(lines: Sequence[FloatArray]) -> float:
+    together = np.abs(np.concatenate(lines))
+    together = together[np.isfinite(together)]
+    return float(np.percentile(together, HIGH)) if len(together) else 0.0
+
+
+def _largest(lines: Lines) -> float:
+    return max(float(np.nanmax(np.abs(finite(v)), initial=0.0)) for v in lines.values())

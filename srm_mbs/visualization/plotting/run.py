@@ -1,0 +1,209 @@
+"""The run plot: drift, energy, sigma and step sizes over time.
+
+sigma and step sizes: panels of the run plot, and a figure in the style of the thesis.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from srm_mbs.dynamics.scaling import row_dimensions
+from srm_mbs.simulation.result import Solution
+from srm_mbs.visualization.plotting.figure import (
+    BLACK,
+    BLUE,
+    FONT_SIZE,
+    GREEN,
+    GREY,
+    LARGE_DOTS,
+    PURPLE,
+    VERMILION,
+    Draw,
+    curve,
+    dots,
+    draw_line,
+    finite,
+    linear_axis,
+    log_axis,
+    mark_times,
+    marks,
+    marks_note,
+    seconds,
+    time_panels,
+)
+from srm_mbs.visualization.plotting.sampling import Run, constrained, distinct
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srm_mbs._typing import BoolArray, FloatArray
+
+SMALLEST_SIGMA = 1e-16
+"""sigma that is exactly zero is drawn here, since a logarithmic axis has no zero."""
+
+
+def sigma_panel(solution: Run, *, log: bool = False) -> Draw:
+    """sigma at the ends of the steps, and a line through every stage."""
+    return partial(_sigma, solution=solution, log=log)
+
+
+def step_panel(solution: Run, *, kinds: bool = False) -> Draw:
+    """Accepted steps, and those that did not stand.
+
+    Parameters
+    ----------
+    kinds
+        Whether steps that were placed, in the zone or held on their branch have marks of their own.
+    """
+    return partial(_step_sizes, solution=solution, kinds=kinds)
+
+
+def draw_sigma(solution: Solution) -> Figure:
+    """sigma, step sizes and error estimates of a run (figures 5.14 to 5.16 of the thesis)."""
+    draws = [sigma_panel(solution, log=True)] if constrained(solution) else []
+    draws.append(step_panel(solution, kinds=True))
+    if solution.settings.step is None:
+        draws.append(partial(_errors, solution=solution))
+    return time_panels(solution, draws, marks_note(solution), height=1.9)
+
+
+def _sigma(axes: Axes, solution: Run, log: bool) -> str:
+    steps = solution.steps
+    mark_times(axes, solution, labelled=not log)
+    # A line through every stage: a step leaps over a singular passage, its stages show the dip.
+    abscissae = np.append(solution.scheme.c, 1.0)
+    times = (steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]).ravel()
+    sigmas = finite(steps.sigmas)
+    if log:
+        sigmas = np.maximum(sigmas, SMALLEST_SIGMA)
+    order = np.argsort(times, kind="stable")
+    line = sigmas.ravel()[order]
+    draw_line(axes, times[order], line, color=GREY, linewidth=0.8, label="stages")
+    ends = sigmas[:, -1]
+    _dots(axes, steps.times[1:], ends, log, colour=BLUE, label="step ends", count=steps.count)
+    if log and steps.count:
+        log_axis(axes)
+    else:
+        axes.set_ylim(bottom=0.0, top=None if steps.count else 1.0)
+    axes.set_ylabel(r"$\sigma$ (relative)", fontsize=FONT_SIZE)
+    floor = log and bool((steps.sigmas < SMALLEST_SIGMA).any())
+    return "distance from singular configurations" + (
+        f" (zeros drawn at {SMALLEST_SIGMA:.0e})" if floor else ""
+    )
+
+
+def _dots(
+    axes: Axes, x: FloatArray, y: FloatArray, log: bool, *, colour: str, label: str, count: int
+) -> None:
+    seen = distinct(x, y, log=log)
+    axes.plot(x[seen], y[seen], color=colour, label=label, **dots(count))
+
+
+def _step_sizes(axes: Axes, solution: Run, kinds: bool) -> str:
+    steps = solution.steps
+    mark_times(axes, solution, labelled=not kinds)
+    starts, lengths = steps.times[:-1], np.diff(steps.times)
+    _dots(axes, starts, lengths, True, colour=BLUE, label="accepted", count=steps.count)
+    if kinds:
+        for label, chosen, colour, marker, size in _special(solution):
+            if chosen.any():
+                seen = distinct(starts[chosen], lengths[chosen], log=True)
+                axes.plot(
+                    starts[chosen][seen],
+                    lengths[chosen][seen],
+                    label=label,
+                    **marks(colour, marker, size if steps.count <= LARGE_DOTS else 0.6 * size),
+                )
+    attempts = (("rejected", solution.rejected, VERMILION, "x"),)
+    for label, pairs, colour, marker in (*attempts, ("redone", solution.replaced, BLACK, "+")):
+        if len(pairs):
+            seen = distinct(pairs[:, 0], pairs[:, 1], log=True)
+            axes.plot(pairs[seen, 0], pairs[seen, 1], label=label, **marks(colour, marker))
+    log_axis(axes)
+    axes.set_ylabel(f"step size{seconds(solution)}", fontsize=FONT_SIZE)
+    return "steps"
+
+
+def _special(solution: Run) -> list[tuple[str, BoolArray, str, str, float]]:
+    """Which accepted steps were out of the ordinary, and their marks."""
+    steps = solution.steps
+    zone = np.isin(np.arange(steps.count), list(steps.zones))
+    return [
+        ("placed", steps.placements > 0.0, GREEN, "o", 5.5),
+        ("in the zone", zone, PURPLE, "s", 7.0),
+        ("held on their branch", steps.held > 0.0, BLACK, "D", 6.0),
+    ]
+
+
+def _errors(axes: Axes, solution: Solution) -> str:
+    steps = solution.steps
+    mark_times(axes, solution, labelled=False)
+    axes.axhline(1.0, color=BLACK, linewidth=0.7, linestyle="--")
+    _ratios(axes, steps.times[:-1], steps.error_ratios, "accepted", dots(steps.count), BLUE)
+    rejected = solution.attempts[solution.attempts["verdict"] == "rejected"]
+    style = marks(VERMILION, "x")
+    del style["color"]
+    _ratios(axes, rejected["t"], rejected["error_ratio"], "rejected", style, VERMILION)
+    if steps.count:
+        log_axis(axes)
+    axes.set_ylabel("error over\ntolerance", fontsize=FONT_SIZE)
+    return "error estimates, accepted up to 1"
+
+
+def _ratios(
+    axes: Axes, t: FloatArray, ratios: FloatArray, label: str, style: dict[str, object], colour: str
+) -> None:
+    """Marks of positive ratios; a step without an error, or that could not be done, has none."""
+    known = np.isfinite(ratios) & (ratios > 0.0)
+    seen = distinct(t[known], ratios[known], log=True)
+    if len(seen):
+        axes.plot(t[known][seen], ratios[known][seen], color=colour, label=label, **style)  # type: ignore[arg-type]
+
+
+SMALLEST_DRIFT = 1e-17
+"""Drift that is exactly zero is drawn here, since a logarithmic axis has no zero."""
+
+
+def draw_run(solution: Solution) -> Figure:
+    """Drift, energy, sigma and step sizes of a run over time, in panels with one time axis.
+
+    Drift and energy are drawn at ``solution.t``, sigma and step sizes at the steps.  Without
+    loops there is neither drift nor sigma, and their panels are left out.
+    """
+    energy: Draw = partial(_energy, solution=solution)
+    draws = [energy, step_panel(solution)]
+    if constrained(solution):
+        drift: Draw = partial(_drift, solution=solution)
+        draws = [drift, energy, sigma_panel(solution), step_panel(solution)]
+    return time_panels(solution, draws)
+
+
+def _drift(axes: Axes, solution: Solution) -> str:
+    found = {part for each in solution.segments for part in row_dimensions(each.mechanism)}
+    parts = [part for part in ("m", "rad") if part in found]
+    units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
+    names = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
+    drift = np.maximum(finite(solution.drift), SMALLEST_DRIFT)
+    # The positions as dots: at round-off a line would jump to and fro between a few values.
+    rate = {"color": VERMILION, **curve(len(solution.t))}
+    position = {"color": BLACK, "linestyle": "none", "marker": ".", "markersize": 2.0}
+    for column, style in ((1, rate), (0, position)):
+        label = f"{names[column]} ({units[column]})"
+        draw_line(axes, solution.t, drift[:, column], label=label, **style)
+    log_axis(axes)
+    axes.set_ylabel("drift", fontsize=FONT_SIZE)
+    floor = finite(solution.drift) < SMALLEST_DRIFT
+    return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
+
+
+def _energy(axes: Axes, solution: Solution) -> str:
+    change = finite(solution.energy - solution.energy[:1])
+    factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
+    draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))
+    from_start = not len(solution.t) or solution.t[0] == solution.steps.times[0]
+    since = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
+    return f"total energy relative to {since}"

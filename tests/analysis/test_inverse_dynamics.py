@@ -1,0 +1,175 @@
+"""Forces that a prescribed motion needs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.linalg import null_space
+
+import srm_mbs as srm
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from tests.support.bundled import load
+from tests.support.mechanisms import floating_ring
+
+
+def driven(name: str, names: list[str], t_end: float = 1.0, **options):
+    """A bundled mechanism, a run of it with torques on the joints ``names``, and these."""
+    mechanism = load(name)
+    columns = [mechanism.joint(joint).idx_v for joint in names]
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        out = np.zeros(mechanism.model.nv)
+        out[columns] = [3.0 * np.sin(4.0 * t + k) - 0.3 * v[c] for k, c in enumerate(columns)]
+        return out
+
+    run = srm.simulate(mechanism, t_end, rtol=1e-10, controller=torque, **options)
+    given = np.array([torque(*state)[columns] for state in zip(run.t, run.q, run.v)])
+    return mechanism, run, given
+
+
+def terms(mechanism: srm.Mechanism, q: np.ndarray, v: np.ndarray):
+    """M, nle and G of the kept rows."""
+    model, data = mechanism.model, mechanism.model.createData()
+    M = np.array(pin.crba(model, data, q, pin.Convention.WORLD))
+    M = np.triu(M) + np.triu(M, 1).T
+    nle = np.array(pin.nonLinearEffects(model, data, q, v))
+    rows = LoopKinematics(model, mechanism.loops, keep=mechanism.structure.kept)
+    rows.update(data, q)
+    return M, nle, rows.G.copy()
+
+
+@pytest.mark.parametrize(
+    ("name", "names"),
+    [
+        ("four_bar", ["crank"]),
+        ("four_bar", ["rocker"]),
+        ("five_bar", ["crank_left", "crank_right"]),
+        ("spatial_four_bar", ["crank"]),
+        ("slider_crank", ["crank"]),
+        ("pendulum_chain", ["link_0", "link_1", "link_2"]),
+    ],
+)
+def test_the_torques_of_a_controller_are_recovered(name: str, names: list[str]) -> None:
+    mechanism, run, given = driven(name, names)
+    found = srm.inverse_dynamics(mechanism, run, names)
+    assert found.actuated == tuple(names)
+    np.testing.assert_allclose(found.torques, given, atol=1e-8)
+    for loop, wrench in run.reactions.items():
+        np.testing.assert_allclose(found.reactions[loop], wrench, atol=1e-6, rtol=1e-8)
+
+
+def test_the_power_of_the_torques_is_what_the_energy_gains() -> None:
+    mechanism, run, _ = driven("four_bar", ["crank"])
+    times = np.linspace(0.0, 1.0, 401)
+    dense = run.at(times)
+    power = srm.inverse_dynamics(mechanism, run, "crank", t=times).power
+    h = times[1]
+    energy = dense.energy
+    slope = (8.0 * (energy[3:-1] - energy[1:-3]) - energy[4:] + energy[:-4]) / (12.0 * h)
+    np.testing.assert_allclose(power[2:-2], slope, atol=1e-5 * np.abs(power).max())
+
+
+def test_overactuated_torques_are_those_of_least_norm() -> None:
+    mechanism, run, _ = driven("four_bar", ["crank"])
+    names = ["crank", "coupler", "rocker"]
+    found = srm.inverse_dynamics(mechanism, run, names)
+    weighted = srm.inverse_dynamics(mechanism, run, names, weights=[1.0, 4.0, 9.0])
+    for i in range(0, len(run.t), 7):
+        M, nle, G = terms(mechanism, run.q[i], run.v[i])
+        right = M @ run.accelerations[i] + nle
+        # numpy's pinv of the stacked problem with the multipliers eliminated by SciPy
+        Z = null_space(G)
+        least = np.linalg.pinv(Z.T) @ (Z.T @ right)
+        np.testing.assert_allclose(found.torques[i], least, atol=1e-8)
+        # and the same as a saddle point: min |tau|^2 subject to tau - G^T lam = right
+        for W, torques in (
+            (np.eye(3), found.torques[i]),
+            (np.diag([1, 4, 9]), weighted.torques[i]),
+        ):
+            m = len(G)
+            saddle = np.block(
+                [
+                    [2.0 * W, np.zeros((3, m)), np.eye(3)],
+                    [np.zeros((m, 3 + m)), -G],
+                    [np.eye(3), -G.T, np.zeros((3, 3))],
+                ]
+            )
+            exact = np.linalg.solve(saddle, np.concatenate([np.zeros(3 + m), right]))[:3]
+            np.testing.assert_allclose(torques, exact, atol=1e-8)
+    single = srm.inverse_dynamics(mechanism, run, "crank")
+    assert np.linalg.norm(found.torques) < np.linalg.norm(single.torques)
+
+
+def test_too_few_actuators_are_refused_unless_the_motion_needs_no_more() -> None:
+    mechanism, run, given = driven("five_bar", ["crank_left"])
+    found = srm.inverse_dynamics(mechanism, run, "crank_left")
+    np.testing.assert_allclose(found.torques, given, atol=1e-8)
+    _, both, _ = driven("five_bar", ["crank_left", "crank_right"])
+    with pytest.raises(srm.InputError, match="crank_left cannot drive this motion of 2 degrees"):
+        srm.inverse_dynamics(mechanism, both, "crank_left")
+
+
+def test_a_free_motion_of_ball_joints_needs_nothing() -> None:
+    mechanism = floating_ring()
+    run = srm.simulate(mechanism, 1.0, rtol=1e-9)
+    found = srm.inverse_dynamics(mechanism, run)
+    assert len(found.actuated) == mechanism.model.nv
+    np.testing.assert_allclose(found.torques, 0.0, atol=1e-9)
+
+
+def test_a_prescribed_crank_turns_uniformly() -> None:
+    """theta = 2 t on the slider-crank whose reduced equation is known."""
+    mechanism = load("slider_crank")
+    w, times = 2.0, np.linspace(0.0, 0.5, 6)
+
+    def motion(t: float):
+        theta = 0.3 + w * t
+        return [theta, -2.0 * theta], [w, -2.0 * w], [0.0, 0.0]
+
+    found = srm.inverse_dynamics(mechanism, motion, "crank", t=times)
+    theta = 0.3 + w * times
+    # twice tests.reduced.slider_crank, which is divided by 2 kg m^2
+    exact = 2.0 * (4.0 * np.sin(theta) * np.cos(theta) * w**2 + 9.81 * np.cos(theta))
+    np.testing.assert_allclose(found.torques[:, 0], exact, atol=1e-10)
+    arrays = [times, *(np.array(part) for part in zip(*map(motion, times)))]
+    same = srm.inverse_dynamics(mechanism, arrays, "crank")
+    np.testing.assert_array_equal(same.torques, found.torques)
+
+
+def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:
+    mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
+    for motion in (run, lambda t: (run.q[0], run.v[0], run.accelerations[0])):
+        assert srm.inverse_dynamics(mechanism, motion, "crank", t=[]).torques.shape == (0, 1)
+
+
+def test_motions_that_cannot_be_are_refused() -> None:
+    mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
+    t, q, v, a = run.t, run.q, run.v, run.accelerations
+    for parts, what in (
+        ((t, q + 0.1, v, a), "positions"),
+        ((t, q, v + 0.1, a), "rates"),
+        ((t, q, v, a + 0.1), "accelerations"),
+    ):
+        with pytest.raises(srm.InputError, match=f"the {what} of the motion violate"):
+            srm.inverse_dynamics(mechanism, parts, "crank")
+    with pytest.raises(srm.InputError, match="a motion of shapes"):
+        srm.inverse_dynamics(mechanism, (t, q, v), "crank")
+    with pytest.raises(srm.InputError, match="needs times"):
+        srm.inverse_dynamics(mechanism, lambda t: (q[0], v[0], a[0]), "crank")
+    for told in (None, (q[0], v[0]), (q[0], v, a[0]), ("a", v[0], a[0])):
+        with pytest.raises(srm.InputError, match="a motion of shapes"):
+            srm.inverse_dynamics(mechanism, lambda t, told=told: told, "crank", t=[0.0, 0.1])
+    with pytest.raises(srm.InputError, match="t = 'soon' does not consist of finite numbers"):
+        srm.inverse_dynamics(mechanism, lambda t: (q[0], v[0], a[0]), "crank", t="soon")
+    with pytest.raises(srm.InputError, match="weights = 'light' does not consist"):
+        srm.inverse_dynamics(mechanism, run, "crank", weights="light")
+    with pytest.raises(srm.InputError, match="weights of shape"):
+        srm.inverse_dynamics(mechanism, run, "crank", weights=[1.0, 2.0])
+    with pytest.raises(srm.InputError, match="there is no joint 'wheel'"):
+        srm.inverse_dynamics(mechanism, run, "wheel")
+    singular = load("slider_crank")
+    fold = srm.assemble(singular, {"crank": 0.5 * np.pi}).q
+    rest = np.zeros((1, 2))
+    with pytest.raises(srm.InputError, match="stands on a singular configuration"):
+        srm.inverse_dynamics(singular, (np.zeros(1), fold[None], rest, rest), "crank")

@@ -1,0 +1,588 @@
+"""The command line: exit status, messages, files, and what it prints."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import srm_mbs as srm
+from srm_mbs.analysis.summary import joint_rows
+from srm_mbs.cli.app import app
+from tests.support.urdf_files import tree
+
+ROOT = Path(srm.__file__).parents[1]
+BOX = """<robot name="box"><link name="box"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+POSIX = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+
+# meshcat imports a module of pyzmq that warns.
+pytestmark = pytest.mark.filterwarnings("ignore:zmq.eventloop:DeprecationWarning")
+
+
+def run(*args: object, status: int = 0) -> str:
+    """Output, both streams, of a command run in this process."""
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == status, result.output
+    assert "Traceback" not in result.output
+    return result.output
+
+
+def command(*args: object) -> list[str]:
+    return [sys.executable, "-m", "srm_mbs.cli.app", *map(str, args)]
+
+
+def run_apart(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A command run in a process of its own, as from a shell with pipes."""
+    return subprocess.run(
+        command(*args),
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=180,
+    )
+
+
+def row(output: str, name: str) -> str:
+    """What stands behind ``name`` in a table."""
+    return re.search(rf"^{re.escape(name)}  +(.*)$", output, re.MULTILINE)[1]
+
+
+def error_line(output: str) -> str:
+    """The one line that reports an error."""
+    (line,) = [line for line in output.splitlines() if line.startswith("error: ")]
+    return line
+
+
+@pytest.fixture(scope="module")
+def saved_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("saved") / "run.npz"
+    run("simulate", "slider_crank", "--t-end", 2, "--out", path)
+    return path
+
+
+@pytest.fixture
+def describe(tmp_path: Path) -> Any:
+    """Writes a description of the bundled four-bar linkage with parts of its text replaced."""
+
+    def write(*changes: tuple[str, str]) -> Path:
+        text = (ROOT / "models" / "four_bar.toml").read_text(encoding="utf-8")
+        urdf = ROOT / "urdf" / "four_bar.urdf"
+        for old, new in (("../urdf/four_bar.urdf", urdf.as_posix()), *changes):
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / "mine.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+# -- help -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("simulate", "--t-end --method --tableau --rtol --atol --step --backend --out --plot"),
+        ("simulate", "--csv --html --play MODEL psrm dop853 auto|python|kernel"),
+        ("info", "MODEL degrees of freedom rank redundant"),
+        ("models", "package"),
+        ("play", "RUN browser"),
+        ("plot", "RUN --out .png .pdf .svg"),
+    ],
+)
+def test_every_command_has_help_on_its_arguments_and_options(name: str, words: str) -> None:
+    output = run(name, "--help")
+    for word in words.split():
+        assert word in output
+
+
+def test_help_lists_the_commands_and_the_exit_status() -> None:
+    output = run("--help")
+    for word in (
+        "simulate",
+        "info",
+        "models",
+        "play",
+        "plot",
+        "benchmark",
+        "--verbose",
+        "--version",
+    ):
+        assert word in output
+    assert "2 for bad input" in output
+
+
+def test_version_is_that_of_the_package() -> None:
+    assert run("--version") == f"srm-mbs {srm.__version__}\n"
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from srm_mbs.cli.app import main\n"
+        "sys.argv = ['srm-mbs', '--help']\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print(*sorted(sys.modules), sep='\\n')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    loaded = set(done.stdout.split())
+    assert "srm_mbs.cli.app" in loaded
+    assert not loaded & {"numpy", "scipy", "pinocchio", "matplotlib", "meshcat", "pydantic"}
+
+
+# -- models and info --------------------------------------------------------------------------
+
+
+def test_models_lists_every_bundled_mechanism_with_its_description() -> None:
+    output = run("models")
+    for name in srm.bundled_models():
+        assert len(row(output, name)) > 20
+    first = "Slider-crank with two equal bars of 2 m and 1 kg and a massless slider"
+    assert row(output, "slider_crank").startswith(first)
+
+
+def test_info_shows_degrees_of_freedom_rank_redundant_rows_joints_and_loops() -> None:
+    output = run("info", "slider_crank_slider")
+    assert row(output, "degrees of freedom") == "1"
+    assert row(output, "closure rows") == "3"
+    assert row(output, "rank") == "2"
+    assert row(output, "redundant rows, left out") == "pin.y"
+    assert row(output, "redundant rows, left to pivoting") == "0"
+    assert re.split("  +", row(output, "crank")) == ["revolute", "5.49779 rad", "0 rad/s"]
+    assert re.split("  +", row(output, "slider")) == ["prismatic along x", "2.82843 m", "0 m/s"]
+    kind, a, b, gap = re.split("  +", row(output, "pin"))
+    assert (kind, a, b) == ("point", "rod xyz [2, 0, 0] m", "slider")
+    assert float(gap.removesuffix(" m")) < 1e-12
+
+
+def test_info_tells_what_was_read_and_what_was_ignored(tmp_path: Path) -> None:
+    assert row(run("info", "four_bar"), "read from").endswith("four_bar.toml (URDF)")
+    assert row(run("info", "n_four_bar_3"), "read from") == "n_four_bar_3, generated (URDF)"
+    path = tmp_path / "robot.yaml"
+    path.write_text("closed_loop: []\ntype: []\nname_mot: [hip]\n")
+    urdf = tree().replace("</robot>", "<transmission/></robot>")
+    (tmp_path / "robot.urdf").write_text(urdf)
+    output = run("info", path)
+    assert row(output, "read from") == f"{path} (Gepetto YAML)"
+    assert "note: joints with motors (name_mot), which exert nothing here: hip" in output
+    assert "note: 1 <transmission> element(s) do not act and are ignored" in output
+
+
+def test_info_of_an_open_chain_has_no_table_of_loops() -> None:
+    output = run("info", "pendulum_chain")
+    assert row(output, "degrees of freedom") == "3"
+    assert "anchor" not in output
+
+
+def test_info_shows_all_coordinates_of_joints_with_several(tmp_path: Path) -> None:
+    path = tmp_path / "free.urdf"
+    path.write_text(BOX)
+    description = tmp_path / "free.toml"
+    description.write_text('format = 1\nurdf = "free.urdf"\nbase = "floating"\n')
+    kind, q, v = re.split("  +", row(run("info", description), "root_joint"))
+    assert (kind, q, v) == ("floating", "[0, 0, 0, 0, 0, 0, 1]", "[0, 0, 0, 0, 0, 0]")
+
+
+def test_info_repeats_what_was_noted_on_reading(describe: Any, tmp_path: Path) -> None:
+    source = ROOT / "urdf" / "four_bar.urdf"
+    urdf = tmp_path / "own.urdf"
+    urdf.write_text(source.read_text().replace("</robot>", "<transmission/></robot>"))
+    output = run("info", describe((source.as_posix(), "own.urdf")))
+    assert "note: 1 <transmission> element(s) do not act and are ignored" in output
+
+
+def test_brackets_in_names_are_printed_as_they_are(describe: Any) -> None:
+    path = describe(('name = "four_bar"', 'name = "four[bold]bar[/]"'))
+    assert row(run("info", path), "mechanism") == "four[bold]bar[/]"
+
+
+# -- simulate ---------------------------------------------------------------------------------
+
+
+def test_simulate_prints_a_summary_and_writes_every_file(tmp_path: Path) -> None:
+    out, plot, csv, html = (tmp_path / f"run.{suffix}" for suffix in ("npz", "png", "csv", "html"))
+    files = ("--out", out, "--plot", plot, "--csv", csv, "--html", html)
+    output = run("simulate", "slider_crank", "--t-end", 5, *files)
+    solution = srm.load_solution(out)
+    assert row(output, "status") == "finished"
+    assert row(output, "end time") == "5 s"
+    assert row(output, "steps") == f"{solution.stats.steps}"
+    assert row(output, "evaluations") == f"{solution.stats.evaluations}"
+    assert row(output, "singular passages") == "2"
+    assert row(output, "largest ||g||") == f"{solution.drift[:, 0].max():.2e} (m, rad)"
+    for name in ("rejected steps", "placements", "zone steps", "energy change", "wall time"):
+        assert row(output, name)
+    for path in (out, plot, csv, html):
+        assert f"written            {path}" in output
+        assert path.stat().st_size > 5000
+    assert "The run reached t = 5 s." in output
+
+
+def test_simulate_takes_its_defaults_from_the_description(describe: Any, tmp_path: Path) -> None:
+    path = describe(("t_end = 10.0", "t_end = 0.25\nrtol = 1e-7\natol = 1e-9"))
+    out = tmp_path / "run.npz"
+    assert row(run("simulate", path, "--out", out), "end time") == "0.25 s"
+    settings = srm.load_solution(out).settings
+    assert (settings.rtol, set(settings.atol)) == (1e-7, {1e-9})
+
+
+def test_options_override_the_description(describe: Any, tmp_path: Path) -> None:
+    path = describe(("t_end = 10.0", "t_end = 0.25\nrtol = 1e-7\natol = 1e-9"))
+    out = tmp_path / "run.npz"
+    options = ("--t-end", 0.5, "--rtol", 1e-5, "--atol", 1e-6, "--tableau", "dopr54")
+    assert row(run("simulate", path, *options, "--out", out), "end time") == "0.5 s"
+    settings = srm.load_solution(out).settings
+    assert (settings.tableau, settings.rtol, set(settings.atol)) == ("dopr54", 1e-5, {1e-6})
+
+
+def test_simulate_uses_the_tableau_of_the_method_where_none_is_given(tmp_path: Path) -> None:
+    out = tmp_path / "run.npz"
+    for method, own in (("psrm", srm.PSRM()), ("srm", srm.SRM())):
+        run("simulate", "four_bar", "--t-end", 0.01, "--method", method, "--out", out)
+        assert srm.load_solution(out).settings.tableau == own.tableau
+
+
+def test_simulate_with_a_fixed_step_takes_that_many() -> None:
+    output = run("simulate", "four_bar", "--t-end", 0.5, "--step", 0.05)
+    assert row(output, "steps") == "10"
+
+
+def test_open_chain_has_no_constraint_rows_in_its_summary() -> None:
+    output = run("simulate", "pendulum_chain", "--t-end", 0.5)
+    assert row(output, "status") == "finished"
+    assert "||g||" not in output
+
+
+def test_run_that_fails_keeps_what_it_has_and_exits_with_1(tmp_path: Path) -> None:
+    out, plot, html = (tmp_path / name for name in ("run.npz", "run.svg", "run.html"))
+    files = ("--out", out, "--plot", plot, "--html", html)
+    output = run("simulate", "pendulum_chain", "--step", 1, *files, status=1)
+    assert row(output, "status") == "failed"
+    assert "Stopped at t = " in output
+    for path in (out, plot, html):
+        assert path.stat().st_size > 5000
+    solution = srm.load_solution(out)
+    assert not solution.success
+    assert solution.stats.steps > 0
+
+
+def test_run_that_fails_at_the_start_exits_with_1(tmp_path: Path) -> None:
+    out, plot, html = (tmp_path / name for name in ("run.npz", "run.png", "run.html"))
+    files = ("--out", out, "--plot", plot, "--html", html)
+    output = run("simulate", "pendulum_chain", "--step", 100, "--t-end", 1000, *files, status=1)
+    assert row(output, "steps") == "0"
+    for path in (out, plot, html):
+        assert path.exists()
+
+
+def test_warnings_are_single_lines() -> None:
+    output = run("simulate", "four_bar", "--t-end", 0.1, "--rtol", 0.1)
+    (line,) = [line for line in output.splitlines() if "rtol" in line]
+    assert line.startswith("warning: rtol = 0.1 is looser than 0.01")
+
+
+def test_simulate_can_play_the_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    played = []
+    monkeypatch.setattr(
+        "srm_mbs.simulation.result.Solution.play", lambda *given, **o: played.append((given, o))
+    )
+    run("simulate", "four_bar", "--t-end", 0.1, "--play", "--gaps", "--trace", "crank:1,0,0")
+    (((solution,), options),) = played
+    assert solution.t[-1] == 0.1
+    anchor = srm.Anchor("crank", xyz=(1.0, 0.0, 0.0))
+    assert options == {"trace": [anchor], "gaps": True, "reactions": False}
+
+
+@POSIX
+def test_interrupted_run_is_written_and_exits_with_1(tmp_path: Path) -> None:
+    psutil = pytest.importorskip("psutil")
+    out, plot = tmp_path / "run.npz", tmp_path / "run.png"
+    # One of many bodies and no singular passages: few steps in this time, and little to write.
+    args = ("simulate", "jansen_walker", "--t-end", 1e6, "--out", out, "--plot", plot)
+    process = subprocess.Popen(
+        command("-v", *args),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A test run in the background of a shell would ignore the signal.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    with process:
+        next(line for line in process.stderr if "from t = 0 to 1e+06 s" in line)  # about to begin
+        # The first step is made within some ms of its CPU time, however busy the machine is.
+        work = psutil.Process(process.pid)
+        begun = work.cpu_times().user
+        while process.poll() is None and work.cpu_times().user < begun + 0.3:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        output, messages = process.communicate(timeout=120)
+    assert process.returncode == 1, messages
+    assert row(output, "status") == "interrupted"
+    assert "Interrupted at t = " in messages
+    assert "Traceback" not in messages
+    assert srm.load_solution(out).t[-1] > 0.0
+    assert plot.stat().st_size > 5000
+
+
+def test_passages_of_an_interrupted_run_are_left_to_whoever_reads_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(t: float, h: float, state: Any) -> None:
+        if t > 4.0:
+            raise KeyboardInterrupt
+
+    def interrupted(*args: Any, **options: Any) -> srm.Solution:
+        return simulate(*args, **options | {"progress": interrupt})
+
+    simulate, out = srm.simulate, tmp_path / "run.npz"
+    monkeypatch.setattr(srm, "simulate", interrupted)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "srm_mbs.integration.singular_passages.find_crossings",
+            lambda *_: pytest.fail("looked for"),
+        )
+        output = run("-v", "simulate", "slider_crank", "--out", out, status=1)
+    assert row(output, "status") == "interrupted"
+    assert row(output, "written") == str(out)
+    assert "singular passages" not in output
+    assert len(srm.load_solution(out).crossings) == 2
+
+
+# -- plot and play ----------------------------------------------------------------------------
+
+
+def test_plot_writes_beside_the_run_unless_told_otherwise(saved_run: Path, tmp_path: Path) -> None:
+    beside, other = saved_run.with_suffix(".png"), tmp_path / "drift.pdf"
+    assert run("plot", saved_run) == f"written: {beside}\n"
+    assert run("plot", saved_run, "--out", other) == f"written: {other}\n"
+    assert beside.stat().st_size > 5000
+    assert other.stat().st_size > 5000
+
+
+@POSIX
+def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> None:
+    process = subprocess.Popen(
+        command("play", saved_run),
+        cwd=ROOT,
+        env=os.environ | {"BROWSER": "true"},
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    with process:
+        next(line for line in process.stderr if "slider_crank is played at http://" in line)
+        process.send_signal(signal.SIGINT)
+        messages = process.communicate(timeout=120)[1]
+    assert process.returncode == 0, messages
+    assert "Traceback" not in messages
+
+
+# -- bad input --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("args", "start"),
+    [
+        (("info", "nonsense"), "error: there is no bundled mechanism 'nonsense'. Known: "),
+        (("info", "nonsense.toml"), "error: nonsense.toml: there is no such file"),
+        (("simulate", "four_bar", "--t-end", 0), "error: --t-end: "),
+        (("simulate", "four_bar", "--t-end", "inf"), "error: --t-end: "),
+        (("simulate", "four_bar", "--rtol", -1), "error: --rtol: "),
+        (("simulate", "four_bar", "--atol", 0), "error: --atol: "),
+        (("simulate", "four_bar", "--step", "nan"), "error: --step: "),
+        (("simulate", "four_bar", "--method", "rattle"), "error: --method: "),
+        (("simulate", "four_bar", "--tableau", "rk5"), "error: --tableau: "),
+        (("simulate", "four_bar", "--tableau", "erk4"), "error: --tableau: "),
+        (("simulate", "four_bar", "--backend", "fortran"), "error: --backend: "),
+        (
+            ("simulate", "four_bar", "--image", "a.png", "--at", 11),
+            "error: --at: 11 s lies outside",
+        ),
+        (("plot", "nonsense.npz"), "error: nonsense.npz: there is no such file"),
+        (("play", "nonsense.npz"), "error: nonsense.npz: there is no such file"),
+        (("plot", "none/run.npz"), "error: none/run.npz: there is no such file"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(args: tuple[object, ...], start: str) -> None:
+    output = run(*args, status=2)
+    assert error_line(output).startswith(start)
+    assert output.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "args", [("simulate",), ("simulate", "four_bar", "--rtol", "x"), ("nonsense",), ("info", "-x")]
+)
+def test_wrong_usage_has_status_2(args: tuple[str, ...]) -> None:
+    assert "Usage: " in run(*args, status=2)
+
+
+def test_file_of_another_type_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "robot.dae"
+    path.write_text("<COLLADA/>")
+    line = error_line(run("simulate", path, status=2))
+    assert line.startswith(f"error: {path}: ")
+    assert "<COLLADA>" in line
+
+
+def test_error_in_a_description_names_file_and_key(describe: Any) -> None:
+    path = describe(('type = "point" ', 'type = "weld" '))
+    line = error_line(run("info", path, status=2))
+    assert line.startswith(f"error: {path}: loop[0].type: there is no closure type 'weld'. ")
+
+
+def test_loops_that_cannot_close_are_bad_input_that_names_the_file(describe: Any) -> None:
+    path = describe(
+        ("q = { crank = 1.0 }", "q = { crank = 1.0, coupler = 1.0, rocker = 1.0 }"),
+        ("coupler = -0.674", ""),
+        ("rocker = 1.413", ""),
+    )
+    for name in ("info", "simulate"):
+        assert error_line(run(name, path, status=2)).startswith(f"error: {path}: ")
+
+
+def test_plot_refuses_an_unknown_format(saved_run: Path) -> None:
+    line = error_line(run("plot", saved_run, "--out", "drift.gif", status=2))
+    assert line.startswith("error: drift.gif: --out: the suffix '.gif' is not known here")
+
+
+def test_something_else_than_a_saved_run_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    path.write_text("not a run")
+    line = error_line(run("plot", path, status=2))
+    assert line.startswith(f"error: {path}: it is not a saved run")
+    assert not path.with_suffix(".png").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "problem"),
+    [
+        ("--out", "run.txt", "the suffix '.txt' is not known here. Use .npz"),
+        ("--plot", "run.gif", "the suffix '.gif' is not known here. Use .png or .pdf or .svg"),
+        ("--plot", "run", "the suffix '' is not known here"),
+        ("--csv", "run.xls", "the suffix '.xls' is not known here. Use .csv"),
+        ("--html", "run.js", "the suffix '.js' is not known here. Use .html or .htm"),
+        ("--out", "none/run.npz", "there is no folder"),
+        ("--plot", "none/run.png", "there is no folder"),
+        ("--html", "none/run.html", "there is no folder"),
+        ("--out", "folder.npz", "it is a folder"),
+    ],
+)
+def test_output_that_cannot_be_written_is_refused_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, name: str, problem: str
+) -> None:
+    monkeypatch.setattr(srm, "load", lambda _: pytest.fail("the run was about to start"))
+    (tmp_path / "folder.npz").mkdir()
+    path = tmp_path / name
+    line = error_line(run("simulate", "slider_crank", option, path, status=2))
+    assert line.startswith(f"error: {path}: {option}: {problem}")
+
+
+@pytest.mark.skipif(
+    os.name != "posix" or os.geteuid() == 0, reason="the superuser may write anywhere"
+)
+def test_folder_without_permission_is_refused_before_the_run(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        path = tmp_path / "run.npz"
+        line = error_line(run("simulate", "slider_crank", "--out", path, status=2))
+        assert line.startswith(f"error: {path}: --out: it cannot be written")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_file_that_cannot_be_written_after_all_does_not_lose_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object, path: Path) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("srm_mbs.simulation.result.Solution.save", full)
+    out, plot = tmp_path / "run.npz", tmp_path / "run.png"
+    output = run("simulate", "four_bar", "--t-end", 0.1, "--out", out, "--plot", plot, status=2)
+    assert error_line(output).startswith(
+        f"error: {out}: it cannot be written: No space left on device. Check the folder"
+    )
+    assert row(output, "written") == str(plot)
+    assert plot.stat().st_size > 5000
+
+
+# -- as a shell sees it -----------------------------------------------------------------------
+
+
+def test_results_go_to_standard_output_and_nothing_else_does() -> None:
+    done = run_apart("simulate", "slider_crank", "--t-end", 1)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert row(done.stdout, "status") == "finished"
+    assert "\x1b" not in done.stdout
+
+
+def test_piped_errors_are_not_wrapped_to_the_width_of_a_terminal(describe: Any) -> None:
+    path = describe(("[initial.guess]", "[initial.gues]"))
+    done = run_apart("info", path, COLUMNS="40")
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: {path}: initial.gues: unknown key 'gues'. Known: ")
+
+
+def test_piped_tables_are_not_wrapped_to_the_width_of_a_terminal() -> None:
+    done = run_apart("models", COLUMNS="40")
+    assert len(done.stdout.splitlines()) == len(srm.bundled_models()) + 1
+
+
+def test_verbose_logs_to_standard_error() -> None:
+    done = run_apart("-v", "info", "four_bar")
+    assert done.returncode == 0
+    assert done.stdout == run("info", "four_bar")  # both streams: quiet without it
+    assert "info: four_bar: 1 degrees of freedom, rank 2\n" in done.stderr
+
+
+@POSIX
+def test_reader_that_closes_the_pipe_early_causes_no_complaint() -> None:
+    with subprocess.Popen(
+        command("models"), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("3", "3")])
+def test_the_command_line_keeps_blas_to_one_thread_unless_told_otherwise(
+    given: str | None, used: str
+) -> None:
+    code = (
+        "import sys, srm_mbs.cli.app, os\n"
+        "assert 'numpy' not in sys.modules, 'too late'\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    plain = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+    environment = plain if given is None else plain | {"OPENBLAS_NUM_THREADS": given}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == used
+
+
+def test_rounding_of_the_assembly_is_shown_as_zero() -> None:
+    mechanism = srm.load("four_bar")
+    q = np.array([1.0, -3e-29, 2e-13])
+    noisy = srm.Mechanism(mechanism.model, q0=q, v0=np.array([1e-14, 0.5, -1e-20]))
+    shown = [row[2:] for row in joint_rows(noisy)]
+    assert shown == [("1 rad", "0 rad/s"), ("0 rad", "0.5 rad/s"), ("0 rad", "0 rad/s")]

@@ -1,0 +1,101 @@
+"""The commands around the simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from tests.cli.test_cli import error_line, row, run
+
+pytestmark = pytest.mark.filterwarnings("ignore:zmq.eventloop:DeprecationWarning")
+
+
+def test_modes_lists_what_closes_and_how_often_it_was_found() -> None:
+    output = run("modes", "four_bar", "--hold", "crank=1.0", "--starts", 20)
+    lines = output.splitlines()
+    assert lines[0] == "held: crank"
+    assert len(lines) == 4
+    assert "1 rad  -0.674279 rad  1.41339 rad" in lines[2]
+    assert " of 20 " in lines[3]
+    assert run("modes", "five_bar", "--starts", 10).startswith("held: crank_left, crank_right\n")
+    assert "no closed configuration" in run(
+        "modes", "four_bar", "--hold", "rocker=3", "--starts", 5, status=1
+    )
+
+
+def test_equilibrium_prints_stability_and_what_holds() -> None:
+    output = run("equilibrium", "four_bar")
+    found = srm.equilibrium(srm.load("four_bar"))
+    frequency = np.sqrt(found.eigenvalues[0]) / (2.0 * np.pi)
+    assert row(output, "equilibrium") == "stable"
+    assert row(output, "small motion") == f"swings with {frequency:.6g} Hz"
+    assert row(output, "crank") == f"{found.q[0]:.6g} rad"
+    output = run("equilibrium", "four_bar", "--nearest")
+    assert row(output, "equilibrium") == "unstable"
+    assert row(output, "small motion").startswith("leaves with")
+    held = run("equilibrium", "four_bar", "--hold", "crank=0.5")
+    force = srm.equilibrium(srm.load("four_bar"), {"crank": 0.5}, hold="crank").holding["crank"]
+    assert row(held, "to hold crank") == f"{force[0]:.6g} N m"
+    assert row(held, "crank") == "0.5 rad"
+    assert "on a singular configuration" in run("equilibrium", "slider_crank")
+
+
+def test_linearise_prints_matrices_and_modes_and_writes_a_page(tmp_path: Path) -> None:
+    page = tmp_path / "mode.html"
+    output = run(
+        *("linearise", "four_bar", "--at", "equilibrium", "--coordinate", "crank"),
+        *("--input", "crank", "--html", page),
+    )
+    assert page.stat().st_size > 100_000
+    found = srm.linearise(
+        srm.load("four_bar"),
+        srm.equilibrium(srm.load("four_bar")).q,
+        coordinates="crank",
+    )
+    assert row(output, "d/dt rate of crank").split()[0] == f"{found.A[1, 0]:.6g}"
+    assert "force of crank" in output
+    assert "force of rocker" not in output
+    assert row(output, "0").split()[1] == f"{found.frequencies[0]:.6g}"
+    assert "rate of coupler" in run("linearise", "four_bar")
+    assert "drift" in run("linearise", "four_bar", "--at", "rest")
+
+
+def test_drag_says_how_far_it_came(tmp_path: Path) -> None:
+    page = tmp_path / "drag.html"
+    output = run("drag", "slider_crank", "crank=5,0", "--html", page)
+    assert row(output, "path") == "all values were reached"
+    assert output.count("singular configuration") == 2
+    assert row(output, "crank") == "0 rad"
+    assert page.exists()
+    output = run("drag", "four_bar", "rocker=3", status=1)
+    assert row(output, "path").startswith("no further than rocker = 2.74589")
+
+
+def test_simulate_prints_the_balance_when_asked() -> None:
+    output = run("simulate", "squeezing_mechanism", "--t-end", 0.01, "--balance")
+    assert row(output, "work of force motor").endswith(" J")
+    assert "open by at most" in row(output, "balance")
+    assert "balance" not in run("simulate", "four_bar", "--t-end", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("modes", "four_bar", "--hold", "crank=x"), "'crank=x' is not a joint with a value"),
+        (("modes", "four_bar", "--hold", "crank=1,2"), "a held joint takes one value"),
+        (("modes", "four_bar", "--seed", -1), "--seed: seed = -1 is not a natural number"),
+        (("modes", "four_bar", "--hold", "crank=1", "--hold", "crank"), "'crank' is given twice"),
+        (("drag", "four_bar", "crank=1", "crank=2"), "joint 'crank' is given twice"),
+        (("equilibrium", "four_bar", "--hold", "wheel"), "there is no joint 'wheel'"),
+        (("linearise", "four_bar", "--at", "here"), "there is no state 'here'"),
+        (("linearise", "four_bar", "--html", "x.txt"), "the suffix '.txt' is not known here"),
+        (("linearise", "four_bar", "--mode", "1"), "--mode: there is no page that could show it"),
+        (("drag", "four_bar", "crank"), "joint 'crank' has no value"),
+        (("drag", "four_bar", "crank=nan"), "JOINT=VALUE[,VALUE...]: joint 'crank' cannot be"),
+    ],
+)
+def test_bad_input_is_one_line_with_status_2(arguments, message: str) -> None:
+    assert message in error_line(run(*arguments, status=2))

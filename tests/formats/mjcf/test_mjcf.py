@@ -1,0 +1,306 @@
+"""MJCF files against MuJoCo itself: M, bias, springs and residuals at random configurations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import tomli_w
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.formats.toml.description import parse_description
+from srm_mbs.formats.urdf.parser import build_urdf
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.visualization.animation.shapes import visuals_of
+from tests.integration.kernel.test_kernel import agree
+from tests.support.lockstep import compare
+from tests.support.mjcf_files import (
+    BODY,
+    FOUR_BAR,
+    TREE,
+    TWO,
+    TWO_LOOPS,
+    file,
+    model_of,
+    translated,
+)
+from tests.support.sdf_files import cassie
+
+mujoco = pytest.importorskip("mujoco")
+
+FILES = {"tree": TREE, "four_bar": FOUR_BAR, "two_loops": TWO_LOOPS}
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo writes its warnings to a file where it runs."""
+    monkeypatch.chdir(tmp_path)
+
+
+class Twins:
+    """The translated file and MuJoCo's model, in the same state."""
+
+    def __init__(self, text: str) -> None:
+        made = self.made = translated(text)
+        self.entries = made.entries
+        self.model = build_urdf(made.urdf, "x.urdf", made.entries.get("base", "fixed")).model
+        self.model.gravity.linear = np.array(made.entries["gravity"])
+        keys = {key: value for key, value in made.entries.items() if key != "loop"}
+        toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})
+        forces = parse_description(toml, "x.toml").force_elements(None)
+        self.forces = ForceKinematics(self.model, forces)
+        self.theirs = mujoco.MjModel.from_xml_string(text)
+        self.theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self.data, self.state = self.model.createData(), mujoco.MjData(self.theirs)
+
+    def put(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Both in the state (q, v) of ours; returns T (nv, nv): their rates are T times ours, up
+        to what :meth:`bias` adds for a free joint."""
+        model, theirs, state = self.model, self.theirs, self.state
+        T = np.zeros((model.nv, model.nv))
+        for i in range(theirs.njnt):
+            name = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_JOINT, i)
+            index = model.getJointId(name)
+            joint = model.joints[index]
+            at_q, at_v = theirs.jnt_qposadr[i], theirs.jnt_dofadr[i]
+            mine = q[joint.idx_q : joint.idx_q + joint.nq]
+            own = slice(joint.idx_v, joint.idx_v + joint.nv)
+            T[at_v : at_v + joint.nv, own] = np.eye(joint.nv)
+            if joint.nq == 1:
+                state.qpos[at_q] = theirs.qpos0[at_q] + mine[0]
+            elif joint.nq == 4:
+                state.qpos[at_q : at_q + 4] = mine[[3, 0, 1, 2]]
+            else:
+                pose = model.jointPlacements[index] * pin.XYZQUATToSE3(mine)
+                state.qpos[at_q : at_q + 7] = pin.SE3ToXYZQUAT(pose)[[0, 1, 2, 6, 3, 4, 5]]
+                T[at_v : at_v + 3, own][:, :3] = pose.rotation
+        state.qvel[:] = T @ v
+        mujoco.mj_forward(theirs, state)
+        pin.computeAllTerms(model, self.data, q, v)
+        pin.computeJointJacobians(model, self.data, q)
+        pin.updateFramePlacements(model, self.data)
+        return T
+
+    def body(self, name: str) -> tuple[pin.SE3, pin.SE3]:
+        """Placement of a body, ours and theirs."""
+        ours = self.data.oMf[self.model.getFrameId(name, pin.FrameType.BODY)]
+        i = mujoco.mj_name2id(self.theirs, mujoco.mjtObj.mjOBJ_BODY, name)
+        return ours, pin.SE3(self.state.xmat[i].reshape(3, 3), self.state.xpos[i])
+
+    def anchor(self, entry: dict[str, Any]) -> pin.SE3:
+        joint, inside = Anchor(**entry).resolve(self.model)
+        return self.data.oMi[joint] * inside
+
+    def residuals(self) -> list[FloatArray]:
+        """What MuJoCo's residuals of the equality constraints should be."""
+        out = []
+        for loop in self.entries.get("loop", ()):
+            if loop["type"] == "coupling":
+                first, second = (
+                    self.q[self.model.joints[self.model.getJointId(name)].idx_q]
+                    for name in loop["joints"]
+                )
+                out.append(np.array([first - loop["ratio"] * second - loop["offset"]]))
+                continue
+            a, b = self.anchor(loop["a"]), self.anchor(loop["b"])
+            out.append(a.translation - b.translation)
+            if loop["type"] == "frame":
+                angle = np.linalg.norm(pin.log3(b.rotation.T @ a.rotation))
+                out.append(np.array([np.sin(0.5 * angle)]))
+        return out
+
+    q: FloatArray
+
+
+def random_states(twins: Twins, count: int = 5) -> list[tuple[FloatArray, FloatArray]]:
+    model = twins.model
+    rng = np.random.default_rng(4)
+    return [
+        (
+            pin.integrate(model, pin.neutral(model), rng.uniform(-1.2, 1.2, model.nv)),
+            rng.standard_normal(model.nv),
+        )
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
+    twins = Twins(FILES[name])
+    model, theirs, state = twins.model, twins.theirs, twins.state
+    for q, v in random_states(twins):
+        T = twins.put(q, v)
+        for i in range(1, theirs.nbody):
+            body = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_BODY, i)
+            ours, other = twins.body(body)
+            np.testing.assert_allclose(ours.homogeneous, other.homogeneous, atol=1e-12)
+        M = np.zeros((theirs.nv, theirs.nv))
+        mujoco.mj_fullM(theirs, state, M)
+        ours = np.triu(twins.data.M) + np.triu(twins.data.M, 1).T
+        np.testing.assert_allclose(ours, T.T @ M @ T, rtol=1e-10, atol=1e-12)
+        # The linear rate of a free joint is in world axes there: it turns against ours.
+        turning = np.zeros(model.nv)
+        for joint in model.joints:
+            if joint.shortname() == "JointModelFreeFlyer":
+                own = slice(joint.idx_v, joint.idx_v + 3)
+                turning[own] = np.cross(v[own.stop : own.stop + 3], v[own])
+        bias = T.T @ (state.qfrc_bias - state.qfrc_passive) + ours @ turning
+        mine = twins.data.nle + model.damping * v - twins.forces.generalised(twins.data, q, v, 0.0)
+        np.testing.assert_allclose(mine, bias, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["four_bar", "two_loops"])
+def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
+    twins = Twins(FILES[name])
+    state = twins.state
+    for q, v in random_states(twins):
+        twins.put(q, v)
+        twins.q = q
+        expected = []
+        kind = state.efc_type[: state.nefc]
+        rows = state.efc_pos[: state.nefc][kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
+        at = 0
+        for loop in twins.entries["loop"]:
+            count = {"point": 3, "frame": 6, "coupling": 1}[loop["type"]]
+            own = rows[at : at + count]
+            at += count
+            expected.append(own[:3])
+            if count == 6:
+                expected.append(np.array([np.linalg.norm(own[3:])]))
+        assert at == rows.size
+        for ours, other in zip(twins.residuals(), expected, strict=True):
+            np.testing.assert_allclose(ours, other, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_file_loads_closes_and_runs_alike_on_both_backends(name: str, tmp_path: Path) -> None:
+    """With armatures and dampers, which both must see."""
+    path = tmp_path / "robot.xml"
+    path.write_text(FILES[name].replace('axis="0 1 0"', 'axis="0 1 0" armature="0.2" damping="1"'))
+    mechanism = srm.load(path)
+    assert mechanism.model.armature.any()
+    agree(compare(mechanism, 0.5, rtol=1e-10))
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        '<compiler settotalmass="7"/>',
+        '<compiler boundmass="20" boundinertia="0.5"/>',
+        '<compiler inertiagrouprange="1 2"/><default><geom group="1"/></default>',
+        '<compiler inertiafromgeom="true" angle="radian"/>',
+    ],
+)
+def test_masses_are_those_of_mujocos_compiler(more: str) -> None:
+    text = file(TWO.replace("<geom", '<inertial pos="0 0 0.1" mass="3" diaginertia="1 1 1"/><geom'))
+    text = text.replace("<worldbody>", more + "<worldbody>")
+    ours, theirs = model_of(text), mujoco.MjModel.from_xml_string(text)
+    for i, joint in ((1, "j"), (2, "k")):
+        inertia = ours.inertias[ours.getJointId(joint)]
+        np.testing.assert_allclose(inertia.mass, theirs.body_mass[i], rtol=1e-12)
+        np.testing.assert_allclose(inertia.lever, theirs.body_ipos[i], atol=1e-12)
+        np.testing.assert_allclose(
+            np.linalg.eigvalsh(inertia.inertia), np.sort(theirs.body_inertia[i]), rtol=1e-12
+        )
+
+
+def test_one_free_body_is_a_floating_robot_at_its_pose(tmp_path: Path) -> None:
+    body = BODY.format("base", "x").replace('<joint name="x"/>', "<freejoint/>")
+    body = body.replace('name="base"', 'name="base" pos="1 2 3" euler="10 20 30"')
+    arm = BODY.format("arm", "j")
+    path = tmp_path / "robot.xml"
+    path.write_text(file(body.replace("</body>", arm + "</body>")))
+    mechanism = srm.load(path)
+    assert mechanism.joint_names == ("root_joint", "j")
+    theirs = mujoco.MjModel.from_xml_string(path.read_text())
+    state = mujoco.MjData(theirs)
+    mujoco.mj_forward(theirs, state)
+    data = mechanism.model.createData()
+    pin.framesForwardKinematics(mechanism.model, data, mechanism.q0)
+    for i, name in ((1, "base"), (2, "arm")):
+        found = data.oMf[mechanism.model.getFrameId(name, pin.FrameType.BODY)]
+        np.testing.assert_allclose(found.translation, state.xpos[i], atol=1e-14)
+        np.testing.assert_allclose(found.rotation.ravel(), state.xmat[i], atol=1e-14)
+
+
+def test_the_inertia_of_an_exact_mesh_is_that_of_mujoco(tmp_path: Path) -> None:
+    mesh = cassie("cassie").parents[1] / "meshes" / "knee.stl"
+    geom = '<geom type="mesh" mesh="knee" pos="0.1 0 0" euler="30 0 0" density="500"/>'
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        '<mujoco><asset><mesh name="knee" inertia="exact" scale="1 2 1" '
+        f'file="{mesh}"/></asset><worldbody><body name="knee"><joint name="j"/>{geom}</body>'
+        '<body name="wall"><geom type="mesh" mesh="knee"/></body></worldbody></mujoco>'
+    )
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    inertia = srm.load(path).model.inertias[1]
+    np.testing.assert_allclose(inertia.mass, theirs.body_mass[1], rtol=1e-12)
+    np.testing.assert_allclose(inertia.lever, theirs.body_ipos[1], atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(inertia.inertia), np.sort(theirs.body_inertia[1]), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [
+        'refpos="0.3 -0.2 0.5" refquat="0.6 0.8 0 0" scale="2 2 2"',
+        'refpos="0.3 -0.2 0.5" scale="2 0.5 1"',
+        'refquat="2 0 0 1"',
+    ],
+)
+def test_a_mesh_that_is_moved_first_is_drawn_where_mujoco_has_it(
+    tmp_path: Path, moved: str
+) -> None:
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
+    sides = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+    (tmp_path / "tetra.obj").write_text(vertices + sides)
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        f'<mujoco><asset><mesh name="t" file="tetra.obj" {moved}/></asset><worldbody>'
+        '<body name="b" pos="0 0 1"><joint name="j"/><inertial pos="0 0 0" mass="1" '
+        'diaginertia="1 1 1"/><geom type="mesh" mesh="t" pos="0.1 0.2 0.3" quat="0.8 0 0.6 0"/>'
+        "</body></worldbody></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_path(str(path))
+    state = mujoco.MjData(model)
+    mujoco.mj_forward(model, state)
+    own = model.mesh_vert.reshape(-1, 3)
+    theirs = state.geom_xpos[0] + own @ state.geom_xmat[0].reshape(3, 3).T
+    mechanism = srm.load(path)
+    (visual,) = visuals_of(mechanism)
+    data = mechanism.model.createData()
+    pin.forwardKinematics(mechanism.model, data, mechanism.q0)
+    place = data.oMi[visual.joint] * visual.placement
+    ours = np.array([place.act(x) for x in np.array(visual.shape.vertices)])
+    apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
+    assert apart.min(axis=0).max() < 1e-6
+    assert apart.min(axis=1).max() < 1e-6
+
+
+def test_what_a_mesh_cannot_be_drawn_with_is_noted(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        '<mujoco><asset><mesh name="t" file="t.obj" refquat="1 1 0 0" scale="1 2 1"/></asset>'
+        f"<worldbody>{BODY.format('one', 'j')}</worldbody></mujoco>"
+    )
+    assert any("refquat and an unequal scale" in note for note in srm.load(path).notes)
+
+
+@pytest.mark.parametrize("sequence", ["xyz", "XYZ", "zYx", "XyZ", "yXy"])
+def test_euler_angles_turn_about_moving_and_fixed_axes_as_in_mujoco(sequence: str) -> None:
+    twins = Twins(
+        file(
+            BODY.format("one", "j").replace("<body", '<body euler="20 -35 50"'),
+            f'<compiler eulerseq="{sequence}"/>',
+        )
+    )
+    twins.put(np.zeros(1), np.zeros(1))
+    ours, theirs = twins.body("one")
+    np.testing.assert_allclose(ours.homogeneous, theirs.homogeneous, atol=1e-14)

@@ -1,0 +1,510 @@
+"""SDF files: poses, joints and graphs are what the file says, checked by naive references."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.formats.graph.joint_graph import Joint, NoTreeError, spanning_tree
+from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, rpy
+from srm_mbs.formats.sdf.reader import translate
+from srm_mbs.formats.translation import Options, Translation
+from srm_mbs.formats.urdf.parser import build_urdf
+from tests.support.sdf_files import CASSIES, cassie, four_bar, joint, link, sdf
+
+
+def translated(text: str, *cut: str, file: str = "robot.sdf") -> Translation:
+    return translate(text, file, Options(cut))
+
+
+def tree(text: str, *cut: str) -> pin.Model:
+    made = translated(text, *cut)
+    return build_urdf(made.urdf, "robot.urdf", made.entries.get("base", "fixed")).model
+
+
+def loaded(folder: Path, text: str, **options: Any) -> srm.Mechanism:
+    path = folder / "robot.sdf"
+    path.write_text(text)
+    return srm.load(path, **options)
+
+
+def placed(model: pin.Model, name: str, q: FloatArray | None = None) -> pin.SE3:
+    """Placement in the world of the link ``name``."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model) if q is None else q)
+    return data.oMf[model.getFrameId(name, pin.FrameType.BODY)].copy()
+
+
+def at(x: float, y: float, z: float, r: float = 0.0, p: float = 0.0, w: float = 0.0) -> pin.SE3:
+    return pin.SE3(pin.rpy.rpyToMatrix(r, p, w), np.array([x, y, z]))
+
+
+def same(a: pin.SE3, b: pin.SE3, tolerance: float = 1e-12) -> None:
+    np.testing.assert_allclose(a.homogeneous, b.homogeneous, rtol=0.0, atol=tolerance)
+
+
+# Poses --------------------------------------------------------------------------------------
+
+ONE, TWO, THREE = "0.1 0.2 0.3 0.4 -0.5 0.6", "-0.3 0.1 0.5 1.2 0.3 -0.7", "0 0.4 -0.2 2 1.1 0.1"
+
+
+def of(text: str) -> pin.SE3:
+    return at(*map(float, text.split()))
+
+
+def test_links_are_placed_relative_to_frames_joints_and_nested_models() -> None:
+    text = sdf(
+        f"<pose>{THREE}</pose>",
+        link("base", ONE),
+        '<frame name="mount" attached_to="base"><pose>' + TWO + "</pose></frame>",
+        f'<frame name="free"><pose relative_to="inner">{TWO}</pose></frame>',
+        f'<link name="arm"><pose relative_to="mount">{ONE}</pose></link>',
+        f'<link name="hand"><pose relative_to="wrist">{TWO}</pose></link>',
+        f'<link name="far"><pose relative_to="free">{THREE}</pose></link>',
+        joint("hinge", "revolute", "base", "arm"),
+        joint("wrist", "revolute", "mount", "hand", f'<pose relative_to="arm">{THREE}</pose>'),
+        joint("inside", "revolute", "hand", "inner::box"),
+        joint("weld", "fixed", "base", "far", axis=""),
+        f'<model name="inner"><pose relative_to="mount">{ONE}</pose>{link("box", TWO)}</model>',
+        f'<model name="outer"><pose>{ONE}</pose><model name="deep"><pose>{TWO}</pose>'
+        f"{link('end', THREE)}</model></model>",
+        joint("deep_weld", "fixed", "base", "outer::deep::end", axis=""),
+    )
+    model = tree(text)
+    world = of(THREE)
+    base = world * of(ONE)
+    arm = base * of(TWO) * of(ONE)
+    inner = base * of(TWO) * of(ONE)
+    for name, expected in {
+        "base": base,
+        "arm": arm,
+        "hand": arm * of(THREE) * of(TWO),
+        "inner::box": inner * of(TWO),
+        "far": inner * of(TWO) * of(THREE),
+        "outer::deep::end": world * of(ONE) * of(TWO) * of(THREE),
+    }.items():
+        same(placed(model, name), expected)
+
+
+def test_poses_may_be_in_degrees_or_quaternions() -> None:
+    quaternion = pin.Quaternion(pin.rpy.rpyToMatrix(0.3, 0.2, -0.4))
+    x, y, z, w = quaternion.coeffs()
+    text = sdf(
+        '<link name="base"><pose degrees="true">1 2 3 30 -40 50</pose></link>',
+        '<link name="arm"><pose relative_to="base" rotation_format="quat_xyzw">'
+        f"1 0 0 {x} {y} {z} {w}</pose></link>",
+        joint("hinge", "revolute", "base", "arm"),
+    )
+    model = tree(text)
+    base = at(1, 2, 3, *np.deg2rad([30.0, -40.0, 50.0]))
+    same(placed(model, "base"), base)
+    same(placed(model, "arm"), base * at(1, 0, 0, 0.3, 0.2, -0.4))
+
+
+@pytest.mark.parametrize(
+    ("version", "inside", "turn"),
+    [
+        ("1.9", "", of(ONE) * of(TWO) * of(THREE)),
+        ("1.9", ' expressed_in="__model__"', pin.SE3.Identity()),
+        ("1.9", ' expressed_in="base"', of(ONE)),
+        ("1.6", "", of(ONE) * of(TWO) * of(THREE)),
+        ("1.4", "", pin.SE3.Identity()),
+    ],
+)
+def test_an_axis_is_expressed_in_the_frame_that_the_version_says(
+    version: str, inside: str, turn: pin.SE3
+) -> None:
+    arm = of(ONE) * of(TWO)
+    at_arm = numbers([*arm.translation, *rpy(arm.rotation)])
+    text = sdf(
+        link("base", ONE),
+        link("arm", at_arm),
+        joint("hinge", "revolute", "base", "arm", f"<pose>{THREE}</pose>", axis="1 2 -2"),
+        version=version,
+    ).replace("<xyz>", f"<xyz{inside}>")
+    model = tree(text)
+    data = model.createData()
+    J = pin.computeFrameJacobian(
+        model,
+        data,
+        pin.neutral(model),
+        model.getFrameId("arm", pin.FrameType.BODY),
+        pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+    )
+    np.testing.assert_allclose(J[3:, -1], turn.rotation @ [1 / 3, 2 / 3, -2 / 3], atol=1e-12)
+
+
+def test_an_older_axis_may_be_in_the_parent_models_frame() -> None:
+    text = sdf(
+        link("base", ONE),
+        link("arm", TWO),
+        joint(
+            "hinge",
+            "revolute",
+            "base",
+            "arm",
+            "|<use_parent_model_frame>1</use_parent_model_frame>",
+            axis="0 0 1",
+        ),
+        version="1.6",
+    )
+    model = tree(text)
+    q = pin.neutral(model)
+    q[-1] = 0.7
+    turned = placed(model, "arm", q).rotation @ of(TWO).rotation.T
+    np.testing.assert_allclose(turned, pin.rpy.rpyToMatrix(0.0, 0.0, 0.7), atol=1e-12)
+
+
+def test_a_joint_and_a_link_of_an_older_file_may_have_one_name() -> None:
+    text = sdf(link("arm", ONE), joint("arm", "revolute", "world", "arm"), version="1.6")
+    assert list(tree(text).names)[1:] == ["arm"]
+    with pytest.raises(srm.InputError, match="are called 'arm'"):
+        tree(text.replace("1.6", "1.9"))
+
+
+@pytest.mark.parametrize("angle", [0.5 * np.pi, 0.5 * np.pi - 1e-9, 1.5708, -0.5 * np.pi, 0.3])
+def test_roll_pitch_and_yaw_are_accurate_at_any_pitch(angle: float) -> None:
+    rotation = pin.rpy.rpyToMatrix(0.4, angle, -1.3)
+    np.testing.assert_allclose(pin.rpy.rpyToMatrix(*rpy(rotation)), rotation, atol=1e-15)
+
+
+# Joints -------------------------------------------------------------------------------------
+
+MOTIONS = {
+    "revolute": lambda q: at(0, 0, 0, 0, 0, q[0]),
+    "prismatic": lambda q: at(0, 0, q[0]),
+    "screw": lambda q: at(0, 0, 0.2 * q[0] / (2 * np.pi), 0, 0, q[0]),
+    "universal": lambda q: at(0, 0, 0, 0, 0, q[0]) * at(0, 0, 0, q[1]),
+    "ball": lambda q: pin.SE3(pin.Quaternion(q).matrix(), np.zeros(3)),
+    "fixed": lambda q: pin.SE3.Identity(),
+}
+SECOND = {"universal": "<axis2><xyz>1 0 0</xyz></axis2>"}
+PITCH = {"screw": "<screw_thread_pitch>0.2</screw_thread_pitch>"}
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("kind", MOTIONS)
+def test_a_joint_moves_its_child_against_its_parent_whichever_is_nearer_to_the_root(
+    kind: str, backwards: bool
+) -> None:
+    """The moving joint's parent is not the root's side if ``backwards``."""
+    inside = f"<pose>{THREE}</pose>" + SECOND.get(kind, "") + PITCH.get(kind, "")
+    first, second = ("hand", "arm") if backwards else ("arm", "hand")
+    text = sdf(
+        link("arm", ONE),
+        link("hand", TWO),
+        joint("held", "revolute", "world", "arm"),
+        joint(
+            "moving",
+            kind,
+            first,
+            second,
+            inside,
+            axis="0 0 1" if kind in SECOND | PITCH or kind in ("revolute", "prismatic") else "",
+        ),
+    )
+    model = tree(text)
+    q = pin.neutral(model)
+    rng = np.random.default_rng(1)
+    if kind != "fixed":
+        own = model.joints[model.getJointId("moving")]
+        q[own.idx_q :] = pin.integrate(model, q, rng.uniform(-1.0, 1.0, model.nv))[own.idx_q :]
+    value = q[1:].copy()
+    if backwards and kind == "universal":
+        value = value[::-1]  # the two angles change places
+    if backwards and kind == "ball":
+        value[:3] *= -1.0
+    between = placed(model, first, q).actInv(placed(model, second, q))
+    second_at = of(TWO) if second == "hand" else of(ONE)
+    first_at = of(ONE) if first == "arm" else of(TWO)
+    J = second_at * of(THREE)
+    expected = first_at.actInv(J) * MOTIONS[kind](value) * J.actInv(second_at)
+    same(between, expected)
+
+
+def test_two_axes_that_are_oblique_or_damped_become_two_hinges() -> None:
+    inside = "<axis2><xyz>1 0 1</xyz><dynamics><damping>0.3</damping></dynamics></axis2>"
+    model = tree(
+        sdf(link("arm"), joint("cross", "revolute2", "world", "arm", inside, axis="0 0 1"))
+    )
+    assert list(model.names)[1:] == ["cross", "cross::axis2"]
+    np.testing.assert_array_equal(model.damping, [0.0, 0.3])
+    turn = placed(model, "arm", np.array([0.4, 0.9])).rotation
+    oblique = pin.AngleAxis(0.9, np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)).matrix()
+    np.testing.assert_allclose(turn, pin.rpy.rpyToMatrix(0, 0, 0.4) @ oblique, atol=1e-12)
+
+
+def test_an_older_thread_pitch_counts_turns_as_libsdformat_does() -> None:
+    text = sdf(
+        link("nut"),
+        joint("thread", "screw", "world", "nut", "<thread_pitch>-5</thread_pitch>", axis="0 0 1"),
+        version="1.6",
+    )
+    made = translated(text)
+    model = build_urdf(made.urdf, "robot.urdf", "fixed").model
+    np.testing.assert_allclose(placed(model, "nut", np.array([1.0])).translation, [0, 0, 0.2])
+    assert any("thread_pitch" in note for note in made.notes)
+
+
+def test_masses_and_moments_are_those_of_the_file() -> None:
+    text = sdf(
+        '<link name="arm"><inertial><pose>0.1 0 0.2 0.3 0.4 0</pose><mass>2</mass><inertia>'
+        "<ixx>0.2</ixx><iyy>0.3</iyy><izz>0.4</izz><ixy>0.01</ixy></inertia></inertial></link>",
+        '<link name="bare"/>',
+        joint("hinge", "revolute", "world", "arm"),
+        joint("other", "revolute", "world", "bare"),
+    )
+    made = translated(text)
+    model = build_urdf(made.urdf, "robot.urdf", "fixed").model
+    turn = pin.rpy.rpyToMatrix(0.3, 0.4, 0.0)
+    own = np.array([[0.2, 0.01, 0.0], [0.01, 0.3, 0.0], [0.0, 0.0, 0.4]])
+    arm = model.inertias[model.getJointId("hinge")]
+    assert arm.mass == 2.0
+    np.testing.assert_allclose(arm.lever, [0.1, 0.0, 0.2], atol=1e-15)
+    np.testing.assert_allclose(arm.inertia, turn @ own @ turn.T, atol=1e-15)
+    assert model.inertias[model.getJointId("other")].mass == 1.0
+    assert any("defaults" in note and "'bare'" in note for note in made.notes)
+
+
+def test_a_double_pendulum_accelerates_as_its_equations_say(tmp_path: Path) -> None:
+    """Lagrange's equations of two rods, with a spring, damping and gravity, written out here."""
+    m1, m2, l1, c1, c2, damping, k, rest = 1.3, 0.8, 1.0, 0.45, 0.6, 0.2, 7.0, 0.3
+    spring = f"<spring_stiffness>{k}</spring_stiffness><spring_reference>{rest}</spring_reference>"
+    text = sdf(
+        link("upper", "0 0 2 0 0 0", m1, f"0 0 {-c1} 0 0 0"),
+        link("lower", "0 0 1 0 0 0", m2, f"0 0 {-c2} 0 0 0"),
+        joint("shoulder", "revolute", "world", "upper"),
+        joint(
+            "elbow",
+            "revolute",
+            "upper",
+            "lower",
+            f"|<dynamics><damping>{damping}</damping>{spring}</dynamics>",
+        ),
+    )
+    mechanism = loaded(tmp_path, text, gravity=[0.0, 0.0, -9.81])
+    q, v, g = np.array([0.4, -0.9]), np.array([0.7, 1.6]), 9.81
+    i1, i2 = 0.01 * m1, 0.01 * m2
+    cos, sin = np.cos(q[1]), np.sin(q[1])
+    m12 = i2 + m2 * c2 * (c2 + l1 * cos)
+    M = np.array(
+        [[i1 + i2 + m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2 * cos), m12],
+         [m12, i2 + m2 * c2**2]]
+    )  # fmt: skip
+    h = m2 * l1 * c2 * sin
+    coriolis = np.array([-h * (2 * v[0] * v[1] + v[1] ** 2), h * v[0] ** 2])
+    both = m2 * c2 * np.sin(q.sum())
+    weight = g * np.array([(m1 * c1 + m2 * l1) * np.sin(q[0]) + both, both])
+    elbow = np.array([0.0, -k * (q[1] - rest) - damping * v[1]])
+    expected = np.linalg.solve(M, elbow - coriolis - weight)
+    step = 1e-4
+    run = srm.simulate(mechanism, step, q0=q, v0=v, rtol=1e-12, atol=1e-14)
+    back = srm.simulate(mechanism, 2 * step, q0=q, v0=v, rtol=1e-12, atol=1e-14)
+    found = (4 * run.v[-1] - back.v[-1] - 3 * v) / (2 * step)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+# Graphs -------------------------------------------------------------------------------------
+
+
+def edge(name: str, kind: str, parent: str, child: str, **more: Any) -> Joint:
+    return Joint(name, kind, parent, child, **more)
+
+
+SQUARE = [
+    edge("a", "revolute", "world", "crank"),
+    edge("c", "revolute", "rocker", "coupler"),
+    edge("b", "revolute", "crank", "coupler"),
+    edge("d", "revolute", "rocker", "world"),
+]
+
+
+def test_a_loop_of_equal_joints_is_cut_far_from_the_root() -> None:
+    found = spanning_tree(SQUARE, "world")
+    assert [joint.name for joint in found.cut] == ["b"]
+    assert [joint.name for joint in found.joints] == ["a", "d", "c"]
+    assert found.reversed == ("d",)
+
+
+def test_the_joint_with_the_most_freedom_is_cut() -> None:
+    near = [edge("a", "spherical", "world", "crank"), *SQUARE[1:]]
+    assert [joint.name for joint in spanning_tree(near, "world").cut] == ["a"]
+
+
+def test_a_joint_that_no_closure_can_replace_is_kept() -> None:
+    rubbing = [edge("b", "revolute", "crank", "coupler", friction=0.1), *SQUARE[:2], SQUARE[3]]
+    assert [joint.name for joint in spanning_tree(rubbing, "world").cut] == ["c"]
+
+
+def test_the_users_cut_counts() -> None:
+    found = spanning_tree(SQUARE, "world", ["a"])
+    assert [joint.name for joint in found.joints] == ["d", "c", "b"]
+    assert found.joints[-1].parent == "coupler"
+
+
+@pytest.mark.parametrize(
+    ("cut", "problem"),
+    [
+        (["a", "b"], "separates"),
+        (["e"], "there is no joint 'e'"),
+    ],
+)
+def test_a_cut_that_leaves_no_tree_is_refused(cut: list[str], problem: str) -> None:
+    with pytest.raises(NoTreeError, match=problem):
+        spanning_tree(SQUARE, "world", cut)
+
+
+def test_a_cut_that_leaves_a_loop_is_refused_with_the_proposal(tmp_path: Path) -> None:
+    hinge = joint("e", "revolute", "crank", "beam")
+    ball = joint("f", "ball", "beam", "rocker", "<pose>0 0 1 0 0 0</pose>", axis="")
+    two = link("beam", "0 0 1 0 0 0") + hinge + ball
+    with pytest.raises(srm.InputError, match=r"leaves a loop through joint 'f'.*\['c', 'f'\]"):
+        loaded(tmp_path, four_bar(two), cut=["c"])
+
+
+@pytest.mark.parametrize("cut", ["a", "b", "c", "d"])
+def test_a_four_bar_is_the_same_wherever_it_is_cut(tmp_path: Path, cut: str) -> None:
+    """With a spring and a damper in joint c, which become a bushing where it is cut."""
+    acting = (
+        "|<dynamics><damping>0.4</damping><spring_stiffness>3</spring_stiffness>"
+        "<spring_reference>0.2</spring_reference></dynamics>"
+    )
+    mechanism = loaded(tmp_path, four_bar(closing=acting), cut=[cut])
+    assert mechanism.degrees_of_freedom == 1
+    np.testing.assert_allclose(mechanism.initial_errors[0], 0.0, atol=1e-14)
+    run = srm.simulate(mechanism, 0.5, rtol=1e-10, atol=1e-12)
+    # Of the parallelogram only the angle phi of crank and rocker is left; joint c turns by phi.
+    # Its spring acts from the start: rest 0.2 against q = 0.
+    model = mechanism.model
+    place = placed(model, "crank", run.q[-1])
+    phi = np.arctan2(place.rotation[0, 2], place.rotation[2, 2])
+    from scipy.integrate import solve_ivp
+
+    inertia = 2 * (0.01 + 0.25) + 1.0
+    g = 9.81
+
+    def rate(_: float, y: FloatArray) -> list[float]:
+        moment = g * (0.5 + 1.0 + 0.5) * np.sin(y[0]) - 0.4 * y[1] - 3.0 * (y[0] - 0.2)
+        return [y[1], moment / inertia]
+
+    exact = solve_ivp(rate, (0.0, 0.5), [0.0, 0.0], rtol=1e-12, atol=1e-13).y[0, -1]
+    assert abs(phi) > 0.01
+    np.testing.assert_allclose(phi, exact, rtol=1e-7)
+
+
+def test_friction_in_a_joint_that_must_be_cut_is_refused_by_name(tmp_path: Path) -> None:
+    text = four_bar(closing="|<dynamics><friction>0.1</friction></dynamics>")
+    assert [loop.name for loop in loaded(tmp_path, text).loops] == ["b"]
+    with pytest.raises(srm.InputError, match="joint 'c': it closes a loop and has friction"):
+        loaded(tmp_path, text, cut=["c"])
+
+
+def test_the_root_floats_where_nothing_holds_it_and_starts_at_its_pose(tmp_path: Path) -> None:
+    text = sdf(link("torso", ONE), link("arm", TWO), joint("hinge", "revolute", "torso", "arm"))
+    mechanism = loaded(tmp_path, text)
+    assert mechanism.model.names[1] == "root_joint"
+    same(placed(mechanism.model, "torso", mechanism.q0), of(ONE))
+    same(placed(mechanism.model, "arm", mechanism.q0), of(TWO))
+    held = loaded(tmp_path, text, base="fixed")
+    assert held.model.nv == 1
+    same(placed(held.model, "arm", held.q0), of(TWO))
+
+
+def test_bodies_that_nothing_holds_beside_others_move_freely(tmp_path: Path) -> None:
+    mechanism = loaded(
+        tmp_path, sdf(link("arm"), link("ball", ONE), joint("hinge", "revolute", "world", "arm"))
+    )
+    assert mechanism.joint_names == ("ball::free", "hinge")
+    assert any("moves freely" in note for note in mechanism.notes)
+    same(placed(mechanism.model, "ball", mechanism.q0), of(ONE))
+
+
+def test_a_world_has_gravity_models_and_joints_between_them(tmp_path: Path) -> None:
+    text = (
+        '<sdf version="1.10"><world name="yard"><gravity>0 0 -1.62</gravity><light name="sun"/>'
+        f'<model name="one"><pose>{ONE}</pose>{link("arm", TWO)}'
+        f"{joint('hinge', 'revolute', 'world', 'arm')}</model>"
+        f'<model name="two"><static>1</static>{link("wall", THREE)}</model></world></sdf>'
+    )
+    mechanism = loaded(tmp_path, text)
+    np.testing.assert_array_equal(mechanism.model.gravity.linear, [0.0, 0.0, -1.62])
+    same(placed(mechanism.model, "one::arm", mechanism.q0), of(ONE) * of(TWO))
+    same(placed(mechanism.model, "two::wall"), of(THREE))
+    assert any("light" in note for note in mechanism.notes)
+
+
+def test_an_included_model_is_found_beside_the_file(tmp_path: Path) -> None:
+    folder = tmp_path / "gripper"
+    folder.mkdir()
+    (folder / "model.config").write_text("<model><sdf version='1.9'>own.sdf</sdf></model>")
+    (folder / "own.sdf").write_text(sdf(f"<pose>{TWO}</pose>", link("finger", ONE)))
+    text = sdf(
+        link("base"),
+        joint("weld", "revolute", "base", "left::finger"),
+        "<include><uri>model://gripper</uri><name>left</name><pose>" + THREE + "</pose></include>",
+    )
+    mechanism = loaded(tmp_path, text)
+    same(placed(mechanism.model, "left::finger", mechanism.q0), of(THREE) * of(ONE))
+
+
+def test_a_gearbox_is_a_coupling_of_two_hinges() -> None:
+    gear = (
+        "<gearbox_ratio>3</gearbox_ratio><gearbox_reference_body>base</gearbox_reference_body>"
+        "<axis2><xyz>0 -1 0</xyz></axis2>"
+    )
+    text = sdf(
+        link("base"),
+        link("motor"),
+        link("wheel", "0 0 1 0 0 0"),
+        joint("m", "revolute", "base", "motor"),
+        joint("w", "revolute", "wheel", "base", axis="0 1 0"),
+        joint("gear", "gearbox", "motor", "wheel", gear),
+    )
+    # theta_1 = q_m; theta_2 is the angle of the wheel about -y, where w turns the base about +y
+    # against the wheel: theta_2 = q_w = -3 theta_1.
+    loops = translated(text).entries["loop"]
+    assert loops == [{"name": "gear", "type": "coupling", "joints": ["w", "m"], "ratio": -3.0}]
+
+
+# Cassie -------------------------------------------------------------------------------------
+
+
+def anchored(entry: dict[str, Any]) -> pin.SE3:
+    """Placement of an anchor in its link."""
+    zero = [0.0, 0.0, 0.0]
+    return at(*entry.get("xyz", zero), *entry.get("rpy", zero))
+
+
+@pytest.mark.filterwarnings("ignore:.*triangle inequality:srm_mbs.errors.SrmWarning")
+@pytest.mark.parametrize("name", CASSIES)
+def test_every_cassie_file_is_posed_and_weighs_what_it_says(name: str) -> None:
+    """The files place all links in the model's frame."""
+    path = cassie(name)
+    made = translated(path.read_text(), file=str(path))
+    model = build_urdf(made.urdf, str(path), made.entries.get("base", "fixed")).model
+    root = ElementTree.parse(path).getroot()
+    mass = 0.0
+    for node in root.iter("link"):
+        same(placed(model, node.get("name", "")), of(node.findtext("pose", "")))
+        mass += float(node.findtext("inertial/mass", ""))
+    np.testing.assert_allclose(pin.computeTotalMass(model), mass, rtol=1e-14)
+    joints = [node for node in root.iter("joint") if node.get("type") != "gearbox"]
+    links = len(root.findall("model/link"))
+    cut = [loop for loop in made.entries["loop"] if loop["type"] != "coupling"]
+    hangs = any(node.findtext("parent") == "world" for node in joints)
+    assert len(joints) - len(cut) == (links if hangs else links - 1)
+    # Each closure holds where the file poses the links.
+    for entry in cut:
+        if entry["type"] == "point":
+            a, b = (
+                placed(model, anchor["link"]) * anchored(anchor)
+                for anchor in (entry["a"], entry["b"])
+            )
+            same(a, b)

@@ -1,0 +1,642 @@
+"""Loops that a URDF brings along, in the words of each tool: the closures are what these say."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from tests.formats.test_loading import closure, mass_matrix
+from tests.support.urdf_files import (
+    AXIS,
+    ON_RIM,
+    ON_SHIN,
+    configuration,
+    open_mechanism,
+    placement,
+    relative,
+    text,
+    tree,
+)
+
+SHIN = f'xyz="{text(ON_SHIN[0])}" rpy="{text(ON_SHIN[1])}"'
+RIM = f'xyz="{text(ON_RIM[0])}" rpy="{text(ON_RIM[1])}"'
+DIRECTION = f'<axis xyz="{text(AXIS)}"/>'
+DRAKE = 'xmlns:drake="http://drake.mit.edu"'
+
+
+def urdf_plus(kind: str) -> str:
+    axis = "" if kind in ("fixed", "spherical") else DIRECTION
+    return (
+        f'<loop name="ring" type="{kind}"><predecessor link="shin"><origin {SHIN}/></predecessor>'
+        f'<successor link="rim"><origin {RIM}/></successor>{axis}</loop>'
+    )
+
+
+def isaac(kind: str, second: str = "link2") -> str:
+    axis = "" if kind in ("fixed", "spherical") else DIRECTION
+    return (
+        f'<loop_joint name="ring" type="{kind}"><link1 link="shin" {SHIN}/>'
+        f'<{second} link="rim" {RIM}/>{axis}</loop_joint>'
+    )
+
+
+def urdfdom(kind: str, axes: str = "") -> str:
+    return (
+        f'<constraint name="ring" type="{kind}"><parent link="shin"/><parent_origin {SHIN}/>'
+        f'<child link="rim"/><child_origin {RIM}/>{axes}</constraint>'
+    )
+
+
+BOTH_AXES = f'<parent_axis xyz="{text(AXIS)}"/><child_axis xyz="{text(AXIS)}"/>'
+
+
+def ball_constraint(declared: str = DRAKE) -> str:
+    return (
+        f'<drake:ball_constraint name="ring" {declared}>'
+        '<drake:ball_constraint_body_A name="shin"/><drake:ball_constraint_body_B name="rim"/>'
+        f'<drake:ball_constraint_p_AP value="{text(ON_SHIN[0])}"/>'
+        f'<drake:ball_constraint_p_BQ value="{text(ON_RIM[0])}"/></drake:ball_constraint>'
+    )
+
+
+# Element, type of the closure.
+CASES = {
+    **{f"URDF+ {kind}": (urdf_plus(kind), closed) for kind, closed in (
+        ("revolute", "revolute"), ("continuous", "revolute"), ("fixed", "frame"),
+        ("spherical", "point"), ("prismatic", "prismatic"), ("planar", "planar"),
+    )},
+    "Isaac spherical": (isaac("spherical"), "point"),
+    "Isaac with link1 twice": (isaac("fixed", "link1"), "frame"),
+    "Isaac revolute": (isaac("revolute"), "revolute"),
+    "urdfdom revolute": (urdfdom("revolute", BOTH_AXES), "revolute"),
+    "urdfdom prismatic": (urdfdom("prismatic", BOTH_AXES), "prismatic"),
+    "urdfdom cylindrical": (urdfdom("cylindrical", BOTH_AXES), "cylindrical"),
+    "urdfdom one axis": (urdfdom("revolute", f'<parent_axis xyz="{text(AXIS)}"/>'), "revolute"),
+    "urdfdom spherical": (urdfdom("spherical"), "point"),
+    "urdfdom fixed": (urdfdom("fixed"), "frame"),
+    "Drake ball": (ball_constraint(), "point"),
+    "Drake ball, prefix not declared": (ball_constraint(""), "point"),
+}  # fmt: skip
+
+
+def gaps(kind: str, between: pin.SE3) -> tuple[float, float]:
+    """Norms of what vanishes when a joint is closed: of positions, and of angles."""
+    p, R = between.translation, between.rotation
+    n = np.array(AXIS) / 3.0
+    tilt = float(np.linalg.norm(np.cross(n, R @ n)))
+    turn = float(np.linalg.norm([R[2, 1], R[0, 2], R[1, 0]]))
+    whole, across, along = (
+        float(np.linalg.norm(part)) for part in (p, p - n * (n @ p), n * (n @ p))
+    )
+    return {
+        "point": (whole, 0.0),
+        "frame": (whole, turn),
+        "revolute": (whole, tilt),
+        "prismatic": (across, turn),
+        "cylindrical": (across, tilt),
+        "planar": (along, tilt),
+    }[kind]
+
+
+def write(folder: Path, urdf: str, name: str = "robot.urdf") -> Path:
+    path = folder / name
+    path.write_text(urdf, encoding="utf-8")
+    return path
+
+
+def random_positions(count: int = 3) -> FloatArray:
+    return np.random.default_rng(7).uniform(-1.5, 1.5, (count, 4))
+
+
+def measured(mechanism: srm.Mechanism, q: FloatArray) -> tuple[float, float]:
+    """Norms of the position and of the other rows of the only loop."""
+    model = mechanism.model
+    (loop,) = mechanism.loops
+    g = closure(mechanism, configuration(model, q), np.zeros(model.nv))[: loop.rows.count]
+    split = len(loop.rows.directions)
+    return float(np.linalg.norm(g[:split])), float(np.linalg.norm(g[split:]))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_loop_element_is_the_closure_that_it_says(case: str, tmp_path: Path) -> None:
+    element, kind = CASES[case]
+    mechanism = open_mechanism(write(tmp_path, tree(element)))
+    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("ring", kind)]
+    # Drake places points, not frames.
+    ends = (
+        ((ON_SHIN[0], (0, 0, 0)), (ON_RIM[0], (0, 0, 0))) if "Drake" in case else (ON_SHIN, ON_RIM)
+    )
+    for q in random_positions():
+        assert measured(mechanism, q) == pytest.approx(gaps(kind, relative(q, *ends)), abs=1e-12)
+
+
+def test_axes_that_differ_in_the_two_frames_are_brought_into_line(tmp_path: Path) -> None:
+    """A hinge about x of one frame and y of the other; of a slider the same is an error."""
+    axes = '<parent_axis xyz="1 0 0"/><child_axis xyz="0 1 0"/>'
+    mechanism = open_mechanism(write(tmp_path, tree(urdfdom("revolute", axes))))
+    for q in random_positions():
+        between = relative(q)
+        tilt = np.linalg.norm(np.cross([1.0, 0.0, 0.0], between.rotation @ [0.0, 1.0, 0.0]))
+        expected = (np.linalg.norm(between.translation), tilt)
+        assert measured(mechanism, q) == pytest.approx(expected, abs=1e-12)
+    with pytest.raises(srm.InputError, match=r"'ring'.*axes.*differ"):
+        srm.load(write(tmp_path, tree(urdfdom("prismatic", axes))))
+
+
+def test_the_cross_of_a_universal_closure_has_an_axis_on_either_side(tmp_path: Path) -> None:
+    axes = '<parent_axis xyz="1 0 0"/><child_axis xyz="0 3 4"/>'
+    mechanism = open_mechanism(write(tmp_path, tree(urdfdom("universal", axes))))
+    for q in random_positions():
+        between = relative(q)
+        cross = abs(between.rotation[0] @ [0.0, 0.6, 0.8])
+        expected = (np.linalg.norm(between.translation), cross)
+        assert measured(mechanism, q) == pytest.approx(expected, abs=1e-12)
+
+
+# --- a child of two parents, and joints inside <gazebo> ----------------------------------------
+
+SECOND = """<joint name="second" type="{kind}"><parent link="shin"/><child link="rim"/>
+  <origin {origin}/>{axis}{more}</joint>"""
+
+
+def second(kind: str, more: str = "") -> str:
+    axis = "" if kind == "fixed" else DIRECTION
+    return SECOND.format(kind=kind, origin=SHIN, axis=axis, more=more)
+
+
+@pytest.mark.parametrize(
+    ("kind", "closed"),
+    [
+        ("revolute", "revolute"),
+        ("prismatic", "prismatic"),
+        ("fixed", "frame"),
+        ("spherical", "point"),
+    ],
+)
+def test_the_second_joint_of_a_child_becomes_a_closure(
+    kind: str, closed: str, tmp_path: Path
+) -> None:
+    """Its frame on the child is the child's own: the closure is closed at the joint's zero."""
+    mechanism = open_mechanism(write(tmp_path, tree(second(kind))))
+    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("second", closed)]
+    assert "second" not in mechanism.joint_names
+    for q in random_positions():
+        between = relative(q, ON_SHIN, ((0, 0, 0), (0, 0, 0)))
+        assert measured(mechanism, q) == pytest.approx(gaps(closed, between), abs=1e-12)
+
+
+def test_a_second_joint_that_restrains_nothing_is_left_out(tmp_path: Path) -> None:
+    assert not open_mechanism(write(tmp_path, tree(second("floating")))).loops
+
+
+def gazebo(kind: str, inside: str) -> str:
+    return (
+        f'<gazebo><joint name="ring" type="{kind}"><parent>shin</parent><child>rim</child>'
+        f"{inside}</joint></gazebo>"
+    )
+
+
+POSE = f"<pose>{text(ON_RIM[0])} {text(ON_RIM[1])}</pose>"
+GAZEBO = {
+    "revolute": ("revolute", f"<axis><xyz>{text(AXIS)}</xyz></axis>"),
+    "prismatic": ("prismatic", f"<axis><xyz>{text(AXIS)}</xyz></axis>"),
+    "ball": ("point", ""),
+    "fixed": ("frame", ""),
+}
+
+
+@pytest.mark.parametrize("pose", ["", POSE])
+@pytest.mark.parametrize("kind", GAZEBO)
+def test_a_joint_inside_gazebo_is_closed_where_it_stands_at_zero(
+    kind: str, pose: str, tmp_path: Path
+) -> None:
+    closed, inside = GAZEBO[kind]
+    mechanism = open_mechanism(write(tmp_path, tree(gazebo(kind, pose + inside))))
+    assert mechanism.loops[0].type == closed
+    on_rim = ON_RIM if pose else ((0, 0, 0), (0, 0, 0))
+    at_zero = relative(np.zeros(4), ((0, 0, 0), (0, 0, 0)), on_rim)
+    for q in random_positions():
+        between = at_zero.actInv(relative(q, ((0, 0, 0), (0, 0, 0)), on_rim))
+        assert measured(mechanism, q) == pytest.approx(gaps(closed, between), abs=1e-12)
+    assert measured(mechanism, np.zeros(4)) == pytest.approx((0.0, 0.0), abs=1e-14)
+
+
+def test_an_axis_in_the_frame_of_the_model_is_turned_into_that_of_the_joint(tmp_path: Path) -> None:
+    inside = "<axis><xyz>0 0 1</xyz><use_parent_model_frame>1</use_parent_model_frame></axis>"
+    mechanism = open_mechanism(write(tmp_path, tree(gazebo("revolute", inside))))
+    model = pin.buildModelFromXML(tree())
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    rim = data.oMf[model.getFrameId("rim")].rotation
+    np.testing.assert_allclose(mechanism.loops[0].axis, rim.T @ [0.0, 0.0, 1.0], atol=1e-14)
+
+
+# --- couplings -----------------------------------------------------------------------------------
+
+
+def relation(mechanism: srm.Mechanism, q: FloatArray) -> float:
+    model = mechanism.model
+    return float(closure(mechanism, configuration(model, q), np.zeros(model.nv))[0])
+
+
+def test_a_mimic_joint_is_a_coupling(tmp_path: Path) -> None:
+    mimic = '<mimic joint="hip" multiplier="-2.5" offset="0.3"/>'
+    mechanism = open_mechanism(write(tmp_path, tree(joints={"wheel": mimic})))
+    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("mimic_wheel", "coupling")]
+    values = [relation(mechanism, q) for q in random_positions()]
+    expected = [q[3] + 2.5 * q[0] - 0.3 for q in random_positions()]
+    np.testing.assert_allclose(np.abs(values), np.abs(expected), atol=1e-13)
+    loaded = srm.load(tmp_path / "robot.urdf")
+    assert loaded.degrees_of_freedom == 3
+    assert closure(loaded, loaded.q0, loaded.v0)[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_mimic_of_defaults_ties_a_continuous_joint_that_counts_turns(tmp_path: Path) -> None:
+    mechanism = open_mechanism(write(tmp_path, tree(joints={"knee": '<mimic joint="wheel"/>'})))
+    assert mechanism.model.nq == mechanism.model.nv == 4
+    q = np.array([0.1, 9.0, 0.2, 9.0])
+    assert relation(mechanism, q) == pytest.approx(0.0, abs=1e-14)
+
+
+def test_a_mimic_with_multiplier_zero_holds_the_joint_at_its_offset(tmp_path: Path) -> None:
+    mimic = '<mimic joint="hip" multiplier="0" offset="0.4"/>'
+    mechanism = srm.load(write(tmp_path, tree(joints={"wheel": mimic})))
+    assert mechanism.q0[mechanism.joint("wheel").idx_q] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("kind", ["", 'type="rolling"'])
+def test_a_coupling_sums_the_joints_of_both_branches(kind: str, tmp_path: Path) -> None:
+    """URDF+: ratio times the sum down to the predecessor is the sum down to the successor."""
+    element = (
+        f'<coupling name="belt" {kind}><predecessor link="shin"/><successor link="slide"/>'
+        '<ratio value="3"/></coupling>'
+    )
+    mechanism = open_mechanism(write(tmp_path, tree(element)))
+    values = [relation(mechanism, q) for q in random_positions()]
+    expected = [q[2] - 3.0 * (q[0] + q[1]) for q in random_positions()]
+    np.testing.assert_allclose(np.abs(values), np.abs(expected), atol=1e-13)
+
+
+# --- springs of Drake ----------------------------------------------------------------------------
+
+SPRING = (
+    f"<drake:linear_spring_damper {DRAKE}>"
+    '<drake:linear_spring_damper_body_A name="shin"/>'
+    f'<drake:linear_spring_damper_p_AP value="{text(ON_SHIN[0])}"/>'
+    '<drake:linear_spring_damper_body_B name="world"/>'
+    '<drake:linear_spring_damper_p_BQ value="1 2 3"/>'
+    '<drake:linear_spring_damper_free_length value="0.7"/>'
+    '<drake:linear_spring_damper_stiffness value="80"/>'
+    '<drake:linear_spring_damper_damping value="9"/></drake:linear_spring_damper>'
+)
+
+
+def test_a_spring_of_drake_is_a_spring_damper(tmp_path: Path) -> None:
+    mechanism = srm.load(write(tmp_path, tree(SPRING)))
+    (spring,) = mechanism.forces
+    assert isinstance(spring, srm.SpringDamper)
+    assert (spring.a.link, spring.a.xyz) == ("shin", ON_SHIN[0])
+    assert (spring.b.link, spring.b.xyz) == ("world", (1.0, 2.0, 3.0))
+    assert (spring.rest_length, spring.stiffness, spring.damping) == (0.7, 80.0, 9.0)
+    assert spring.name == "spring_damper_shin_world"
+
+
+# --- whole mechanisms ----------------------------------------------------------------------------
+
+BAR = """<link name="{name}"><inertial><origin xyz="{half} 0 0"/><mass value="1"/>
+  <inertia ixx="0.001" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+HINGE = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>
+  <origin xyz="{xyz}"/><axis xyz="0 -1 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>
+  {more}</joint>"""
+
+
+SLIDER = """<link name="slider"><inertial><mass value="2"/>
+  <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+GUIDE = """<joint name="guide" type="prismatic"><parent link="ground"/><child link="slider"/>
+  <axis xyz="1 0 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>{more}</joint>"""
+
+
+def slider_crank(on_pin: str = "", on_guide: str = "") -> str:
+    """All four joints are in the URDF: the slider has two parents, rod and ground."""
+    crank, rod = BAR.format(name="crank", half=0.25), BAR.format(name="rod", half=0.5)
+    joints = [
+        HINGE.format(name="a", parent="ground", child="crank", xyz="0 0 0", more=""),
+        HINGE.format(name="b", parent="crank", child="rod", xyz="0.5 0 0", more=""),
+        HINGE.format(name="pin", parent="rod", child="slider", xyz="1 0 0", more=on_pin),
+        GUIDE.format(more=on_guide),
+    ]
+    links = f'<link name="ground"/>{crank}{rod}{SLIDER}'
+    return "\n".join(['<robot name="slider_crank">', links, *joints, "</robot>"])
+
+
+def described(folder: Path, urdf: str, entries: str = "", cut: str = "") -> srm.Mechanism:
+    write(folder, urdf, f"slider_crank{cut}.urdf")
+    path = folder / f"slider_crank{cut}.toml"
+    line = f'cut = ["{cut}"]\n' if cut else ""
+    path.write_text(f'format = 1\nurdf = "slider_crank{cut}.urdf"\n{line}{entries}')
+    return srm.load(path)
+
+
+def end_of(mechanism: srm.Mechanism, link: str, q: FloatArray) -> FloatArray:
+    """World position of a link's frame."""
+    data = mechanism.model.createData()
+    pin.framesForwardKinematics(mechanism.model, data, q)
+    at: FloatArray = data.oMf[mechanism.model.getFrameId(link)].translation.copy()
+    return at
+
+
+START = "[initial]\nq = { a = 1.2 }\nv = { a = 1.0 }\nguess = { b = -1.6 }\n"
+
+
+def test_the_motion_does_not_depend_on_where_the_loop_is_cut(tmp_path: Path) -> None:
+    """Nor on whether a damped joint is the one: it then becomes a bushing."""
+    damped = '<dynamics damping="0.6"/>'
+    ends = []
+    for cut, name in (("", "guide"), ("pin", "pin")):
+        mechanism = described(tmp_path, slider_crank(damped, damped), START, cut)
+        assert [loop.name for loop in mechanism.loops] == [name]
+        assert [force.name for force in mechanism.forces] == [f"{name}::damping"]
+        assert mechanism.degrees_of_freedom == 1
+        solution = srm.simulate(mechanism, 1.0, rtol=1e-10)
+        ends.append(end_of(mechanism, "slider", solution.q[-1]))
+        assert solution.energy[-1] - solution.energy[0] < -0.05
+    assert abs(ends[0][0] - 0.5) > 0.01
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
+
+
+def test_the_caller_may_choose_the_cut(tmp_path: Path) -> None:
+    path = write(tmp_path, slider_crank())
+    assert srm.load(path, cut=["pin"]).joint_names == ("a", "b", "guide")
+
+
+def test_a_description_adds_its_loops_to_those_of_the_file(tmp_path: Path) -> None:
+    own = (
+        '[[loop]]\nname = "own"\ntype = "point"\na = { link = "crank", xyz = [0.5, 0, 0] }\n'
+        'b = { link = "rod" }\n'
+    )
+    with pytest.raises(srm.InputError, match="'own'"):  # on one joint: both anchors are the same
+        described(tmp_path, slider_crank(), own.replace('"rod"', '"crank"'))
+    mechanism = described(tmp_path, slider_crank(), own + START)
+    assert [loop.name for loop in mechanism.loops] == ["own", "guide"]
+
+
+def test_names_that_are_missing_are_made(tmp_path: Path) -> None:
+    element = urdf_plus("spherical").replace(' name="ring"', "")
+    mechanism = open_mechanism(write(tmp_path, tree(element + element)))
+    assert [loop.name for loop in mechanism.loops] == ["point_rim_shin", "point_rim_shin_2"]
+
+
+def test_a_saved_run_of_a_file_with_loops_is_read_again(tmp_path: Path) -> None:
+    mechanism = described(tmp_path, slider_crank(), START)
+    solution = srm.simulate(mechanism, 0.2)
+    solution.save(tmp_path / "run.npz")
+    for file in tmp_path.glob("*.urdf"):
+        file.unlink()
+    read = srm.load_solution(tmp_path / "run.npz")
+    np.testing.assert_array_equal(read(0.1)[0], solution(0.1)[0])
+    assert [loop.name for loop in read.mechanism.loops] == ["guide"]
+
+
+def test_what_a_robot_is_drawn_with_survives(tmp_path: Path) -> None:
+    from srm_mbs.visualization.animation.shapes import Box, visuals_of
+
+    box = '<visual><geometry><box size="1 2 3"/></geometry></visual></link>'
+    urdf = slider_crank().replace("</link>", box, 1)
+    (visual,) = visuals_of(described(tmp_path, urdf, START))
+    assert isinstance(visual.shape, Box)
+    assert visual.shape.size == (1.0, 2.0, 3.0)
+
+
+def test_a_tree_without_loops_stays_as_it_is(tmp_path: Path) -> None:
+    path = write(tmp_path, tree())
+    source = srm.load(path).source
+    assert source is not None
+    assert source.urdf == tree()
+
+
+# --- frames of onshape-to-robot ------------------------------------------------------------------
+
+
+def frame(name: str, parent: str, at: tuple[Any, Any], lift: float = 0.0) -> str:
+    here = placement(*at) * pin.SE3(np.eye(3), np.array([0.0, 0.0, lift]))
+    rpy = pin.rpy.matrixToRpy(here.rotation)
+    return (
+        f'<link name="{name}"/><joint name="{name}_frame" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{name}"/><origin xyz="{text(here.translation)}" rpy="{text(rpy)}"/></joint>'
+    )
+
+
+PAIR = frame("closing_ring_1", "shin", ON_SHIN) + frame("closing_ring_2", "rim", ON_RIM)
+HINGED = frame("closing_ring_1_z", "shin", ON_SHIN, 0.1) + frame(
+    "closing_ring_2_z", "rim", ON_RIM, 0.1
+)
+
+
+def test_a_pair_of_closing_frames_joins_their_origins(tmp_path: Path) -> None:
+    mechanism = open_mechanism(write(tmp_path, tree(PAIR)))
+    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("closing_ring", "point")]
+    assert any("closing_ring" in note and "type of this mate" in note for note in mechanism.notes)
+    for q in random_positions():
+        assert measured(mechanism, q) == pytest.approx(gaps("point", relative(q)), abs=1e-12)
+
+
+def test_with_two_more_frames_along_z_it_is_a_hinge(tmp_path: Path) -> None:
+    mechanism = open_mechanism(write(tmp_path, tree(PAIR + HINGED)))
+    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("closing_ring", "revolute")]
+    for q in random_positions():
+        between = relative(q)
+        tilt = np.linalg.norm(between.rotation[:2, 2])
+        expected = (np.linalg.norm(between.translation), tilt)
+        assert measured(mechanism, q) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_closure_of_the_description_replaces_the_pair(tmp_path: Path) -> None:
+    write(tmp_path, tree(PAIR))
+    path = tmp_path / "own.toml"
+    path.write_text(
+        'format = 1\nurdf = "robot.urdf"\n[[loop]]\nname = "weld"\ntype = "frame"\n'
+        'a = { link = "closing_ring_2" }\nb = { frame = "closing_ring_1" }\n'
+    )
+    mechanism = open_mechanism(path)
+    assert [loop.name for loop in mechanism.loops] == ["weld"]
+
+
+def test_a_closing_frame_without_partner_is_noted(tmp_path: Path) -> None:
+    mechanism = srm.load(write(tmp_path, tree(frame("closing_ring_1", "shin", ON_SHIN))))
+    assert not mechanism.loops
+    assert any("no partner 'closing_ring_2'" in note for note in mechanism.notes)
+
+
+# --- one clear error each ------------------------------------------------------------------------
+
+FAULTS = {
+    "loop without type": (
+        urdf_plus("revolute").replace('type="revolute"', ""),
+        "'ring': it has no type",
+    ),
+    "loop of unknown type": (urdf_plus("bend"), "no closure for a joint of type 'bend'"),
+    "loop without predecessor": (
+        re.sub("<pred.*</predecessor>", "", urdf_plus("fixed")),
+        "no <predecessor>",
+    ),
+    "loop with two axes": (
+        urdf_plus("revolute").replace(DIRECTION, 2 * DIRECTION),
+        "<axis> is given twice",
+    ),
+    "loop with a zero axis": (
+        urdf_plus("revolute").replace(text(AXIS), "0 0 0"),
+        "its axis is zero",
+    ),
+    "loop with words for numbers": (
+        urdf_plus("fixed").replace(SHIN, 'xyz="a b c"'),
+        "3 finite numbers",
+    ),
+    "loop on no link": (
+        urdf_plus("fixed").replace('"shin"', '"sin"'),
+        "the link 'sin' does not exist",
+    ),
+    "loop without link": (
+        urdf_plus("fixed").replace('link="shin"', ""),
+        "<predecessor> has no 'link'",
+    ),
+    "loop with more": (
+        urdf_plus("fixed").replace("</loop>", "<play/></loop>"),
+        "unknown element <play>",
+    ),
+    "loop with an attribute": (
+        urdf_plus("fixed").replace("<loop ", '<loop stiffness="1" '),
+        "'stiffness'",
+    ),
+    "universal loop": (urdf_plus("universal"), "two axes"),
+    "loop on one body": (urdf_plus("fixed").replace('"rim"', '"shin"'), "same body"),
+    "loop twice": (2 * urdf_plus("spherical"), "'ring' is used twice"),
+    "coupling without ratio": (
+        '<coupling name="c"><predecessor link="shin"/><successor link="rim"/></coupling>',
+        "no <ratio>",
+    ),
+    "coupling of ratio zero": (
+        '<coupling name="c"><predecessor link="shin"/><successor link="rim"/><ratio value="0"/>'
+        "</coupling>",
+        "its ratio is zero",
+    ),
+    "coupling on one branch": (
+        '<coupling name="c"><predecessor link="thigh"/><successor link="shin"/><ratio value="2"/>'
+        "</coupling>",
+        "no joint moves 'thigh' against 'thigh'",
+    ),
+    "coupling of another type": ('<coupling name="c" type="belt"/>', "no coupling type 'belt'"),
+    "loop joint without axis": (isaac("revolute").replace(DIRECTION, ""), "does not say its axis"),
+    "loop joint of one link": (
+        isaac("fixed").replace("<link2", "<link3").replace("/link2", "/link3"),
+        "<link3>",
+    ),
+    "loop joint without links": ('<loop_joint name="l" type="fixed"/>', "two links"),
+    "constraint without child": (urdfdom("fixed").replace('<child link="rim"/>', ""), "no <child>"),
+    "ball without point": (
+        re.sub("<drake:ball_constraint_p_AP.*?/>", "", ball_constraint()),
+        "p_AP",
+    ),
+    "ball on no body": (ball_constraint().replace('"rim"', '"brim"'), "'brim' does not exist"),
+    "spring of negative stiffness": (SPRING.replace('"80"', '"-80"'), "stiffness -80 is negative"),
+    "spring with a word": (SPRING.replace('"0.7"', '"long"'), "a finite number"),
+    "another element of Drake": (f"<drake:tendon_constraint {DRAKE}/>", "<tendon_constraint>"),
+    "gazebo joint without child": (
+        "<gazebo><joint name='g' type='ball'><parent>rim</parent></joint></gazebo>",
+        "no <child>",
+    ),
+    "gazebo joint of a gearbox": (gazebo("gearbox", ""), "type 'gearbox'"),
+    "gazebo joint relative to another": (
+        gazebo("ball", "<pose relative_to='base'>0 0 0 0 0 0</pose>"),
+        "relative to 'base'",
+    ),
+    "gazebo pose of five numbers": (gazebo("ball", "<pose>0 0 0 0 0</pose>"), "6 finite numbers"),
+    "gazebo axis without direction": (gazebo("revolute", "<axis/>"), "no <xyz>"),
+    "gazebo joint with friction": (
+        gazebo(
+            "revolute", "<axis><xyz>1 0 0</xyz><dynamics><friction>2</friction></dynamics></axis>"
+        ),
+        "friction",
+    ),
+    "gazebo joint with more": (gazebo("ball", "<plugin/>"), "unknown element <plugin>"),
+    "second joint with friction": (second("revolute", '<dynamics friction="2"/>'), "friction (2)"),
+    "second joint with armature": (
+        second("revolute", '<dynamics armature="2"/>'),
+        "armature (2)",
+    ),
+    "second joint with damping": (second("spherical", '<dynamics damping="2"/>'), "damping (2)"),
+    "second joint of a screw": (second("screw", '<thread_pitch value="1"/>'), "type 'screw'"),
+    "second joint that mimics": (second("revolute", '<mimic joint="hip"/>'), "it has a <mimic>"),
+    "second joint with more": (second("revolute", "<play/>"), "unknown element <play>"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_loop_is_one_clear_error(fault: str, tmp_path: Path) -> None:
+    closing, needle = FAULTS[fault]
+    path = write(tmp_path, tree(closing))
+    with pytest.raises(srm.InputError) as caught:
+        srm.load(path)
+    message = str(caught.value)
+    assert message.startswith(str(path)), message
+    assert needle in message
+    assert caught.value.remedy
+
+
+MIMICS = {
+    "of nothing": ("", "no joint ''"),
+    "of no joint": ('joint="hop"', "no joint 'hop'"),
+    "of itself": ('joint="wheel"', "mimics itself"),
+    "with a word": ('joint="hip" multiplier="twice"', "a finite number"),
+    "with an attribute": ('joint="hip" ratio="2"', "'ratio'"),
+}
+
+
+@pytest.mark.parametrize("fault", MIMICS)
+def test_a_faulty_mimic_is_one_clear_error(fault: str, tmp_path: Path) -> None:
+    attributes, needle = MIMICS[fault]
+    path = write(tmp_path, tree(joints={"wheel": f"<mimic {attributes}/>"}))
+    with pytest.raises(srm.InputError) as caught:
+        srm.load(path)
+    for part in (str(path), "'wheel', <mimic>", needle):
+        assert part in str(caught.value)
+
+
+def test_a_mimic_of_a_locked_joint_is_refused_and_a_locked_mimic_is_ignored(tmp_path: Path) -> None:
+    write(tmp_path, tree(joints={"wheel": '<mimic joint="hip"/>'}))
+    path = tmp_path / "robot.toml"
+    path.write_text('format = 1\nurdf = "robot.urdf"\nlock = ["hip"]\n')
+    with pytest.raises(srm.InputError, match="'hip' is locked"):
+        srm.load(path)
+    path.write_text('format = 1\nurdf = "robot.urdf"\nlock = ["wheel"]\n')
+    mechanism = srm.load(path)
+    assert not mechanism.loops
+    assert any("<mimic> is ignored" in note for note in mechanism.notes)
+
+
+@pytest.mark.parametrize(
+    ("cut", "needle"), [("hop", "no joint 'hop'"), ("hip", "no other joint holds the link 'thigh'")]
+)
+def test_a_joint_that_cannot_be_cut_is_named(cut: str, needle: str, tmp_path: Path) -> None:
+    path = write(tmp_path, tree())
+    with pytest.raises(srm.InputError, match=re.escape(needle)):
+        srm.load(path, cut=[cut])
+
+
+def test_the_tree_of_a_file_with_loops_is_that_without(tmp_path: Path) -> None:
+    """Taking the loops out changes no mass, placement or joint."""
+    everything = (
+        urdf_plus("revolute") + gazebo("ball", "").replace("ring", "eye") + second("fixed") + SPRING
+    )
+    mechanism = open_mechanism(write(tmp_path, tree(everything)))
+    model, plain = mechanism.model, pin.buildModelFromXML(tree())
+    assert list(model.names) == list(plain.names)
+    for q in random_positions():
+        at = configuration(plain, q)
+        np.testing.assert_allclose(mass_matrix(model, at), mass_matrix(plain, at), atol=1e-14)

@@ -1,0 +1,341 @@
+"""``solution.crossings``: which passages are listed, and what is said about them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.dynamics.constraints import structure
+from srm_mbs.integration import singular_passages as crossings_module
+from tests.support import reduced
+from tests.support.bundled import load
+from tests.support.mechanisms import (
+    along_x,
+    ball_dead_point,
+    floating_slider_crank,
+    rod,
+    slider_crank_of_points,
+)
+
+PI = np.pi
+
+# mechanism, joint, its angle at a singular configuration (modulo pi)
+SINGULAR_AT = {
+    "slider_crank_whirl": ("crank", PI / 2.0),
+    "parallelogram": ("crank", 0.0),
+    "n_four_bar_2": ("crank_0", 0.0),
+    "spatial_dead_point": ("crank", 2.0 * PI / 3.0),
+}
+
+
+def run(name: str, t_end: float, tableau: str = "dop853", tol: float = 1e-8) -> srm.Solution:
+    return srm.simulate(load(name), t_end, tableau=tableau, rtol=tol, atol=tol)
+
+
+def passages_of(solution: srm.Solution, name: str) -> np.ndarray:
+    """Times at which the run's own dense output passes the singular angle."""
+    joint, angle = SINGULAR_AT[name]
+    index = solution.mechanism.joint(joint).idx_q
+
+    def f(t: Any) -> np.ndarray:
+        return np.sin(solution(t)[0][..., index] - angle)
+
+    t = np.linspace(0.0, float(solution.t[-1]), 20001)
+    values = f(t)
+    found = []
+    for k in np.flatnonzero(values[:-1] * values[1:] < 0.0):
+        low, high = t[k], t[k + 1]
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            if f(low) * f(middle) <= 0.0:
+                high = middle
+            else:
+                low = middle
+        found.append(low)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("tableau", ["tvd32", "dopr54", "dop853"])
+@pytest.mark.parametrize("name", ["slider_crank_whirl", "parallelogram", "n_four_bar_2"])
+def test_the_coarsest_runs_list_every_passage(name: str, tableau: str) -> None:
+    solution = run(name, 10.0, tableau, 1e-4)
+    expected = passages_of(solution, name)
+    found = np.array([crossing.time for crossing in solution.crossings])
+    assert len(found) == len(expected)
+    assert np.abs(found - expected).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", SINGULAR_AT)
+def test_passages_are_listed_at_their_times(name: str) -> None:
+    solution = run(name, 3.0, tol=1e-9)
+    expected = passages_of(solution, name)
+    found = np.array([crossing.time for crossing in solution.crossings])
+    assert len(found) == len(expected)
+    assert np.abs(found - expected).max() < 1e-6
+
+
+def test_a_motion_that_turns_back_before_a_singular_configuration_passes_none() -> None:
+    """Its energy lifts the crank to 0.02 rad before the vertical: sigma falls to 0.06 and rises."""
+    rate = np.sqrt(1.5 * reduced.G * np.sin(PI / 2.0 - 0.02))
+    solution = srm.simulate(
+        load("slider_crank"), 6.5, q0=[0.0, 0.0], v0=[rate, -2.0 * rate], rtol=1e-9
+    )
+    turning = solution(np.linspace(0.0, 6.5, 6501))[0][:, 0].max()
+    assert PI / 2.0 - turning == pytest.approx(0.02, abs=1e-4)
+    assert turning - solution.q[-1, 0] > 0.3
+    assert solution.crossings == ()
+
+
+@pytest.mark.parametrize("longer", [1e-3, 1e-5])
+def test_a_linkage_that_is_only_almost_singular_passes_nothing(longer: float) -> None:
+    """With a rod longer than the crank the slider-crank turns without a singular configuration."""
+    base = load("slider_crank_whirl")
+    (loop,) = base.loops
+    tip = srm.Anchor("rod", xyz=(2.0 + longer, 0.0, 0.0))
+    mechanism = srm.Mechanism(
+        base.model, (srm.LoopClosure(loop.type, tip, loop.b, loop.axis, "pin"),), q0=base.q0
+    )
+    start = srm.assemble(mechanism, {"crank": PI / 4.0}, {"crank": 6.0}, guess={"rod": -PI / 2.0})
+    solution = srm.simulate(mechanism, 1.0, q0=start.q, v0=start.v, rtol=1e-8)
+    assert solution.success
+    turned = abs(float(solution.q[-1, 0] - solution.q[0, 0]))
+    assert turned > 3.0
+    assert solution.crossings == ()
+
+
+@pytest.mark.parametrize("name", ["four_bar", "five_bar", "slider_crank_regular"])
+def test_regular_motions_list_none_at_the_coarsest_tolerance(name: str) -> None:
+    assert run(name, 3.0, "dopr54", 1e-4).crossings == ()
+
+
+def test_a_start_on_a_singular_configuration_is_no_passage() -> None:
+    solution = srm.simulate(load("slider_crank"), 0.5, q0=[1.5 * PI, -3.0 * PI], v0=[1.0, -2.0])
+    assert solution.crossings == ()
+
+
+def test_an_open_chain_passes_none() -> None:
+    assert run("pendulum_chain", 0.5).crossings == ()
+
+
+# --- what is said about a passage ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whirl() -> srm.Solution:
+    return run("slider_crank_whirl", 4.0)
+
+
+def test_sigma_before_and_at_the_closest_stage_are_those_of_the_step(whirl: srm.Solution) -> None:
+    for crossing in whirl.crossings:
+        step = np.searchsorted(whirl.steps.times, crossing.time) - 1
+        assert crossing.sigma_before == whirl.steps.sigmas[step, 0]
+        assert crossing.sigma == whirl.steps.sigmas[step].min()
+        assert 0.0 < crossing.sigma <= crossing.sigma_before
+        assert crossing.rank == 1
+
+
+def test_the_loop_and_row_that_lose_rank_are_named(whirl: srm.Solution) -> None:
+    assert {crossing.loops for crossing in whirl.crossings} == {("pin",)}
+    assert {crossing.rows for crossing in whirl.crossings} == {("pin.normal",)}
+
+
+def test_all_loops_that_lose_rank_are_named() -> None:
+    first, *_ = run("n_four_bar_2", 1.0).crossings
+    assert first.loops == ("pin_0", "pin_1")
+    assert first.rows == ("pin_0.x", "pin_1.x")
+    assert first.singular is not None
+    assert first.singular.nullity == 2
+
+
+def test_the_configuration_is_exactly_singular(whirl: srm.Solution) -> None:
+    for crossing in whirl.crossings:
+        assert crossing.configuration is not None
+        crank, rod = crossing.configuration
+        assert np.cos(crank) == pytest.approx(0.0, abs=1e-13)
+        assert np.cos(crank + rod) == pytest.approx(0.0, abs=1e-13)
+        assert abs(crank - whirl(crossing.time)[0][0]) < 1e-6
+
+
+def test_how_the_stages_were_kept_away_is_recorded() -> None:
+    placed = run("slider_crank", 10.0)
+    assert "a priori" in {crossing.placement for crossing in placed.crossings}
+    assert np.sum(placed.steps.placements == 1) <= placed.stats.placements
+    # fixed steps that end on the singular configuration
+    mechanism = load("slider_crank_whirl")
+    step = run("slider_crank_whirl", 1.0, tol=1e-11).crossings[0].time / 50.0
+    hit = srm.simulate(mechanism, 70.0 * step, step=step, placement="off")
+    assert [crossing.placement for crossing in hit.crossings] == ["zone"]
+    assert hit.stats.zone_steps > 0
+    untouched = srm.simulate(load("slider_crank_whirl"), 4.0, placement="off", rtol=1e-6)
+    assert {crossing.placement for crossing in untouched.crossings} <= {"", "zone"}
+
+
+def test_redone_steps_are_recorded_where_they_were_redone() -> None:
+    solution = run("parallelogram", 10.0, tol=1e-7)
+    redone = np.flatnonzero(solution.steps.placements == 2)
+    assert len(redone) > 0
+    assert solution.stats.replaced >= len(redone)
+    starts = solution.steps.times[redone]
+    tried = np.array([attempt["t"] for attempt in solution.attempts])
+    assert np.isin(starts, tried).all()
+
+
+def test_the_tangents_and_the_branch_that_was_kept(whirl: srm.Solution) -> None:
+    for crossing in whirl.crossings:
+        assert len(crossing.branches) == 2
+        expected = np.array([[1.0, -2.0], [1.0, 0.0]]) / np.array([[np.sqrt(5.0)], [1.0]])
+        rate = whirl(crossing.time)[1][0]
+        order = np.argsort(np.abs(crossing.branches[:, 1]))[::-1]
+        np.testing.assert_allclose(
+            crossing.branches[order] * np.sign(rate), expected * 1.0, atol=1e-9
+        )
+        assert crossing.arrived_on == crossing.left_on == order[0]
+        assert not crossing.switched
+
+
+@pytest.mark.parametrize("start", [ball_dead_point, floating_slider_crank])
+def test_passages_of_balls_and_free_bases_keep_their_branch(start: Any) -> None:
+    mechanism = start()
+    if start is floating_slider_crank:
+        mechanism = mechanism.with_state(floating_slider_crank(away=-0.5).q0, mechanism.v0)
+    solution = srm.simulate(mechanism, 1.0, rtol=1e-8, atol=1e-8)
+    assert len(solution.crossings) >= 1
+    for crossing in solution.crossings:
+        assert len(crossing.branches) == 2
+        assert crossing.arrived_on == crossing.left_on == 0
+        assert not crossing.switched
+
+
+def test_a_passage_at_the_very_end_of_a_run_is_listed_and_left_open() -> None:
+    whole = run("slider_crank", 2.0, tol=1e-9)
+    t = whole.crossings[0].time
+    cut = srm.simulate(load("slider_crank"), t + 1e-3, rtol=1e-9, atol=1e-9)
+    (crossing,) = cut.crossings
+    assert crossing.time == pytest.approx(t, abs=1e-6)
+    assert crossing.left_on is None
+    assert not crossing.switched
+
+
+def test_passages_survive_saving(whirl: srm.Solution, tmp_path: Path) -> None:
+    whirl.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+    assert loaded.crossings == whirl.crossings
+    for a, b in zip(loaded.crossings, whirl.crossings):
+        assert (a.loops, a.placement, a.left_on) == (b.loops, b.placement, b.left_on)
+        assert np.array_equal(a.branches, b.branches)
+        assert a.configuration is not None
+        assert b.configuration is not None
+        assert np.array_equal(a.configuration, b.configuration)
+
+
+def test_what_is_expensive_is_computed_when_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    solution = run("slider_crank_whirl", 4.0)
+    calls: list[int] = []
+    analyse = crossings_module.analyse_singular
+
+    def counted(*arguments: Any) -> Any:
+        calls.append(1)
+        return analyse(*arguments)
+
+    monkeypatch.setattr(crossings_module, "analyse_singular", counted)
+    first, *_ = solution.crossings
+    assert (first.time, first.sigma, first.placement) is not None
+    assert calls == []
+    assert first.loops == ("pin",)
+    assert len(first.branches) == 2
+    assert len(calls) == 1
+
+
+def slender_slider_crank(thickness: float, twist: float = 0.0) -> srm.Mechanism:
+    """slider_crank with ball joints, which closures hold as hinges, and rods of that ratio of axial
+    to transverse inertia; the hinges' frames are turned by ``twist`` (rad) about their axis."""
+    base = load("slider_crank")
+    model = pin.Model()
+    model.name = "slender_slider_crank"
+    model.gravity.linear = base.model.gravity.linear
+    crank = model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "crank")
+    tip = model.addJoint(crank, pin.JointModelSpherical(), along_x(2.0), "rod")
+    for joint, name in ((crank, "crank"), (tip, "rod")):
+        model.appendBodyToJoint(joint, rod(1.0, 2.0, thickness), pin.SE3.Identity())
+        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+    axis = (0.0, 1.0, 0.0)
+    tip, turned = (2.0, 0.0, 0.0), (0.0, twist, 0.0)
+    end, pin_joint = srm.Anchor("crank", xyz=tip, rpy=turned), srm.Anchor("rod", xyz=tip)
+    ground = srm.Anchor("world", rpy=turned)
+    loops = (
+        srm.LoopClosure("revolute", srm.Anchor("crank", rpy=turned), ground, axis, "pivot"),
+        srm.LoopClosure("revolute", srm.Anchor("rod", rpy=turned), end, axis, "hinge"),
+        srm.LoopClosure("point_on_plane", pin_joint, srm.Anchor("world"), (0.0, 0.0, 1.0), "pin"),
+    )
+    halves = -0.5 * base.q0
+    q = [x for half in halves for x in (0.0, np.sin(half), 0.0, np.cos(half))]
+    return srm.Mechanism(model, loops, q0=q)
+
+
+@pytest.mark.parametrize(
+    ("thickness", "twist"), [(1e-8, 0.0), (1e-4, 0.0), (1e-4, 0.25 * PI), (1e-2, 0.0), (1.0, 0.0)]
+)
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+def test_slender_bodies_held_by_closures_pass_like_hinges_in_the_tree(
+    thickness: float, twist: float, rtol: float
+) -> None:
+    """Rows that turn a rod about its axis are 1/sqrt(thickness) as large as those beside them."""
+    expected = srm.simulate(load("slider_crank"), 10.0, rtol=1e-12)
+    solution = srm.simulate(slender_slider_crank(thickness, twist), 10.0, rtol=rtol)
+    found = solution.crossings
+    assert [c.time for c in found] == pytest.approx([c.time for c in expected.crossings], abs=1e-4)
+    assert all(c.loops == ("pin",) and not c.switched for c in found)
+    t = np.linspace(0.1, 10.0, 100)
+    quaternions = solution(t)[0].reshape(100, 2, 4)
+    angles = -2.0 * np.arctan2(quaternions[:, :, 1], quaternions[:, :, 3])
+    error = np.angle(np.exp(1j * (angles - expected(t)[0])))
+    assert np.abs(error).max() < 0.1 * rtol
+
+
+@pytest.mark.parametrize("thickness", [1e-4, 1e-2])
+def test_passages_are_listed_where_the_last_pivot_stays_small_everywhere(
+    thickness: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it would where balancing the rows made more of them independent."""
+    monkeypatch.setattr(structure, "BLUNT", 0.0)
+    mechanism = slender_slider_crank(thickness)
+    assert mechanism.structure.sigma_ref < crossings_module.BLUNT
+    expected = srm.simulate(srm.load("slider_crank"), 10.0, rtol=1e-10).crossings
+    found = srm.simulate(mechanism, 10.0, rtol=1e-6).crossings
+    assert [c.time for c in found] == pytest.approx([c.time for c in expected], abs=1e-4)
+    assert all(c.loops == ("pin",) and not c.switched for c in found)
+
+
+@cache
+def passing() -> srm.Solution:
+    return srm.simulate(load("slider_crank"), 6.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("apart", [2.0, 0.1, 1e-2, 1e-4])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+def test_hinges_of_two_points_next_to_each_other_pass_like_hinges(
+    apart: float, rtol: float, tmp_path: Path
+) -> None:
+    """What holds them against turning is small everywhere; passages must be seen from afar."""
+    expected = passing()
+    mechanism = slider_crank_of_points(apart)
+    assert mechanism.structure.rank == 11
+    assert mechanism.structure.sigma_ref > 0.1
+    solution = srm.simulate(mechanism, 6.0, rtol=rtol)
+    solution.save(tmp_path / "run.npz")
+    for found in (solution, srm.load_solution(tmp_path / "run.npz")):
+        times = [c.time for c in found.crossings]
+        assert times == pytest.approx([c.time for c in expected.crossings], abs=1e-4)
+        assert {"pin_0", "pin_1"} & set(found.crossings[0].loops)
+        assert not any(c.switched for c in found.crossings)
+        t = np.linspace(0.1, 6.0, 60)
+        quaternions = found(t)[0].reshape(60, 2, 7)[:, :, 3:]
+        angles = 2.0 * np.arctan2(quaternions[:, :, 1], quaternions[:, :, 3])
+        off = angles + np.cumsum(expected(t)[0], axis=1)
+        assert np.abs(np.angle(np.exp(1j * off))).max() < 10.0 * rtol

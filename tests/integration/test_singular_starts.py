@@ -1,0 +1,503 @@
+"""Starts on, and next to, singular configurations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.singularities.branch_limit import branch_limit
+from srm_mbs.dynamics.singularities.local_analysis import (
+    SingularConfiguration,
+    analyse_singular,
+    nearest_singular,
+)
+from srm_mbs.model.mechanism import Mechanism
+from tests.support import reduced
+from tests.support.bundled import load
+from tests.support.mechanisms import ball_dead_point, distance, floating_slider_crank
+
+PI = np.pi
+
+
+def parallel(n: int, rate: float) -> list[float]:
+    """Rates, or angles, of the N-four-bar (N = 1: the parallelogram) moving as parallelograms."""
+    return [rate] + [-rate, rate] * n
+
+
+def crank_error(solution: srm.Solution, field: reduced.Field, start: list[float]) -> float:
+    """Largest error of the first joint's angle and rate at the end."""
+    assert solution.success, solution.message
+    expected = reduced.integrate(field, start, float(solution.t[-1]))
+    return float(np.abs([solution.q[-1, 0], solution.v[-1, 0]] - expected).max())
+
+
+def parallelogram_field(t: float, y: Any) -> list[float]:
+    return [y[1], -9.0 / 8.0 * reduced.G * np.cos(y[0])]
+
+
+def refused(mechanism: Mechanism, t_end: float = 1.0, **state: Any) -> str:
+    with pytest.raises(srm.InputError) as caught:
+        srm.simulate(mechanism, t_end, **state)
+    return str(caught.value)
+
+
+# --- exactly there ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+@pytest.mark.parametrize("rate", ["1.0", "-0.5"])
+def test_a_slider_crank_starts_upright_with_momentum(
+    rate: str, tableau: str, exact: dict[str, Any]
+) -> None:
+    data = exact["slidercrank"]["start_at_singular th1=3pi/2"][f"omega0={rate},t=10"]
+    theta, omega = map(float, data)
+    w = float(rate)
+    solution = srm.simulate(
+        load("slider_crank"),
+        10.0,
+        q0=[1.5 * PI, -3.0 * PI],
+        v0=[w, -2.0 * w],
+        tableau=tableau,
+        rtol=1e-10,
+        atol=1e-10,
+    )
+    assert solution.success
+    assert solution.q[-1, 0] == pytest.approx(theta, abs=1e-8)
+    assert solution.v[-1, 0] == pytest.approx(omega, abs=1e-8)
+
+
+def test_the_other_branch_of_the_slider_crank_is_followed_as_well() -> None:
+    """The rod lies on the crank: one rigid pendulum of two bars, (8/3) a'' = -2 g cos a."""
+    solution = srm.simulate(
+        load("slider_crank"), 3.0, q0=[1.5 * PI, -3.0 * PI], v0=[1.0, 0.0], rtol=1e-10, atol=1e-10
+    )
+
+    def pendulum(t: float, y: Any) -> list[float]:
+        return [y[1], -0.75 * reduced.G * np.cos(y[0])]
+
+    assert crank_error(solution, pendulum, [1.5 * PI, 1.0]) < 1e-8
+    assert np.abs(solution.q[:, 1] + 3.0 * PI).max() < 1e-8
+
+
+def test_a_parallelogram_starts_stretched_out() -> None:
+    solution = srm.simulate(
+        load("parallelogram"), 3.0, q0=parallel(1, 0.0), v0=parallel(1, 6.0), rtol=1e-9, atol=1e-9
+    )
+    assert crank_error(solution, parallelogram_field, [0.0, 6.0]) < 1e-8
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_an_n_four_bar_starts_where_it_has_lost_n_rows(n: int) -> None:
+    mechanism = load(f"n_four_bar_{n}")
+    solution = srm.simulate(
+        mechanism, 2.0, q0=parallel(n, 0.0), v0=parallel(n, -4.0), rtol=1e-9, atol=1e-9
+    )
+    assert crank_error(solution, reduced.n_four_bar(n), [0.0, -4.0]) < 1e-8
+    cranks = [mechanism.joint(f"crank_{i}").idx_q for i in range(n + 1)]
+    assert np.abs(solution.q[:, cranks] - solution.q[:, :1]).max() < 1e-8
+
+
+def test_a_spatial_mechanism_starts_in_its_dead_point_while_its_rod_spins() -> None:
+    mechanism = load("spatial_dead_point")
+    start = srm.assemble(
+        mechanism,
+        {"crank": 2.0 * PI / 3.0},
+        {"crank": 4.0, "rod": 6.4, "rod_spin": -3.0},
+        guess={"rod_sideways": 2.5, "rod": 0.0},
+    )
+    assert start.singular
+    solution = srm.simulate(mechanism, 2.0, q0=start.q, v0=start.v, rtol=1e-9, atol=1e-9)
+    expected = reduced.integrate(reduced.spatial_dead_point(), [PI / 2.0, 4.0], 2.0)
+    assert solution.success
+    assert solution.q[-1, 0] - PI / 6.0 == pytest.approx(expected[0], abs=1e-6)
+    assert solution.v[-1, 0] == pytest.approx(expected[1], abs=1e-6)
+
+
+def test_a_ball_joint_starts_in_a_dead_point_to_round_off() -> None:
+    solution = srm.simulate(ball_dead_point(PI / 2.0, 4.0), 0.3, rtol=1e-12, atol=1e-12)
+    assert crank_error(solution, reduced.spatial_dead_point(), [PI / 2.0, 4.0]) < 1e-11
+
+
+def test_a_free_flying_mechanism_starts_as_one_that_passes_there() -> None:
+    """Without forces motions are reversible: the way back passes the start and goes on."""
+    start = floating_slider_crank()
+    options: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-11}
+    there = srm.simulate(start, 0.6, **options)
+    assert there.success
+    back = srm.simulate(start, 0.9, q0=there.q[-1], v0=-there.v[-1], **options)
+    q, v = back(0.6)
+    assert np.abs(pin.difference(start.model, q, start.q0)).max() < 1e-8
+    assert np.abs(v + start.v0).max() < 1e-8
+    assert len(back.crossings) == 1
+    before = srm.simulate(start, 0.3, v0=-start.v0, **options)
+    assert np.abs(pin.difference(start.model, back.q[-1], before.q[-1])).max() < 1e-8
+    assert np.abs(back.v[-1] - before.v[-1]).max() < 1e-8
+
+
+def test_the_motion_does_not_depend_on_the_frame_of_a_free_base() -> None:
+    first = floating_slider_crank()
+    turned = floating_slider_crank(turn=(0.4, -1.1, 0.7))
+    a, b = (srm.simulate(m, 1.0, rtol=1e-10, atol=1e-10) for m in (first, turned))
+    assert a.success
+    assert b.success
+    assert np.abs(a.q[-1, 7:] - b.q[-1, 7:]).max() < 1e-8
+    assert np.abs(a.v[-1] - b.v[-1]).max() < 1e-8
+
+
+def test_momentum_and_energy_are_kept_from_a_free_singular_start() -> None:
+    mechanism = floating_slider_crank()
+    solution = srm.simulate(mechanism, 1.0, rtol=1e-10, atol=1e-10)
+    data = mechanism.model.createData()
+    momenta = []
+    for q, v in zip(solution.q, solution.v):
+        h = pin.computeCentroidalMomentum(mechanism.model, data, q, v)
+        momenta.append(h.vector)
+    assert np.abs(np.array(momenta) - momenta[0]).max() < 1e-8
+    assert np.abs(solution.energy / solution.energy[0] - 1.0).max() < 1e-9
+
+
+# --- redundant and singular at once -------------------------------------------------------------
+
+
+def closed_twice(kind: str) -> Mechanism:
+    base = load("parallelogram")
+    (loop,) = base.loops
+    loops = {
+        "same point again": (loop, srm.LoopClosure("point", loop.a, loop.b, name="again")),
+        "hinge": (srm.LoopClosure("revolute", loop.a, loop.b, (0.0, 1.0, 0.0), name="hinge"),),
+        # a point beyond the pin, on the coupler's and rocker's common pivot axis
+        "two points of the pivot": (
+            loop,
+            srm.LoopClosure(
+                "point",
+                srm.Anchor("coupler", xyz=(2.0, 0.3, 0.0)),
+                srm.Anchor("rocker", xyz=(1.0, 0.3, 0.0)),
+                name="beyond",
+            ),
+        ),
+    }[kind]
+    return srm.Mechanism(base.model, loops, q0=base.q0, v0=base.v0, name="closed_twice")
+
+
+@pytest.mark.parametrize("kind", ["same point again", "hinge", "two points of the pivot"])
+def test_redundant_closures_start_singular_as_well(kind: str) -> None:
+    mechanism = closed_twice(kind)
+    assert mechanism.degrees_of_freedom == 1
+    solution = srm.simulate(
+        mechanism, 2.0, q0=parallel(1, 0.0), v0=parallel(1, 6.0), rtol=1e-9, atol=1e-9
+    )
+    assert crank_error(solution, parallelogram_field, [0.0, 6.0]) < 1e-7
+    assert np.abs(solution.q[:, 2] - solution.q[:, 0]).max() < 1e-8
+
+
+# --- next to it ---------------------------------------------------------------------------------
+
+NEXT_TO = [1e-3, -3e-4, 1e-4, 1e-5, -1e-6, 1e-7, 1e-8, -1e-9, 1e-10, 1e-12]
+
+
+@pytest.mark.parametrize("away", NEXT_TO)
+def test_starts_next_to_a_singular_configuration_are_as_exact_as_others(away: float) -> None:
+    theta = 1.5 * PI + away
+    solution = srm.simulate(
+        load("slider_crank"),
+        2.0,
+        q0=[theta, -2.0 * theta],
+        v0=[1.0, -2.0],
+        rtol=1e-10,
+        atol=1e-10,
+    )
+    assert crank_error(solution, reduced.slider_crank(), [theta, 1.0]) < 1e-9
+
+
+@pytest.mark.parametrize("away", NEXT_TO)
+def test_starts_next_to_a_dead_point_on_a_curved_branch_are_exact_too(away: float) -> None:
+    angle = PI / 2.0 + away
+    solution = srm.simulate(ball_dead_point(angle, 4.0), 0.3, rtol=1e-10, atol=1e-10)
+    assert crank_error(solution, reduced.spatial_dead_point(), [angle, 4.0]) < 1e-8
+
+
+@pytest.mark.parametrize("away", [1e-3, 1e-5, 1e-6, 1e-7])
+@pytest.mark.parametrize("ratio", [-2.0, 0.0])
+def test_assembled_rates_belong_to_the_branch_next_to_its_end(away: float, ratio: float) -> None:
+    theta = 1.5 * PI + away
+    rod = -2.0 * theta if ratio else -3.0 * PI
+    start = srm.assemble(load("slider_crank"), {"crank": theta}, {"crank": 1.0}, guess={"rod": rod})
+    assert start.v[1] == pytest.approx(ratio, abs=1e-9)
+    assert srm.simulate(load("slider_crank"), 0.1, q0=start.q, v0=start.v).success
+
+
+@pytest.mark.parametrize("away", [1e-3, pytest.param(1e-5, marks=pytest.mark.stress)])
+def test_a_mechanism_is_released_from_rest_next_to_a_singular_configuration(away: float) -> None:
+    """Upright it falls, away from it by a factor of 2 in the first second: a slow start."""
+    theta = 0.5 * PI + away
+    solution = srm.simulate(
+        load("slider_crank"), 1.0, q0=[theta, -2.0 * theta], rtol=1e-10, atol=1e-14
+    )
+    assert crank_error(solution, reduced.slider_crank(), [theta, 0.0]) < 1e-8 * away
+
+
+def test_a_slow_start_leaves_the_singular_configuration_on_its_branch() -> None:
+    solution = srm.simulate(
+        load("slider_crank"), 3.0, q0=[0.5 * PI, -PI], v0=[1e-3, -2e-3], rtol=1e-10, atol=1e-14
+    )
+    field = reduced.slider_crank()
+    assert abs(solution.q[-1, 0] - 0.5 * PI) > 0.01
+    assert crank_error(solution, field, [0.5 * PI, 1e-3]) < 1e-8
+
+
+def test_a_start_that_stays_next_to_a_singular_configuration_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Hanging, a slider-crank swings through the singular configuration by 1e-6 rad."""
+    monkeypatch.setattr("srm_mbs.integration.singular_endpoints.DEPARTURE_BLOCKS", 3)
+    message = refused(load("slider_crank"), 20.0, q0=[1.5 * PI, -3.0 * PI], v0=[1e-6, -2e-6])
+    assert "does not leave" in message
+
+
+# --- orders -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tableau", "steps"),
+    [
+        ("trap", (2e-2, 1e-2, 5e-3)),
+        ("tvd32", (2e-2, 1e-2, 5e-3)),
+        ("erk4", (2e-2, 1e-2, 5e-3)),
+        ("dopr54", (4e-2, 2e-2, 1e-2)),
+    ],
+)
+def test_fixed_steps_from_a_singular_start_have_the_order_of_the_tableau(
+    tableau: str, steps: tuple[float, ...]
+) -> None:
+    errors = []
+    for h in steps:
+        solution = srm.simulate(
+            load("slider_crank"),
+            0.4,
+            q0=[1.5 * PI, -3.0 * PI],
+            v0=[2.0, -4.0],
+            method=srm.PSRM(tableau),
+            step=h,
+        )
+        errors.append(crank_error(solution, reduced.slider_crank(), [1.5 * PI, 2.0]))
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert order == pytest.approx(srm.TABLEAUS[tableau].order, abs=0.35)
+
+
+def test_the_order_is_kept_on_a_curved_branch() -> None:
+    """There the stages, which lie off the branch, would see other constraint normals."""
+    steps, errors = (0.02, 0.01, 0.005), []
+    start = ball_dead_point(PI / 2.0, 2.0)
+    for h in steps:
+        solution = srm.simulate(start, 0.3, method=srm.PSRM("dopr54"), step=h)
+        errors.append(crank_error(solution, reduced.spatial_dead_point(), [PI / 2.0, 2.0]))
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] > 4.8
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        srm.SRM("erk4", iterations=4, eps="h", restart=False),
+        srm.PSRM("dopr54", correction="sweep", eps=0.1),
+        srm.PSRM("dopr54", correction="fused", eps=0.1),
+    ],
+    ids=["SRM", "two sweeps", "fused"],
+)
+def test_other_methods_start_there_too(method: Any) -> None:
+    solution = srm.simulate(
+        load("slider_crank"),
+        0.4,
+        q0=[1.5 * PI, -3.0 * PI],
+        v0=[2.0, -4.0],
+        method=method,
+        step=5e-3,
+    )
+    assert crank_error(solution, reduced.slider_crank(), [1.5 * PI, 2.0]) < 1e-3
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+def test_a_start_at_rest_on_a_singular_configuration_is_refused_with_its_branches() -> None:
+    mechanism = load("slider_crank")
+    state = srm.assemble(mechanism, {"crank": 1.5 * PI}, guess={"rod": -3.0 * PI})
+    message = refused(mechanism, q0=state.q, v0=state.v)
+    for needle in ("'pin'", "at rest", "2 branches", "crank 0.4472, rod -0.8944", "assemble"):
+        assert needle in message
+
+
+def test_a_velocity_between_the_branches_is_refused_with_the_branches() -> None:
+    """G v vanishes for every crank and rod rate here."""
+    message = refused(load("slider_crank"), q0=[1.5 * PI, -3.0 * PI], v0=[1.0, -1.5])
+    for needle in ("'pin'", "not tangent", "crank 0.4472, rod -0.8944", "(crank 1)"):
+        assert needle in message
+
+
+def test_a_velocity_off_the_branch_next_to_a_singular_configuration_is_refused() -> None:
+    """The closure rates are 1e-9 rad/s: only the branch tells that this is no motion."""
+    theta = 1.5 * PI + 1e-9
+    message = refused(load("slider_crank"), q0=[theta, -2.0 * theta], v0=[1.0, -1.0])
+    assert "not tangent" in message
+
+
+def test_a_base_that_moves_while_its_loop_rests_on_a_singular_configuration_is_refused() -> None:
+    mechanism = floating_slider_crank()
+    v = np.zeros(mechanism.model.nv)
+    v[:6] = 1.0
+    message = refused(mechanism, v0=v)
+    assert "does not choose one branch" in message
+
+
+# --- the analysis behind it ---------------------------------------------------------------------
+
+
+def singular_at(mechanism: Mechanism, q: Any) -> SingularConfiguration:
+    geometry = ClosureGeometry(mechanism, mechanism.q0)
+    rank = mechanism.structure.rank
+    found = nearest_singular(geometry, np.asarray(q, dtype=float), rank, reach=0.3)
+    assert found is not None
+    return analyse_singular(geometry, found, rank)
+
+
+CASES: dict[str, Any] = {
+    "slider-crank": lambda: (load("slider_crank"), [1.5 * PI + 0.05, -3.0 * PI - 0.1]),
+    "parallelogram": lambda: (load("parallelogram"), [0.1, -0.1, 0.1]),
+    "closed twice": lambda: (closed_twice("same point again"), [0.1, -0.1, 0.1]),
+    "hinge": lambda: (closed_twice("hinge"), [0.1, -0.1, 0.1]),
+    "N = 3": lambda: (load("n_four_bar_3"), parallel(3, 0.1)),
+    "ball": lambda: (ball_dead_point(PI / 2.0), ball_dead_point(PI / 2.0 + 0.1).q0),
+    "free flyer": lambda: (floating_slider_crank(), floating_slider_crank(away=0.1).q0),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_nearest_singular_configuration_is_closed_and_singular(case: str) -> None:
+    mechanism, q = CASES[case]()
+    singular = singular_at(mechanism, q)
+    geometry = singular.geometry
+    g, _ = geometry.closure(singular.q)
+    values = np.linalg.svd(geometry.normalised(singular.q), compute_uv=False)
+    assert np.abs(g).max() < 1e-14
+    assert values[mechanism.structure.rank - 1] < 1e-12
+    assert np.abs(geometry.difference(np.asarray(q), singular.q)).max() < 0.3
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_hessians_are_the_derivatives_of_the_jacobian(case: str) -> None:
+    singular = singular_at(*CASES[case]())
+    geometry = singular.geometry
+    u = np.random.default_rng(1).standard_normal(len(geometry.unit))
+    tau = 1e-5
+    ahead = geometry.normalised(geometry.move(singular.q, tau * u))
+    behind = geometry.normalised(geometry.move(singular.q, -tau * u))
+    expected = singular.left.T @ (ahead - behind) / (2.0 * tau)
+    np.testing.assert_allclose(singular.hessians(u), expected, atol=1e-8)
+    for a, n in enumerate(singular.null.T):
+        np.testing.assert_allclose(
+            singular.forms[:, a], singular.hessians(n) @ singular.null, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_third_derivative_is_that_of_the_bias_along_a_constant_velocity(case: str) -> None:
+    singular = singular_at(*CASES[case]())
+    geometry = singular.geometry
+    u = 3.0 * np.random.default_rng(2).standard_normal(len(geometry.unit))
+    tau = 1e-5
+    ahead = geometry.bias(geometry.move(singular.q, tau * u), u)
+    behind = geometry.bias(geometry.move(singular.q, -tau * u), u)
+    expected = singular.left.T @ (ahead - behind) / (2.0 * tau)
+    scale = max(1.0, float(np.abs(expected).max()))
+    np.testing.assert_allclose(singular.third_derivative(u), expected, atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize("away", [0.0, 1e-12, 1e-8, 1e-6, 1e-4, 1e-3])
+def test_the_limit_of_the_algebra_gives_the_exact_acceleration(away: float) -> None:
+    angle = PI / 2.0 + away
+    mechanism = ball_dead_point(angle, 4.0)
+    singular = singular_at(mechanism, mechanism.q0)
+    limit = branch_limit(singular, mechanism.q0, mechanism.v0)
+    assert limit is not None
+    model = mechanism.model
+    data = model.createData()
+    free = pin.aba(model, data, mechanism.q0, mechanism.v0, np.zeros(model.nv))
+    acceleration = (free - limit.multiplier(mechanism.v0, free))[0]
+    expected = reduced.spatial_dead_point()(0.0, [angle, 4.0])[1]
+    assert acceleration == pytest.approx(expected, abs=1e-9)
+    assert np.abs(limit.projector @ mechanism.v0).max() < 1e-9
+
+
+def test_the_limit_formula_is_exact_on_the_configuration_itself() -> None:
+    mechanism = ball_dead_point(PI / 2.0, 4.0)
+    singular = singular_at(mechanism, mechanism.q0)
+    free = pin.aba(
+        mechanism.model,
+        mechanism.model.createData(),
+        mechanism.q0,
+        mechanism.v0,
+        np.zeros(mechanism.model.nv),
+    )
+    acceleration = singular.limit_acceleration(mechanism.v0, free)
+    assert acceleration is not None
+    expected = reduced.spatial_dead_point()(0.0, [PI / 2.0, 4.0])[1]
+    assert acceleration[0] == pytest.approx(expected, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("case", "rows", "nullity"),
+    [
+        ("slider-crank", {"pin.normal"}, 1),
+        ("parallelogram", {"pin.x"}, 1),
+        ("closed twice", {"pin.x", "again.x"}, 1),
+        ("hinge", {"hinge.x"}, 1),
+        ("N = 3", {"pin_0.x", "pin_1.x", "pin_2.x"}, 3),
+        ("ball", {"rail.normal_1", "rail.normal_2"}, 1),
+    ],
+)
+def test_the_rows_that_lose_rank_are_named_and_redundant_ones_are_not(
+    case: str, rows: set[str], nullity: int
+) -> None:
+    singular = singular_at(*CASES[case]())
+    involved = singular.participants
+    assert set(involved.rows) == rows
+    assert involved.loops == tuple(dict.fromkeys(row.partition(".")[0] for row in involved.rows))
+    assert singular.nullity == nullity
+
+
+def test_far_from_singular_configurations_none_is_found() -> None:
+    mechanism = load("four_bar")
+    geometry = ClosureGeometry(mechanism, mechanism.q0)
+    assert nearest_singular(geometry, mechanism.q0, mechanism.structure.rank, 0.3) is None
+
+
+def test_starts_give_the_same_motion_as_a_run_that_passes_there() -> None:
+    """Slider-crank at 3 rad/s: what passes 3 pi / 2 and what starts there."""
+    passing = srm.simulate(
+        load("slider_crank"),
+        1.0,
+        q0=[1.5 * PI - 0.5, -3.0 * PI + 1.0],
+        v0=[3.0, -6.0],
+        rtol=1e-11,
+        atol=1e-11,
+    )
+    times = np.linspace(0.0, 1.0, 2001)
+    angles = passing(times)[0][:, 0]
+    t0 = float(np.interp(1.5 * PI, angles, times))
+    for _ in range(5):
+        q, v = passing(t0)
+        t0 -= float((q[0] - 1.5 * PI) / v[0])
+    rate = float(passing(t0)[1][0])
+    started = srm.simulate(
+        load("slider_crank"),
+        1.0 - t0,
+        q0=[1.5 * PI, -3.0 * PI],
+        v0=[rate, -2.0 * rate],
+        rtol=1e-11,
+        atol=1e-11,
+    )
+    assert distance(load("slider_crank"), passing, started) < 1e-8

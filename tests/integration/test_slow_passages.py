@@ -1,0 +1,182 @@
+"""Singular configurations passed slowly, touched, or passed twice in a row: sigma far from linear.
+
+References: SciPy on the reduced equations, and motions that a controller makes exact.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import srm_mbs as srm
+from tests.support import reduced, tangency
+from tests.support.bundled import load
+
+TOP = np.pi / 2.0
+"""Crank angle of slider_crank at its upper singular configuration, an unstable equilibrium."""
+TABLEAUS = pytest.mark.parametrize("tableau", ["dop853", "dopr54"])
+
+
+def slider_crank(angle: float, rate: float) -> srm.Mechanism:
+    """slider_crank on its moving branch, where rod = -2 crank."""
+    return load("slider_crank").with_state(
+        np.array([angle, -2.0 * angle]), np.array([rate, -2.0 * rate])
+    )
+
+
+def off_branch(solution: srm.Solution, t: np.ndarray) -> float:
+    q, _ = solution(t)
+    return float(np.abs(q[:, 1] + 2.0 * q[:, 0]).max())
+
+
+@TABLEAUS
+@pytest.mark.parametrize("rate", [1.0, 0.1, 0.01, 1e-3])
+def test_slow_passages_follow_the_reduced_equation(tableau: str, rate: float) -> None:
+    """``rate`` (rad/s) at the top, from 2 s before to 0.2 s after; deviations grow there by
+    exp(1.36 t), and over this range by 20."""
+    field = reduced.slider_crank()
+    before, after, tol = 2.0, 0.2, 1e-10
+    t = np.linspace(0.0, before + after, 45)
+    back = solve_ivp(
+        lambda t, y: [-x for x in field(t, y)],
+        (0.0, before),
+        [TOP, rate],
+        "DOP853",
+        rtol=3e-14,
+        atol=1e-16,
+    )
+    start = back.y[:, -1]
+    exact = solve_ivp(field, (0.0, t[-1]), start, "DOP853", t, rtol=3e-14, atol=1e-16)
+    solution = srm.simulate(slider_crank(*start), t[-1], rtol=tol, tableau=tableau)
+    assert solution.success
+    q, v = solution(t)
+    assert np.abs(q[:, 0] - exact.y[0]).max() < 100.0 * tol
+    assert np.abs(v[:, 0] - exact.y[1]).max() < 100.0 * tol
+    assert off_branch(solution, t) < 10.0 * tol
+    crossing = solution.crossings[-1]
+    assert abs(crossing.time - before) * rate < 100.0 * tol
+    assert not crossing.switched
+    assert solution.bifurcations == ()
+
+
+SWING, FREQUENCY = 0.4, 2.0
+
+
+def swung(reach: float, tableau: str, tol: float = 1e-8) -> tuple[srm.Solution, np.ndarray]:
+    """slider_crank driven to crank = TOP + reach + SWING (-1 - cos(2 t)), so ``reach`` beyond the
+    singular configuration and back, twice, and when it was there."""
+    middle = TOP + reach - SWING
+
+    def torque(t: float, q: Any, v: Any) -> list[float]:
+        # (8/3 + 8 sin^2) a'' + 8 sin cos a'^2 + 2 g cos = torque, from the kinetic energy
+        s, c = np.sin(q[0]), np.cos(q[0])
+        wanted = SWING * FREQUENCY**2 * np.cos(FREQUENCY * t)
+        return [
+            (8.0 / 3.0 + 8.0 * s * s) * wanted + 8.0 * s * c * v[0] ** 2 + 2.0 * reduced.G * c,
+            0.0,
+        ]
+
+    solution = srm.simulate(
+        slider_crank(middle - SWING, 0.0), 2.0 * np.pi, rtol=tol, tableau=tableau, controller=torque
+    )
+    assert solution.success
+    t = np.linspace(0.0, 2.0 * np.pi, 161)
+    q, v = solution(t)
+    angle = middle - SWING * np.cos(FREQUENCY * t)
+    rate = SWING * FREQUENCY * np.sin(FREQUENCY * t)
+    error = np.maximum(np.abs(q[:, 0] - angle), np.abs(v[:, 0] - rate))
+    assert off_branch(solution, t) < 100.0 * tol
+    return solution, error
+
+
+@TABLEAUS
+@pytest.mark.parametrize("reach", [0.3, 0.03, 0.01, 1e-3])
+def test_a_motion_that_turns_back_beyond_passes_twice(tableau: str, reach: float) -> None:
+    solution, error = swung(reach, tableau)
+    assert error.max() < 1e-7
+    half = np.arccos(1.0 - reach / SWING) / FREQUENCY
+    exact = [turn + side * half for turn in (np.pi / 2, 3 * np.pi / 2) for side in (-1.0, 1.0)]
+    found = [crossing.time for crossing in solution.crossings]
+    assert len(found) == 4
+    # where the motion turns, an error of the angle is one of time over the rate
+    rate = np.sqrt(2.0 * SWING * reach) * FREQUENCY
+    assert np.abs(np.array(found) - exact).max() < 1e-7 / rate
+    assert not any(crossing.switched for crossing in solution.crossings)
+    assert solution.bifurcations == ()
+
+
+@TABLEAUS
+@pytest.mark.parametrize("reach", [-0.1, -0.01, -1e-3, -1e-4])
+def test_a_motion_that_turns_back_before_passes_nowhere(tableau: str, reach: float) -> None:
+    solution, error = swung(reach, tableau)
+    assert error.max() < 1e-7
+    assert solution.crossings == ()
+    assert solution.bifurcations == ()
+
+
+@TABLEAUS
+def test_a_motion_that_just_reaches_a_singular_configuration_says_so(tableau: str) -> None:
+    """It comes to rest there, where nothing chooses a branch; it keeps the one it came along."""
+    solution, error = swung(0.0, tableau)
+    assert error.max() < 1e-5
+    for time in (np.pi / 2, 3 * np.pi / 2):
+        assert any(b.start - 0.01 < time < b.end + 0.01 for b in solution.bifurcations)
+    assert not any(crossing.switched for crossing in solution.crossings)
+    assert "momentum" in solution.message
+
+
+END = 0.35
+
+
+def touched(reach: float, tableau: str, tol: float = 1e-8) -> tuple[srm.Solution, float]:
+    """The mechanism of tests.tangency, and the error of its input angle."""
+    solution = srm.simulate(tangency.mechanism(reach), END, rtol=tol, tableau=tableau)
+    assert solution.success
+    t = np.linspace(0.0, END, 36)[1:]
+    q, _ = solution(t)
+    assert np.abs(q[:, 3] + 2.0 * q[:, 2]).max() < 1e-10
+    return solution, float(np.abs(q[:, 0] - tangency.inputs(reach, t)).max())
+
+
+@TABLEAUS
+@pytest.mark.parametrize("reach", [0.05, 0.01, 1e-3])
+def test_a_linkage_that_turns_just_beyond_passes_twice(tableau: str, reach: float) -> None:
+    """At reach 1e-3 sigma stays below 1e-3 in between."""
+    solution, error = touched(reach, tableau)
+    assert error < 1e-7
+    q, _ = solution(np.array([crossing.time for crossing in solution.crossings]))
+    assert len(q) == 2
+    assert np.abs(q[:, 2] - TOP).max() < 1e-6
+    assert all(crossing.loops == ("slide",) for crossing in solution.crossings)
+    assert not any(crossing.switched for crossing in solution.crossings)
+
+
+@TABLEAUS
+@pytest.mark.parametrize("reach", [-0.01, -1e-3, -1e-4])
+def test_a_linkage_that_turns_just_before_passes_nowhere(tableau: str, reach: float) -> None:
+    solution, error = touched(reach, tableau)
+    assert error < 1e-7
+    assert solution.crossings == ()
+
+
+@TABLEAUS
+@pytest.mark.parametrize("tol", [1e-5, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11])
+def test_where_branches_are_tangent_the_motion_stays_on_its_own(tableau: str, tol: float) -> None:
+    """State and rates are the same on both branches; the smooth continuation is kept.  What
+    rounding leaves to solve for there bounds the accuracy."""
+    solution, error = touched(0.0, tableau, tol)
+    assert error < max(2.0 * tol, 1e-6)
+    assert len(solution.crossings) == 1
+
+
+@TABLEAUS
+@pytest.mark.parametrize("tol", [1e-9, 1e-10, 1e-11])
+def test_where_a_linkage_turns_just_beyond_tight_tolerances_are_kept(
+    tableau: str, tol: float
+) -> None:
+    solution, error = touched(1e-3, tableau, tol)
+    assert error < 1e-8
+    assert len(solution.crossings) == 2

@@ -1,0 +1,163 @@
+"""Closures as Pinocchio's constraint models, and back: the same rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
+
+
+def placement(rng: np.random.Generator) -> pin.SE3:
+    return pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
+
+
+def tree(seed: int = 0) -> pin.Model:
+    """A branching tree with ball, sliding and turning joints."""
+    rng = np.random.default_rng(seed)
+    model = pin.Model()
+    kinds = [pin.JointModelSpherical(), pin.JointModelRX(), pin.JointModelPY(), pin.JointModelRZ()]
+    for k, (parent, kind) in enumerate(zip((0, 1, 1, 3), kinds)):
+        at, link = placement(rng), placement(rng)
+        joint = model.addJoint(parent, kind, at, f"j{k}")
+        model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
+        model.addBodyFrame(f"link_{k}", joint, link, 0)
+    return model
+
+
+def constraint(kind: str, model: pin.Model, joints: tuple[int, int], seed: int) -> Any:
+    rng = np.random.default_rng(seed)
+    one, two = (placement(rng) for _ in range(2))
+    if kind.startswith("rigid"):
+        type_ = pin.ContactType.CONTACT_3D if "3" in kind else pin.ContactType.CONTACT_6D
+        return pin.RigidConstraintModel(
+            type_, model, joints[0], one, joints[1], two, pin.ReferenceFrame.LOCAL
+        )
+    made = {"point": pin.PointAnchorConstraintModel, "frame": pin.FrameAnchorConstraintModel}
+    anchor = made[kind.removeprefix("wrapped_")](model, joints[0], one, joints[1], two)
+    return pin.ConstraintModel(anchor) if kind.startswith("wrapped") else anchor
+
+
+def rows(model: pin.Model, loop: srm.LoopClosure, q: Any) -> tuple[np.ndarray, np.ndarray]:
+    kinematics = LoopKinematics(model, (loop,))
+    data = model.createData()
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    kinematics.update(data, q, with_bias=False)
+    return kinematics.g.copy(), kinematics.G.copy()
+
+
+def of_pinocchio(model: pin.Model, given: Any, q: Any) -> tuple[Any, np.ndarray]:
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    pin.computeJointJacobians(model, data, q)
+    constraint_data = given.createData()
+    given.calc(model, data, constraint_data)
+    J = pin.getConstraintJacobian(model, data, given, constraint_data)
+    own = constraint_data.extract() if hasattr(constraint_data, "extract") else constraint_data
+    return own.c1Mc2, np.array(J)
+
+
+@pytest.mark.parametrize("joints", [(2, 4), (4, 2), (0, 4), (3, 0)])
+@pytest.mark.parametrize("kind", ["point", "wrapped_point", "rigid3", "frame", "rigid6"])
+def test_rows_and_jacobians_are_those_of_pinocchio(kind: str, joints: tuple[int, int]) -> None:
+    model = tree()
+    given = constraint(kind, model, joints, 1)
+    (loop,) = closures_from_pinocchio(model, given)
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        q = pin.integrate(model, pin.neutral(model), rng.normal(size=model.nv))
+        g, G = rows(model, loop, q)
+        relative, J = of_pinocchio(model, given, q)
+        swapped = joints[1] == 0  # b is the world
+        if swapped:
+            relative = relative.inverse()
+        p, R = relative.translation, relative.rotation
+        assert g[:3] == pytest.approx(p, abs=1e-12)
+        if kind.endswith("point") or kind == "rigid3":
+            if swapped:
+                continue  # theirs are the rates of b in a
+            if kind == "rigid3":  # velocities of two points; ours is that seen from b
+                data = model.createData()
+                pin.computeJointJacobians(model, data, q)
+                local = pin.getJointJacobian(model, data, joints[0], pin.ReferenceFrame.LOCAL)
+                turning = given.joint1_placement.rotation.T @ local[3:]
+                J = -J - np.cross(turning.T, p).T
+            assert pytest.approx(J, abs=1e-11) == G[:3]
+            continue
+        # Spatial velocity of a in b, at b's origin and in its axes; that of b in a if swapped.
+        V = J if kind == "frame" else -J
+        if swapped:
+            V = -relative.action @ V
+        moved = V[:3] + np.cross(V[3:].T, p).T
+        assert pytest.approx(moved, abs=1e-11) == G[:3]
+        axes = loop.rows.alignments
+        for k, (u, n) in enumerate(axes):
+            rate = np.array([n @ np.cross(w, R @ u) for w in V[3:].T])
+            assert G[3 + k] == pytest.approx(rate, abs=1e-11)
+
+
+def test_a_mechanism_goes_to_pinocchio_and_comes_back() -> None:
+    mechanism = srm.load("spatial_four_bar")
+    found = mechanism.to_pinocchio()
+    assert found.names == ("ball",)
+    assert found.without == ()
+    again = srm.Mechanism.from_pinocchio(
+        mechanism.model, found.models, q0=mechanism.q0, v0=mechanism.v0
+    )
+    assert [loop.name for loop in again.loops] == ["ball"]
+    end = srm.simulate(mechanism, 0.5, rtol=1e-9).q[-1]
+    assert np.abs(srm.simulate(again, 0.5, rtol=1e-9).q[-1] - end).max() < 1e-9
+
+
+def test_pinocchio_finds_the_same_accelerations() -> None:
+    mechanism = srm.load("spatial_four_bar")
+    model = mechanism.model
+    rigid = mechanism.to_pinocchio().models
+    data = model.createData()
+    datas = pin.StdVec_RigidConstraintData()
+    for one in rigid:
+        datas.append(one.createData())
+    pin.initConstraintDynamics(model, data, rigid, datas)
+    settings = pin.ProximalSettings(1e-14, 1e-10, 20)
+    theirs = pin.constraintDynamics(
+        model, data, mechanism.q0, mechanism.v0, np.zeros(model.nv), rigid, datas, settings
+    )
+    ours = srm.simulate(mechanism, 1e-6).accelerations[0]
+    assert np.abs(theirs - ours).max() < 1e-6 * np.abs(ours).max()
+
+
+def test_closures_without_a_model_are_named() -> None:
+    found = srm.load("slider_crank").to_pinocchio()
+    assert len(found.models) == 0
+    assert found.without == ("pin",)
+
+
+def test_what_cannot_be_converted_is_refused() -> None:
+    model = tree()
+    limits = pin.JointLimitConstraintModel(model, [2])
+    with pytest.raises(srm.InputError, match=r"constraint_models\[0\].*JointLimitConstraintModel"):
+        srm.closures_from_pinocchio(model, [limits])
+    shifted = constraint("point", model, (1, 2), 0)
+    shifted.desired_constraint_offset = np.array([0.0, 0.0, 0.1])
+    with pytest.raises(srm.InputError, match="a desired offset"):
+        srm.closures_from_pinocchio(model, shifted)
+    bare = pin.Model()
+    joint = bare.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "bare")
+    with pytest.raises(srm.InputError, match=r"joint 'bare' has no frame.*addBodyFrame"):
+        srm.closures_from_pinocchio(
+            bare, pin.PointAnchorConstraintModel(bare, joint, pin.SE3.Identity())
+        )
+    with pytest.raises(srm.InputError, match="no closure for a float"):
+        srm.closures_from_pinocchio(model, [3.0])
+
+
+def test_equal_names_are_told_apart() -> None:
+    model = tree()
+    pair = [constraint("point", model, (1, 4), k) for k in range(2)]
+    names = [loop.name for loop in srm.closures_from_pinocchio(model, pair)]
+    assert len(set(names)) == 2

@@ -1,0 +1,459 @@
+"""Index-2 DAEs: the thesis' table 5.1, orders, singularities, tolerances, faults, bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from benchmarks.thesis.entries import PRINTED
+from tests.support.daes import (
+    START_PASSING,
+    START_TWO,
+    passing_singularity,
+    problem_one,
+    problem_two,
+    solution_passing,
+    solution_two,
+)
+
+
+@pytest.mark.parametrize(("tableau", "m"), [("fe", 1), ("trap", 2), ("erk4", 4), ("dopr54", 5)])
+def test_table_5_1_of_the_thesis_is_reproduced_to_all_printed_digits(
+    tableau: str, m: int, exact: dict[str, Any]
+) -> None:
+    """14 decimals; the last of y is rounding of g/eps summed over 1000 steps."""
+    solution = srm.solve_dae(
+        problem_two(), (0.0, 1.0), START_TWO, method=srm.SRM(tableau, m, eps=0.005), step=0.001
+    )
+    x1, x2, y = (float(digits) for digits in exact["table5.1"][tableau])
+    assert solution.x[-1] == pytest.approx([x1, x2], rel=0.0, abs=1.1e-14)
+    assert solution.y[-1] == pytest.approx([y], rel=0.0, abs=5e-14)
+    # As the thesis prints them.  y adds up g/eps: one rounding of g is 2e-14 in y.
+    printed = PRINTED["table5.1"]["rows"][f"{tableau}, m = {m}"]
+    assert [f"{x:.14f}" for x in solution.x[-1]] == [printed["x1"], printed["x2"]]
+    assert solution.y[-1, 0] == pytest.approx(float(printed["y"]), abs=1e-13, rel=0)
+
+
+def observed(
+    problem: srm.SemiExplicitDAE, x0: Any, method: Any, steps: tuple[float, ...], exact: Any
+) -> float:
+    errors = []
+    for h in steps:
+        solution = srm.solve_dae(problem, (0.0, 1.0), x0, method=method, step=h)
+        assert solution.success, solution.message
+        errors.append(np.abs(solution.x[-1] - exact).max())
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+@pytest.mark.parametrize(
+    ("tableau", "m", "printed"),
+    [("trap", 1, 0.9722), ("trap", 2, 1.9995), ("tvd32", 2, 1.9646), ("tvd32", 3, 2.9999),
+     ("erk4", 1, 0.9344), ("erk4", 2, 1.8897), ("erk4", 3, 2.8783), ("erk4", 4, 3.9085)],
+)  # fmt: skip
+def test_srm_has_order_min_m_p_on_problem_one(tableau: str, m: int, printed: float) -> None:
+    """Theory m; ``printed``: the thesis, tables 5.2 to 5.4, eps = h, over a wider range of h."""
+    problem = problem_one(srm.TABLEAUS[tableau].order)
+    order = observed(problem, [0.0], srm.SRM(tableau, m), (0.02, 0.01, 0.005), 1.0)
+    assert order == pytest.approx(m, abs=0.12)
+    assert order == pytest.approx(printed, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    "T", ["identity", pytest.param("transpose", marks=pytest.mark.stress), "inverse"]
+)
+@pytest.mark.parametrize(
+    ("method", "theory"),
+    [
+        ({"tableau": "erk4"}, 4.0),
+        ({"tableau": "erk4", "prediction": "simple"}, 2.0),
+        ({"tableau": "erk4", "correction": "sweep", "interpolation": "auto"}, 8 / 3),
+        ({"tableau": "dopr54", "correction": "sweep", "interpolation": "auto"}, 13 / 3),
+        ({"tableau": "erk4", "correction": "fused", "eps": 0.3}, 4.0),
+    ],
+    ids=str,
+)
+def test_psrm_has_its_order_on_problem_two_with_every_t(
+    T: str, method: dict[str, Any], theory: float
+) -> None:
+    exact, _ = solution_two(1.0)
+    steps = (0.04, 0.02, 0.01)
+    order = observed(problem_two(), START_TWO, srm.PSRM(**method, T=T), steps, exact)
+    assert order == pytest.approx(theory, abs=0.3)
+
+
+def test_the_multiplier_converges_as_well() -> None:
+    for method, bound in ((srm.PSRM("erk4"), 1e-8), (srm.SRM("erk4", 4, eps=0.02), 1e-3)):
+        solution = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, method=method, step=0.01)
+        assert solution.y.shape == (101, 1)
+        assert abs(solution.y[-1, 0] - np.e) < bound
+
+
+@pytest.mark.parametrize("method", ["psrm", srm.PSRM("tvd32"), srm.PSRM("dopr54")], ids=str)
+def test_errors_fall_with_the_tolerance(method: Any) -> None:
+    errors = []
+    for tol in (1e-4, 1e-6, 1e-8):
+        solution = srm.solve_dae(
+            problem_two(), (0.0, 2.0), START_TWO, method=method, rtol=tol, atol=tol
+        )
+        errors.append(np.abs(solution.x[-1] - solution_two(2.0)[0]).max())
+        assert errors[-1] < 30.0 * tol
+    assert errors[2] < 0.1 * errors[1] < 0.01 * errors[0]
+
+
+def test_dense_output_is_as_accurate_as_the_steps() -> None:
+    t = np.linspace(0.0, 2.0, 101)
+    exact_x, exact_y = solution_two(t)
+    solution = srm.solve_dae(problem_two(), (0.0, 2.0), START_TWO, rtol=1e-9, atol=1e-9)
+    x, y = solution(t)
+    assert np.abs(x - exact_x).max() < 1e-7
+    assert np.abs(y[:, 0] - exact_y).max() < 1e-5
+    for method in (srm.SRM("dopr54", 5, eps=0.02), srm.PSRM("dopr54", correction="sweep")):
+        solution = srm.solve_dae(problem_two(), (0.0, 2.0), START_TWO, method=method, step=0.01)
+        late = t > 0.5  # behind the initial layer of sweeps that start from y = 0
+        at_nodes = np.abs(solution.x - solution_two(solution.t)[0])[solution.t > 0.5].max()
+        x, y = solution(t + 0.003 * (t < 2.0))
+        exact_x, exact_y = solution_two(t + 0.003 * (t < 2.0))
+        assert np.abs(x - exact_x)[late].max() < 5.0 * at_nodes + 1e-12
+    x, y = solution(0.5)
+    assert x.shape == (2,)
+    assert y.shape == (1,)
+    chosen = srm.solve_dae(problem_two(), (0.0, 2.0), START_TWO, t_eval=[0.5, 1.5])
+    assert chosen.t.tolist() == [0.5, 1.5]
+    assert chosen.x.shape == (2, 2)
+    assert chosen.y.shape == (2, 1)
+
+
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+def test_the_split_form_passes_an_isolated_singularity_of_gb(tableau: str) -> None:
+    placements = 0
+    for tol in (1e-4, 1e-6, 1e-8, 1e-10):
+        solution = srm.solve_dae(
+            passing_singularity(), (0.0, 3.0), START_PASSING, tableau=tableau, rtol=tol, atol=tol
+        )
+        assert solution.success, solution.message
+        # tol bounds the error of a step; over the run errors add up.
+        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < 10.0 * tol
+        placements += solution.stats.placements
+    assert placements > 0
+
+
+@pytest.mark.parametrize(
+    ("method", "bound"),
+    [
+        (srm.PSRM("erk4", correction="sweep", T="inverse"), 1e-5),
+        (srm.SRM("tvd32", 3, T="inverse", restart=True, carry=True), 1e-3),
+    ],
+    ids=str,
+)
+def test_sweeps_that_carry_by_pass_an_isolated_singularity(method: Any, bound: float) -> None:
+    solution = srm.solve_dae(passing_singularity(), (0.0, 3.0), START_PASSING, method=method,
+                             step=0.01)  # fmt: skip
+    assert solution.success, solution.message
+    assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < bound
+
+
+@pytest.mark.parametrize(
+    ("method", "bounds"),
+    [
+        (srm.PSRM("tvd32", correction="sweep", T="inverse"), (2e-4, 2e-6)),
+        (srm.PSRM("dopr54", correction="sweep", T="inverse"), (2e-4, 2e-6)),
+        (srm.PSRM("dopr54", correction="sweep", T="inverse", interpolation="linear"), (1e-3, 2e-5)),
+        (srm.PSRM("dop853", correction="fused", T="inverse"), (1e-6, 1e-8)),
+        (srm.SRM("tvd32", 3, T="inverse", restart=True, carry=True), (2e-4, 2e-6)),
+    ],
+    ids=str,
+)
+def test_adaptive_sweeps_pass_an_isolated_singularity_and_follow_the_tolerance(
+    method: Any, bounds: tuple[float, float]
+) -> None:
+    for tol, bound in zip((1e-4, 1e-6), bounds):
+        solution = srm.solve_dae(
+            passing_singularity(), (0.0, 3.0), START_PASSING, method=method, rtol=tol, atol=tol
+        )
+        assert solution.success, solution.message
+        assert "turned" not in solution.message
+        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < bound
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "bound"),
+    [
+        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.02}, 1e-3),
+        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.01}, 2e-4),
+        (srm.SRM("erk4", 4, T="inverse"), {"step": 0.01}, 1e-4),
+        (srm.SRM("dopr54", 5, T="inverse"), {"step": 0.02}, 1e-3),
+        (srm.SRM("tvd32", 3, T="inverse"), {"rtol": 1e-4, "atol": 1e-4}, 1e-3),
+        (srm.SRM("tvd32", 3, T="inverse", eps=0.003), {"rtol": 1e-4, "atol": 1e-4}, 5e-5),
+    ],
+    ids=str,
+)
+def test_own_histories_are_restarted_next_to_a_singularity_and_pass(
+    method: Any, options: dict[str, Any], bound: float
+) -> None:
+    """Their first sweep is off by O(eps), on a level of g that turns off whatever the step."""
+    solution = srm.solve_dae(
+        passing_singularity(), (0.0, 3.0), START_PASSING, method=method, **options
+    )
+    assert solution.success, solution.message
+    assert "turned" not in solution.message
+    assert "gave up their own histories" in solution.message
+    assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < bound
+
+
+def test_own_histories_are_kept_where_nothing_is_singular() -> None:
+    method = srm.SRM("tvd32", 3, T="inverse", eps=0.02)
+    solution = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, method=method, step=0.01)
+    assert solution.success
+    assert "own histories" not in solution.message
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        (srm.PSRM("tvd32", "simple"), {"step": 0.01}),
+        (srm.SRM("tvd32", 3, T="inverse", eps=0.01, restart=True), {"step": 0.01}),
+        pytest.param(
+            srm.PSRM("dopr54", correction="sweep"),
+            {"rtol": 1e-4, "atol": 1e-4},
+            marks=pytest.mark.stress,
+        ),
+    ],
+    ids=str,
+)
+def test_a_wrong_branch_is_never_silent(method: Any, options: dict[str, Any]) -> None:
+    """Sweeps that carry the unbounded y, or start every step from 0, do not pass: they say it."""
+    solution = srm.solve_dae(
+        passing_singularity(), (0.0, 3.0), START_PASSING, method=method, **options
+    )
+    assert not solution.success, "this method passes now: say so in the docstring of solve_dae"
+    assert "x' turned" in solution.message
+    assert 'T = "inverse"' in solution.message
+    assert "unstable" not in solution.message
+    # What is kept is before the branches part, or not far behind.
+    assert 1.0 < solution.t[-1] < 1.8
+    before = solution.t < 1.2
+    exact = np.array([solution_passing(float(t)) for t in solution.t[before]])
+    assert np.abs(solution.x[before] - exact).max() < 0.02
+
+
+def test_a_sharp_turn_away_from_singularities_is_not_reported() -> None:
+    """The same problem on a level g = c that passes beside the singular point."""
+    problem = passing_singularity()
+    moved = srm.SemiExplicitDAE(
+        f=problem.f, B=problem.B, G=problem.G, g=lambda t, x: problem.g(t, x) + 0.02
+    )
+    start = [-1.0, 0.52]
+    solution = srm.solve_dae(moved, (0.0, 3.0), start, rtol=1e-6, atol=1e-6)
+    assert solution.success
+    assert solution.steps.sigmas.min() < 0.2
+    assert "turned" not in solution.message
+
+
+def test_singular_times_and_placement_are_those_of_simulate() -> None:
+    passage = 4.0 / 3.0
+    for options in (
+        {"singular_times": [passage], "placement": "off"},
+        {"singular_times": [passage], "step": 0.04},
+        {"placement": "halved", "step": 0.04},
+    ):
+        solution = srm.solve_dae(
+            passing_singularity(), (0.0, 3.0), START_PASSING, tableau="dopr54", **options
+        )
+        assert solution.success, solution.message
+        assert np.abs(solution.x[-1] - solution_passing(3.0)).max() < 1e-5
+        h = np.diff(solution.steps.times)
+        if "singular_times" in options:
+            stages = solution.steps.times[:-1, None] + h[:, None] * srm.TABLEAUS["dopr54"].c[1:]
+            assert (np.abs(stages - passage).min(axis=1) / h).min() > 0.049
+
+
+def test_events_are_located_and_end_a_run() -> None:
+    def crossing(t: float, x: Any) -> float:
+        return float(x[1] - 0.5)
+
+    def low(t: float, x: Any) -> float:
+        return float(x[0] - 0.3)
+
+    low.terminal = True  # type: ignore[attr-defined]
+    solution = srm.solve_dae(
+        problem_two(), (0.0, 2.0), START_TWO, rtol=1e-9, atol=1e-9, events=[crossing, low]
+    )
+    assert solution.status == "event"
+    assert solution.success
+    assert solution.t_events is not None
+    assert solution.x_events is not None
+    assert solution.t_events[0] == pytest.approx([np.pi / 6.0], abs=1e-8)
+    assert solution.t_events[1] == pytest.approx([-np.log(0.3)], abs=1e-8)
+    assert solution.x_events[1][0] == pytest.approx([0.3, np.sin(-np.log(0.3))], abs=1e-8)
+    assert solution.t[-1] == solution.t_events[1][0]
+    assert len(solution.x) == len(solution.y) == len(solution.t)
+    assert srm.solve_dae(problem_two(), (0.0, 0.1), START_TWO).t_events is None
+
+
+def test_a_run_is_written_as_a_table(tmp_path: Any) -> None:
+    solution = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO)
+    solution.to_csv(tmp_path / "run.csv")
+    lines = (tmp_path / "run.csv").read_text().splitlines()
+    assert lines[0] == "t,x[0],x[1],y[0]"
+    values = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    assert np.array_equal(values, np.column_stack([solution.t, solution.x, solution.y]))
+
+
+def test_sweeps_that_carry_y_say_why_they_cannot_go_on() -> None:
+    solution = srm.solve_dae(
+        passing_singularity(), (0.0, 1.0), START_PASSING, method="srm", rtol=1e-4, atol=1e-4
+    )
+    assert not solution.success
+    assert "T = I or (GB)^T" in solution.message
+    assert len(solution.x) > 10
+
+
+def test_constraints_hold_to_round_off_with_the_split_form() -> None:
+    problem = problem_two()
+    solution = srm.solve_dae(problem, (0.0, 5.0), START_TWO)
+    drift = [abs(problem.g(t, x)) for t, x in zip(solution.t, solution.x)]
+    assert max(drift) < 1e-10
+
+
+def test_two_constraints_are_solved_together() -> None:
+    """x = (cos t, sin t, 2 cos t): two of three states follow from the constraints."""
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: np.array([0.0, x[0], 0.0]),
+        B=lambda t, x: np.array([[2 * x[0], -2.0], [2 * x[1], 0.0], [0.0, 1.0]]),
+        g=lambda t, x: np.array([x[0] ** 2 + x[1] ** 2 - 1.0, x[2] - 2.0 * x[0]]),
+        G=lambda t, x: np.array([[2 * x[0], 2 * x[1], 0.0], [-2.0, 0.0, 1.0]]),
+    )
+    solution = srm.solve_dae(problem, (0.0, 1.0), [1.0, 0.0, 2.0], rtol=1e-8, atol=1e-8)
+    x = solution.x
+    assert solution.y.shape[1] == 2
+    assert np.abs(np.hypot(x[:, 0], x[:, 1]) - 1.0).max() < 1e-12
+    assert np.abs(x[:, 2] - 2.0 * x[:, 0]).max() < 1e-12
+    # B y leaves the tangent part of f: with P = B (GB)^-1 G the slope is (1 - P) f
+    slope = np.gradient(solution(np.linspace(0.4, 0.6, 201))[0], 0.001, axis=0)[100]
+    at = solution(0.5)[0]
+    G, B = problem.G(0.5, at), problem.B(0.5, at)
+    f = problem.f(0.5, at)
+    assert slope == pytest.approx(f - B @ np.linalg.solve(G @ B, G @ f), abs=1e-5)
+
+
+def late(value: Any) -> Any:
+    def f(t: float, x: Any) -> Any:
+        if t > 0.5:
+            if isinstance(value, Exception):
+                raise value
+            return value
+        return problem_two().f(t, x)
+
+    return f
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (RuntimeError("boom"), "f raised RuntimeError"),
+        (np.ones(3), "f returned shape"),
+        (np.full(2, np.nan), "not finite"),
+    ],
+    ids=["raises", "shape", "nan"],
+)
+@pytest.mark.parametrize("options", [{"step": 0.02}, {}], ids=["fixed", "adaptive"])
+def test_a_function_that_fails_on_the_way_leaves_the_partial_solution(
+    value: Any, words: str, options: dict[str, Any]
+) -> None:
+    problem = problem_two(f=late(value))
+    solution = srm.solve_dae(problem, (0.0, 1.0), START_TWO, tableau="dopr54", **options)
+    assert not solution.success
+    assert solution.status == "failed"
+    assert words in solution.message
+    assert 0.0 < solution.t[-1] <= 0.5
+    assert len(solution.x) == len(solution.y) == len(solution.t)
+    with pytest.raises(srm.SimulationError) as caught:
+        srm.solve_dae(problem, (0.0, 1.0), START_TWO, raise_on_failure=True)
+    assert caught.value.solution.t[-1] <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"problem": 3}, "not a DAE"),
+        ({"t_span": (1.0, 0.0)}, "t_span"),
+        ({"t_span": 1.0}, "t_span"),
+        ({"x0": [1.0, np.nan]}, "x0"),
+        ({"x0": [[1.0, 0.0]]}, "x0"),
+        ({"x0": [1.1, 0.0]}, "violates g"),
+        ({"x0": [1.0]}, "at the start"),
+        ({"step": -1.0}, "step"),
+        ({"rtol": 0.0}, "rtol"),
+        ({"atol": [1e-6] * 3}, "atol"),
+        ({"t_eval": [0.0, 3.0]}, "t_eval"),
+        ({"placement": "best"}, "no placement"),
+        ({"singular_times": [0.0]}, "singular_times"),
+        ({"events": [3]}, "events"),
+        ({"method": "bdf"}, "no method"),
+        ({"tableau": "erk4"}, "Give a step"),
+        ({"problem": problem_two(G=lambda t, x: 2.0 * x)}, "finite differences"),
+        ({"problem": problem_two(g_t=lambda t, x: 0.0)}, "g_t.*finite differences"),
+        ({"problem": problem_two(g_t=None)}, "g depends on t"),
+        ({"problem": problem_two(f=lambda t, x: np.ones(3))}, "f returned shape"),
+        ({"problem": problem_two(B=lambda t, x: 1 / 0)}, "ZeroDivisionError"),
+        ({"problem": problem_two(f=lambda t, x: x * np.nan)}, "not finite"),
+        ({"problem": problem_two(B=lambda t, x: np.array([-x[1], x[0]]))}, "singular"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "options",
+)
+def test_bad_input_is_refused_before_any_stepping(options: dict[str, Any], words: str) -> None:
+    arguments: dict[str, Any] = {"problem": problem_two(), "t_span": (0.0, 1.0), "x0": START_TWO}
+    with pytest.raises(srm.InputError, match=words):
+        srm.solve_dae(**(arguments | options))
+
+
+def test_a_problem_is_made_of_functions() -> None:
+    with pytest.raises(srm.InputError, match="G = 3 cannot be called"):
+        problem_two(G=3)
+
+
+def test_methods_without_exact_prediction_do_not_need_g_t() -> None:
+    for method in (srm.SRM("erk4", 4), srm.PSRM("erk4", "simple")):
+        solution = srm.solve_dae(
+            problem_two(g_t=None), (0.0, 1.0), START_TWO, method=method, step=0.01
+        )
+        assert np.abs(solution.x[-1] - solution_two(1.0)[0]).max() < 1e-3
+
+
+def test_a_run_that_is_read_nowhere_has_no_drift(tmp_path: Path) -> None:
+    run = srm.solve_dae(problem_two(), (0.0, 0.5), START_TWO, t_eval=[])
+    assert run.drift.shape == (0,)
+    run.to_csv(tmp_path / "run.csv")
+
+
+@pytest.mark.parametrize("t", ["now", 1j, [[0.1], 2.0], {0.1}])
+def test_times_that_are_no_numbers_are_refused(t: object) -> None:
+    dae = srm.solve_dae(problem_two(), (0.0, 0.5), START_TWO)
+    run = srm.simulate(srm.load("pendulum_chain"), 0.1)
+    for read in (dae, run, run.at):
+        with pytest.raises(srm.InputError, match="does not consist of numbers"):
+            read(t)
+
+
+def test_complex_numbers_are_refused_not_halved() -> None:
+    with pytest.raises(srm.InputError, match="x0"):
+        srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO + 0.5j)
+    for name in ("f", "B", "G"):
+        changed = problem_two(**{name: lambda t, x: x + 0.5j})
+        with pytest.raises(srm.InputError, match="complex"):
+            srm.solve_dae(changed, (0.0, 1.0), START_TWO)
+
+
+def test_the_number_of_sweeps_may_come_from_an_array() -> None:
+    method = srm.SRM("erk4", np.arange(5)[3], eps=0.05)
+    assert method == srm.SRM("erk4", 3, eps=0.05)
+    assert srm.solve_dae(problem_two(), (0.0, 0.1), START_TWO, method=method, step=0.01).success
+
+
+def test_a_prediction_that_is_no_name_is_refused() -> None:
+    with pytest.raises(srm.InputError, match="no PSRM"):
+        srm.PSRM(prediction=["exact"])  # type: ignore[arg-type]

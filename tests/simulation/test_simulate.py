@@ -1,0 +1,412 @@
+"""Options of ``simulate``, its failures, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import srm_mbs as srm
+from tests.support.mechanisms import along_x, floating_ring, rod
+
+
+@pytest.fixture(scope="module")
+def four_bar() -> srm.Mechanism:
+    return srm.load("four_bar")
+
+
+def test_defaults_are_sensible_without_any_option(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 1.0)
+    assert solution.success
+    assert solution.status == "finished"
+    assert solution.settings.tableau == "dop853"
+    assert solution.settings.rtol == 1e-6
+    assert solution.t[0] == 0.0
+    assert solution.t[-1] == 1.0
+    assert solution.q.shape == (len(solution.t), 3)
+    assert solution.v.shape == (len(solution.t), 3)
+
+
+def test_t_eval_gives_exactly_those_times_and_does_not_change_the_steps(
+    four_bar: srm.Mechanism,
+) -> None:
+    t = np.array([0.0, 0.1, 0.11, 0.5, 1.0])
+    sampled = srm.simulate(four_bar, 1.0, t_eval=t)
+    plain = srm.simulate(four_bar, 1.0)
+    assert np.array_equal(sampled.t, t)
+    assert np.array_equal(sampled.steps.times, plain.steps.times)
+    q, v = plain(t)
+    assert np.array_equal(sampled.q, q)
+    assert np.array_equal(sampled.v, v)
+
+
+def test_an_initial_state_may_be_given(four_bar: srm.Mechanism) -> None:
+    state = srm.assemble(four_bar, {"crank": 2.0}, {"crank": -1.0})
+    solution = srm.simulate(four_bar, 0.5, q0=state.q, v0=state.v)
+    assert solution.q[0, 0] == 2.0
+    assert solution.v[0, 0] == -1.0
+    assert four_bar.q0[0] == 1.0, "the mechanism itself is unchanged"
+
+
+def test_a_controller_acts_as_generalised_force() -> None:
+    """A driven pendulum chain against SciPy on aba with the same torque."""
+    mechanism = srm.load("pendulum_chain")
+    model, data = mechanism.model, mechanism.model.createData()
+
+    def torque(t: float, q: Any, v: Any) -> np.ndarray:
+        return np.array([20.0 * np.sin(3.0 * t), -2.0 * v[1], 0.5 * q[2]])
+
+    def field(t: float, x: np.ndarray) -> np.ndarray:
+        q, v = x[:3], x[3:]
+        return np.concatenate([v, pin.aba(model, data, q, v, torque(t, q, v))])
+
+    start = np.concatenate([mechanism.q0, mechanism.v0])
+    theirs = solve_ivp(field, (0, 3), start, method="DOP853", rtol=1e-12, atol=1e-12)
+    ours = srm.simulate(mechanism, 3.0, controller=torque, rtol=1e-10)
+    assert np.abs(ours.q[-1] - theirs.y[:3, -1]).max() < 1e-8
+
+
+def test_a_controller_acts_on_a_closed_loop(four_bar: srm.Mechanism) -> None:
+    """Power balance: the energy gained is the work of the crank torque."""
+
+    def torque(t: float, q: Any, v: Any) -> np.ndarray:
+        return np.array([5.0 * np.cos(t), 0.0, 0.0])
+
+    t = np.linspace(0.0, 2.0, 4001)
+    solution = srm.simulate(four_bar, 2.0, controller=torque, rtol=1e-10, t_eval=t)
+    power = 5.0 * np.cos(t) * solution.joint("crank")[1]
+    work = np.sum(0.5 * (power[1:] + power[:-1]) * np.diff(t))
+    assert solution.energy[-1] - solution.energy[0] == pytest.approx(work, rel=1e-5)
+
+
+def test_joint_damping_takes_energy_out(tmp_path: Any) -> None:
+    folder = tmp_path
+    model = srm.load("four_bar").source
+    assert model is not None
+    urdf = model.urdf.replace(
+        '<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><dynamics damping="0.3"/>'
+    )
+    assert urdf != model.urdf
+    (folder / "damped.urdf").write_text(urdf)
+    text = model.description.replace("../urdf/four_bar.urdf", "damped.urdf")
+    (folder / "damped.toml").write_text(text)
+    mechanism = srm.load(folder / "damped.toml")
+    t = np.linspace(0.0, 2.0, 4001)
+    solution = srm.simulate(mechanism, 2.0, rtol=1e-10, t_eval=t)
+    lost = 0.3 * (solution.v**2).sum(axis=1)
+    work = np.sum(0.5 * (lost[1:] + lost[:-1]) * np.diff(t))
+    assert solution.energy[0] - solution.energy[-1] == pytest.approx(work, rel=1e-5)
+
+
+def test_ctrl_c_keeps_the_partial_solution(four_bar: srm.Mechanism) -> None:
+    def interrupt(t: float, h: float, state: Any) -> None:
+        if t > 0.5:
+            raise KeyboardInterrupt
+
+    solution = srm.simulate(four_bar, 10.0, progress=interrupt)
+    assert solution.status == "interrupted"
+    assert not solution.success
+    assert 0.5 < solution.t[-1] < 10.0
+    assert "Interrupted at t =" in solution.message
+    q, _ = solution(0.25)
+    assert np.isfinite(q).all()
+
+
+def test_a_controller_that_raises_ends_the_run_with_what_was_computed(
+    four_bar: srm.Mechanism,
+) -> None:
+    def failing(t: float, q: Any, v: Any) -> np.ndarray:
+        if t > 0.3:
+            raise RuntimeError("sensor lost")
+        return np.zeros(3)
+
+    solution = srm.simulate(four_bar, 1.0, controller=failing)
+    assert solution.status == "failed"
+    assert "sensor lost" in solution.message
+    assert 0.0 < solution.t[-1] <= 0.3
+    with pytest.raises(srm.SimulationError, match="sensor lost") as caught:
+        srm.simulate(four_bar, 1.0, controller=failing, raise_on_failure=True)
+    assert caught.value.solution.t[-1] == solution.t[-1]
+
+
+@pytest.mark.parametrize("bad", [np.full(3, np.nan), np.zeros(2), "text"], ids=str)
+def test_a_controller_that_returns_nonsense_is_named(four_bar: srm.Mechanism, bad: Any) -> None:
+    solution = srm.simulate(four_bar, 1.0, controller=lambda t, q, v: bad)
+    assert solution.status == "failed"
+    assert "controller" in solution.message
+    assert len(solution.t) == 1
+
+
+def test_a_mechanism_that_blows_up_returns_what_was_computed() -> None:
+    mechanism = srm.load("pendulum_chain")
+    solution = srm.simulate(mechanism, 100.0, tableau="fe", step=0.4)
+    assert solution.status == "failed"
+    assert "Stopped at t =" in solution.message
+    assert np.isfinite(solution.q).all()
+
+
+def test_a_locked_up_error_estimate_ends_the_run_instead_of_hanging(
+    four_bar: srm.Mechanism,
+) -> None:
+    """A torque that jumps at every call cannot be integrated: bounded attempts, then a message."""
+    rng = np.random.default_rng(0)
+    solution = srm.simulate(
+        four_bar, 1.0, controller=lambda t, q, v: 1e9 * rng.standard_normal(3), rtol=1e-8
+    )
+    assert solution.status == "failed"
+    assert "error estimate" in solution.message
+
+
+def test_loose_tolerances_are_capped_with_a_warning(four_bar: srm.Mechanism) -> None:
+    for tableau, method, loosest in (
+        ("dop853", "psrm", 1e-2),
+        ("dopr54", "psrm", 1e-3),
+        ("tvd32", "srm", 1e-4),
+    ):
+        with pytest.warns(srm.SrmWarning, match=f"rtol = 0.1 is looser than {loosest:g}"):
+            solution = srm.simulate(four_bar, 0.5, rtol=0.1, method=method, tableau=tableau)
+        assert solution.settings.rtol == loosest
+
+
+def test_tolerances_below_round_off_are_raised_with_a_warning(four_bar: srm.Mechanism) -> None:
+    with pytest.warns(srm.SrmWarning, match="below round-off: using 1.0e-12"):
+        srm.simulate(four_bar, 0.01, rtol=1e-16)
+    for tableau, tightest in (("dop853", 1e-12), ("dopr54", 1e-12), ("tvd32", 1e-11)):
+        expected = "rtol = 1e-13 is below round-off next to singular configurations"
+        with pytest.warns(srm.SrmWarning, match=f"{expected}.*using {tightest:.1e}"):
+            solution = srm.simulate(four_bar, 0.01, rtol=1e-13, tableau=tableau)
+        assert solution.settings.rtol == tightest
+
+
+def test_mechanisms_without_closures_may_ask_for_tighter_tolerances() -> None:
+    pendulum = srm.load("simple_pendulum")
+    assert srm.simulate(pendulum, 0.01, rtol=1e-13).settings.rtol == 1e-13
+    with pytest.warns(srm.SrmWarning, match=r"below round-off: using 2\.2e-14"):
+        srm.simulate(pendulum, 0.01, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"t_end": -1.0}, "t_end"),
+        ({"t_end": float("nan")}, "t_end"),
+        ({"step": 0.0}, "step"),
+        ({"max_step": -1.0}, "max_step"),
+        ({"first_step": float("inf")}, "first_step"),
+        ({"rtol": -1e-6}, "rtol"),
+        ({"atol": [1e-6, 1e-6]}, r"atol has shape \(2,\)"),
+        ({"atol": 0.0}, "atol = 0 is not positive"),
+        ({"atol": [1e-6, -1.0, 1e-6]}, "the smallest atol, -1, is not positive"),
+        ({"method": "newmark"}, "Known: 'psrm', 'srm'"),
+        ({"method": srm.SRM(T="inverse")}, "no such matrix"),
+        ({"tableau": "rk45"}, "dopr54"),
+        ({"tableau": "erk4"}, "Give a step, or use"),
+        ({"method": srm.PSRM(), "tableau": "dopr54"}, r"PSRM\(tableau"),
+        ({"backend": "fortran"}, "auto, python, kernel"),
+        ({"backend": "kernel", "method": "srm"}, "the split PSRM only"),
+        ({"t_eval": [0.0, 2.0]}, "t_eval"),
+        ({"t_eval": [0.5, 0.2]}, "increase"),
+        ({"q0": np.zeros(2)}, "q0"),
+        ({"q0": "home"}, "q0"),
+        ({"v0": [[1.0], [2.0, 3.0]]}, "v0"),
+        ({"q0": np.zeros(3)}, "violates the closures: row pin"),
+        ({"v0": np.ones(3)}, "v0.*srm.assemble"),
+        ({"v0": np.full(3, np.nan)}, "v0"),
+        ({"atol": np.inf}, "atol"),
+        ({"atol": "tight"}, "atol"),
+        ({"rtol": "tight"}, "rtol"),
+        ({"rtol": None}, "rtol"),
+        ({"step": "small"}, "step"),
+        ({"t_end": "late"}, "t_end"),
+        ({"t_eval": ["now"]}, "t_eval"),
+        ({"t_eval": [[0.0, 0.5]]}, "t_eval"),
+        ({"controller": 3}, "controller"),
+        ({"method": 3}, "method"),
+        ({"method": srm.PSRM}, "method"),
+        ({"mechanism": "four_bar"}, "mechanism"),
+    ],
+    ids=str,
+)
+def test_invalid_options_raise_before_any_stepping(
+    four_bar: srm.Mechanism, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(srm.InputError, match=words):
+        srm.simulate(**({"mechanism": four_bar, "t_end": 1.0} | options))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"prediction": "simple", "correction": "split"}, "there is no PSRM with"),
+        ({"prediction": "extrapolated"}, "there is no PSRM with"),
+        ({"correction": "late"}, "there is no PSRM with"),
+        ({"eps": -1.0}, "eps"),
+        ({"tableau": "nonsense"}, "there is no tableau"),
+    ],
+)
+def test_a_method_refuses_what_it_cannot_do(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(srm.InputError, match=words):
+        srm.PSRM(**options)
+
+
+def test_max_step_and_first_step_are_obeyed(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 1.0, max_step=0.01, first_step=1e-4)
+    h = np.diff(solution.steps.times)
+    assert h[0] == pytest.approx(1e-4)
+    assert h.max() <= 0.01 * (1 + 1e-12)
+
+
+def test_fixed_steps_keep_the_grid_and_shorten_the_last(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 1.03, step=0.1, tableau="erk4")
+    assert solution.t == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.03])
+
+
+def test_rotations_per_step_stay_inside_the_chart() -> None:
+    ring = floating_ring()
+    solution = srm.simulate(ring, 5.0, rtol=1e-4)
+    turned = np.diff(solution.steps.times)[:, None] * np.linalg.norm(
+        solution.v[:-1].reshape(-1, 5, 3)[:, 1:], axis=2
+    )
+    assert turned.max() <= 1.5 * (1 + 1e-9)
+
+
+def test_a_step_that_turns_a_ball_joint_too_far_is_refused_not_integrated_wrongly() -> None:
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "ball")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    mechanism = srm.Mechanism(model)
+
+    def kick(t: float, q: Any, v: Any) -> np.ndarray:
+        return np.array([0.0, 50.0, 0.0])
+
+    fixed = srm.simulate(mechanism, 2.0, controller=kick, tableau="erk4", step=0.5)
+    assert fixed.status == "failed"
+    assert "turns too far within one step" in fixed.message
+    adaptive = srm.simulate(mechanism, 2.0, controller=kick)
+    assert adaptive.success
+
+
+def test_default_tolerances_of_rates_follow_gravity_or_else_the_start() -> None:
+    mechanism = srm.load("four_bar")
+    units = mechanism.structure.units
+    assert units.rate == pytest.approx(np.sqrt(9.81 / units.length))
+    solution = srm.simulate(mechanism, 0.1, rtol=1e-7)
+    assert solution.settings.atol == pytest.approx([1e-7] * 3 + [1e-7 * units.rate] * 3)
+    weightless = srm.load("four_bar", gravity=(0.0, 0.0, 0.0))
+    rate = np.median(np.abs(mechanism.v0))
+    assert weightless.structure.units.rate == pytest.approx(rate)
+    faster = weightless.with_state(weightless.q0, 100.0 * weightless.v0)
+    assert faster.structure.units.rate == pytest.approx(100.0 * rate)
+    assert faster.structure.sigma_ref == weightless.structure.sigma_ref
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_a_fixed_step_so_long_that_the_loops_come_apart_fails(
+    four_bar: srm.Mechanism, step: float
+) -> None:
+    solution = srm.simulate(four_bar, 1.0, step=step)
+    assert solution.status == "failed"
+    assert "smaller step" in solution.message
+    assert solution.drift[:, 0].max() < 0.03
+
+
+def test_states_are_read_only(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 0.1)
+    for array in (solution.q, solution.v, solution.t):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 99.0
+
+
+def test_times_may_miss_the_end_by_rounding(four_bar: srm.Mechanism) -> None:
+    solution = srm.simulate(four_bar, 0.3, t_eval=np.arange(4) * 0.1)
+    assert len(solution.t) == 4
+
+
+def test_leaving_joint_limits_is_said() -> None:
+    model = pin.Model()
+    joint = model.addJoint(
+        0,
+        pin.JointModelRY(),
+        along_x(0.0),
+        "swing",
+        np.full(1, 1e3),
+        np.full(1, 1e3),
+        np.full(1, -0.5),
+        np.full(1, 0.5),
+    )
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    solution = srm.simulate(srm.Mechanism(model), 1.0)
+    assert solution.success
+    assert "swing" in solution.message
+    assert "limits do not act" in solution.message
+
+
+def test_a_progress_callable_sees_every_accepted_step(four_bar: srm.Mechanism) -> None:
+    seen: list[float] = []
+    solution = srm.simulate(four_bar, 0.5, progress=lambda t, h, x: seen.append(t))
+    assert seen == list(solution.t[1:])
+
+
+@pytest.mark.parametrize("backend", ["python", "auto"])
+def test_what_a_progress_callable_does_to_the_state_changes_nothing(
+    four_bar: srm.Mechanism, backend: str
+) -> None:
+    def spoil(t: float, h: float, x: Any) -> None:
+        x[:] = np.nan
+
+    spoilt = srm.simulate(four_bar, 0.5, progress=spoil, backend=backend)
+    plain = srm.simulate(four_bar, 0.5, backend=backend)
+    assert np.array_equal(spoilt.q, plain.q)
+
+
+def test_two_runs_are_identical(four_bar: srm.Mechanism) -> None:
+    a, b = (srm.simulate(four_bar, 1.0) for _ in range(2))
+    assert np.array_equal(a.q, b.q)
+    assert np.array_equal(a.t, b.t)
+
+
+def test_a_second_run_looks_nothing_up_in_the_model_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mechanism = srm.load("squeezing_mechanism")
+    first = srm.simulate(mechanism, 1e-3)
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("an anchor is looked up again")
+
+    monkeypatch.setattr(srm.Anchor, "resolve", refuse)
+    for backend in ("auto", "python"):
+        again = srm.simulate(mechanism, 1e-3, backend=backend)
+        moved = srm.simulate(
+            mechanism, 1e-3, q0=mechanism.q0.copy(), v0=mechanism.v0.copy(), backend=backend
+        )
+        assert np.abs(again.q[-1] - first.q[-1]).max() < 1e-10
+        assert np.array_equal(again.q, moved.q)
+
+
+def test_runs_of_one_mechanism_do_not_share_what_they_work_on(four_bar: srm.Mechanism) -> None:
+    """Dense output and energies of a run stay what they were after another one."""
+    t = np.linspace(0.0, 0.5, 7)
+    first = srm.simulate(four_bar, 0.5, backend="python")
+    known = srm.simulate(four_bar, 0.5, backend="python").at(t)
+    other = srm.assemble(four_bar, {"crank": 2.0}, {"crank": -1.0})
+    second = srm.simulate(four_bar, 0.5, q0=other.q, v0=other.v, backend="python")
+    assert np.abs(second.q[-1] - first.q[-1]).max() > 0.1
+    assert np.array_equal(first.at(t).q, known.q)
+    assert np.array_equal(first.at(t).energy, known.energy)
+    assert first.drift.max() < 1e-9
+
+
+def test_a_start_that_does_not_fit_is_refused_whatever_ran_before(
+    four_bar: srm.Mechanism,
+) -> None:
+    srm.simulate(four_bar, 0.1)
+    with pytest.raises(srm.InputError, match="violates the closures"):
+        srm.simulate(four_bar, 0.1, q0=four_bar.q0 + np.array([1e-3, 0.0, 0.0]))
+    srm.simulate(four_bar, 0.1)
+    floating = floating_ring()
+    with pytest.raises(srm.InputError, match="unit length"):
+        floating.with_state(2.0 * floating.q0, floating.v0)

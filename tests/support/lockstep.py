@@ -1,0 +1,240 @@
+"""Both backends side by side: every attempt of the reference is repeated by the kernel.
+
+The kernel starts each attempt from where the reference stands, so that rounding cannot add up:
+what is compared is one proposal, one step and one verdict at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.errors import EvaluationError
+from srm_mbs.integration.breakpoints import Passing, pieces_between
+from srm_mbs.integration.control.branch_guard import BranchGuard
+from srm_mbs.integration.control.placement import SingularityPlacement
+from srm_mbs.integration.control.prescribed_times import SlopeOfSigma
+from srm_mbs.integration.control.step_size import FixedStep, PIControl, Verdict, initial_step
+from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
+from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
+from srm_mbs.integration.singular_endpoints import start
+from srm_mbs.simulation.runner import absolute_tolerance, placed_control
+
+
+def control_state(control: Any) -> dict[str, Any]:
+    """What a control of the reference remembers, in the words of control.hpp."""
+    state: dict[str, Any] = {
+        "h": 0.0,
+        "xi_old": 1.0,
+        "just_rejected": False,
+        "index": 1,
+        "slope": 0.0,
+        "zero": np.nan,
+        "redo": 0.0,
+        "redone": 0,
+        "limit": np.inf,
+        "tries": 0,
+        "arrival": 0,
+    }
+    while True:
+        if isinstance(control, BranchGuard):
+            state |= {"limit": control._limit, "tries": control._tries}
+        elif isinstance(control, SingularityPlacement):
+            state |= {
+                "slope": control._slope,
+                "zero": np.nan if control._zero is None else control._zero,
+                "redo": 0.0 if control._redo is None else control._redo,
+                "redone": control._redone,
+                "arrival": int(control._arrival),
+            }
+        elif isinstance(control, SlopeOfSigma):
+            state |= {"slope": control._slope}
+        elif isinstance(control, PIControl):
+            return state | {
+                "h": control._h,
+                "xi_old": control._xi_old,
+                "just_rejected": control._just_rejected,
+            }
+        else:
+            assert isinstance(control, FixedStep)
+            return state | {"index": control._index}
+        control = control._inner
+
+
+def mass_matrix(mechanism: srm.Mechanism, state: FloatArray) -> FloatArray:
+    """M (nv, nv) at a state."""
+    model = mechanism.model
+    M = np.triu(pin.crba(model, model.createData(), state[: model.nq]))
+    return M + np.triu(M, 1).T  # type: ignore[no-any-return]
+
+
+@dataclass
+class Comparison:
+    """Largest differences over all attempts, each over the size that it should be small to.
+
+    Attributes
+    ----------
+    h, state, rates, sigma, correction, error
+        Step lengths, states (over units), stage rates, sigma, corrections, error ratios.
+    energy
+        States again, as sqrt(d^T M d): in the norm of the kinetic energy both backends' solves are
+        well conditioned; on single coordinates rounding is magnified by the condition of M.
+    condition
+        Largest condition number of M.
+    near
+        States of steps next to singular configurations, where rounding is magnified.
+    verdicts
+        (t, reference, kernel) where the two decided differently.
+    attempts, zones, replaced
+        How many attempts there were, how many used the zone, how many were redone.
+    entered
+        How many breakpoints were passed.
+    arrivals
+        How many ends beside singular configurations were prepared for.
+    """
+
+    h: float = 0.0
+    state: float = 0.0
+    energy: float = 0.0
+    condition: float = 1.0
+    near: float = 0.0
+    rates: float = 0.0
+    sigma: float = 0.0
+    correction: float = 0.0
+    error: float = 0.0
+    verdicts: list[tuple[float, Any, Any]] = field(default_factory=list)
+    attempts: int = 0
+    zones: int = 0
+    replaced: int = 0
+    entered: int = 0
+    arrivals: int = 0
+
+
+def compare(
+    mechanism: srm.Mechanism,
+    t_end: float,
+    *,
+    rtol: float,
+    tableau: str = "dop853",
+    step: float | None = None,
+    placement: str = "automatic",
+    eps: float | str | None = None,
+    max_step: float = np.inf,
+    controller: Any = None,
+    breakpoints: tuple[float, ...] = (),
+    arrivals: bool = True,
+) -> Comparison:
+    """Run the reference and repeat each of its attempts on the kernel."""
+    method = srm.PSRM(tableau, eps=eps)
+    scheme = method.scheme
+    system = make_system(mechanism, controller)
+    pieces = pieces_between(np.array(breakpoints), np.zeros(0), 0.0, t_end)
+    twin = twin_of(system)
+    norm = ErrorNorm(
+        absolute_tolerance(mechanism, None, rtol),
+        rtol,
+        NEGLIGIBLE if step is None else 0.0,
+    )
+    x = np.concatenate([mechanism.q0, mechanism.v0])
+    memory = start(system, method, 0.0, x, norm, t_end)
+    order = scheme.controller_order or 1
+    first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
+    control, _ = placed_control(
+        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0), arrivals
+    )
+    run = CompiledRun(
+        twin,
+        method,
+        norm,
+        memory,
+        x,
+        pieces,
+        step=step,
+        first_step=first,
+        max_step=max_step,
+        placed=placement,
+        arrivals=arrivals,
+    )
+    out = Comparison()
+    one = np.concatenate([norm.one, norm.one])[: 2 * system.nv]
+    t = 0.0
+    passing = Passing(pieces, system, method, norm)
+    control.aim(passing.end)
+    while t < t_end and out.attempts < 4000:
+        if t >= passing.end:
+            memory = passing.next(t, x, memory)
+            control.aim(passing.end)
+            out.entered += 1
+            assert run.at_breakpoint
+            run.enter()
+            change = run.memory().rate - memory.rate
+            out.rates = max(out.rates, float(np.max(np.abs(change) / (np.abs(memory.rate) + one))))
+        limit = min(max_step, system.step_limit(x))
+        # Before the reference proposes: its proposal writes the slope into the memory.
+        stop, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
+        proposal = control.propose(t, limit, memory)
+        assert proposal.arriving == (stop == ARRIVAL)
+        if proposal.arriving:
+            memory = passing.arrive(t, x, memory)
+            out.arrivals += 1
+            continue
+        try:
+            result = method.step(system, t, proposal.h, x, memory, norm)
+        except EvaluationError:
+            result = None
+        verdict = control.judge(proposal, result)
+        out.attempts += 1
+        out.h = max(out.h, abs(run.h - proposal.h) / proposal.h)
+        if verdict is not twin_verdict:
+            out.verdicts.append((t, verdict, twin_verdict))
+        if result is not None:
+            twin_result = run.last()
+            size = np.maximum(one, memory.magnitude)
+            rates = np.abs(result.rates).max(axis=0)
+            change = system.difference(result.state, twin_result.state)
+            # Next to a singular configuration the algebra magnifies rounding by 1 / sigma^2.
+            lowest = min(1.0, float(result.sigmas.min()))
+            scale = np.maximum(size, proposal.h * rates) / lowest**2
+            moved = float(np.max(np.abs(change) / scale))
+            if result.quiet or not system.has_constraints:
+                out.state = max(out.state, moved)
+                M = mass_matrix(mechanism, x)
+                out.condition = max(out.condition, float(np.linalg.cond(M)))
+                for part in np.split(np.arange(2 * system.nv), 2):
+                    d, s = change[part], scale[part]
+                    out.energy = max(out.energy, float(np.sqrt((d @ M @ d) / (s * s @ np.diag(M)))))
+            else:
+                out.near = max(out.near, moved)
+            out.rates = max(
+                out.rates,
+                float(np.max(np.abs(twin_result.rates - result.rates).max(0) / (rates + one)))
+                * lowest**2,
+            )
+            if np.isfinite(result.sigmas).all():
+                change = np.abs(twin_result.sigmas - result.sigmas)
+                out.sigma = max(out.sigma, float(change.max()) * lowest)
+            if result.correction.size:
+                change = np.abs(twin_result.correction - result.correction)
+                out.correction = max(out.correction, float(np.max(change / scale)))
+            # An error estimate is a difference of rates: its rounding is theirs.
+            rounding = norm(proposal.h * rates, norm.weights(memory.magnitude))
+            change = abs(twin_result.error_ratio - result.error_ratio)
+            bound = (rounding + result.error_ratio) / lowest**2
+            out.error = max(out.error, float(change / bound))
+            out.zones += result.zone is not None
+            assert (result.zone is None) == (twin_result.zone is None)
+            assert result.rank == twin_result.rank
+            assert result.held == twin_result.held
+            assert result.quiet == twin_result.quiet
+        out.replaced += verdict is Verdict.REPLACED
+        if verdict is Verdict.ACCEPTED and result is not None:
+            method.accept(memory, result)
+            t, x = proposal.t_new, result.state
+    return out

@@ -1,0 +1,58 @@
+"""Motions of bundled mechanisms by SciPy, sampled over a run; none uses the package's stepping."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import solve_ivp
+
+import srm_mbs as srm
+from tests.support import reduced
+
+
+def _open_chain(mechanism: srm.Mechanism) -> reduced.Field:
+    model, data = mechanism.model, mechanism.model.createData()
+    nq = model.nq
+
+    def field(t: float, x: Any) -> np.ndarray:
+        q, v = x[:nq], x[nq:]
+        return np.concatenate([v, pin.aba(model, data, q, v, -model.damping * v)])
+
+    return field
+
+
+def observed(name: str, solution: srm.Solution, t: np.ndarray) -> np.ndarray:
+    """What :func:`reference` gives, from a run: angle and rate of the crank, or the whole state."""
+    q, v = solution(t)
+    if name in ("four_bar", "spatial_four_bar", "pendulum_chain"):
+        return np.hstack([q, v])
+    crank = 0 if name.startswith("n_four_bar") else solution.mechanism.joint("crank").idx_q
+    angle = q[:, crank]
+    return np.column_stack([angle - np.pi / 6 if name == "spatial_dead_point" else angle, v[:, 0]])
+
+
+@lru_cache(maxsize=32)
+def reference(name: str, t_end: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times (samples,) and what is observed there: reduced equations, or the index-1 equations of
+    regular mechanisms, by DOP853 near round-off."""
+    mechanism = srm.load(name)
+    t = np.linspace(0.0, t_end, samples + 1)[1:]
+    start = np.array([mechanism.q0[0], mechanism.v0[0]])
+    if name in ("slider_crank", "slider_crank_whirl"):
+        field = reduced.slider_crank()
+    elif name == "parallelogram":
+        field = lambda t, y: [y[1], -reduced.G * 9.0 / 8.0 * np.cos(y[0])]  # noqa: E731
+    elif name == "spatial_dead_point":
+        field, start = reduced.spatial_dead_point(), start - np.array([np.pi / 6, 0.0])
+    elif name.startswith("n_four_bar"):
+        field = reduced.n_four_bar(int(name.rsplit("_", 1)[1]))
+    else:
+        start = np.concatenate([mechanism.q0, mechanism.v0])
+        closed = bool(mechanism.loops)
+        field = reduced.index_one(mechanism) if closed else _open_chain(mechanism)
+    run = solve_ivp(field, (0.0, t_end), start, "DOP853", t, rtol=3e-14, atol=1e-14)
+    assert run.success
+    return t, run.y.T

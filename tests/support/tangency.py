@@ -1,0 +1,115 @@
+"""A slider-crank that a four-bar drives just up to its singular configuration, or over it and back.
+
+In the x-y plane, gravity along -y.  The four-bar (input 0.5 m, coupler 1.5 m) takes the equal
+slider-crank's crank by a point 1 m along it.  Where input and coupler align, at input 0, the crank
+turns back; the ground pivot of the input, ``reach`` too close, lies so that this happens at the
+singular configuration of the slider-crank for ``reach`` = 0.  There sigma vanishes with the square
+of time, and the two branches are tangent: rod = -crank and rod at the crank's pivot have the same
+rates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import solve_ivp
+
+import srm_mbs as srm
+from tests.support.mechanisms import along_x, rod
+
+G = 9.81
+INPUT, COUPLER, BAR = 0.5, 1.5, 2.0
+FIRST, RATE = -1.2, 6.0
+"""Input at the start (rad), and its rate (rad/s)."""
+
+
+def _pivot(reach: float) -> np.ndarray:
+    return np.array([reach - INPUT - COUPLER, 1.0])
+
+
+def _along(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _across(angle: float) -> np.ndarray:
+    return np.array([-np.sin(angle), np.cos(angle)])
+
+
+def _angles(psi: float, reach: float) -> tuple[float, float]:
+    """Absolute angles of coupler and crank at the input angle ``psi``: two circles meet."""
+    p = _pivot(reach) + INPUT * _along(psi)
+    r = np.hypot(*p)
+    crank = np.arctan2(p[1], p[0]) - np.arccos((r * r + 1.0 - COUPLER**2) / (2.0 * r))
+    to = _along(crank) - p
+    return float(np.arctan2(to[1], to[0])), float(crank)
+
+
+def _rates(psi: float, reach: float) -> np.ndarray:
+    """Rates of coupler and crank over that of the input."""
+    coupler, crank = _angles(psi, reach)
+    closure = np.column_stack([COUPLER * _across(coupler), -_across(crank)])
+    return np.linalg.solve(closure, -INPUT * _across(psi))
+
+
+def mechanism(reach: float) -> srm.Mechanism:
+    """It moves with ``RATE`` from ``FIRST``, rod = -crank, all bars uniform with 1 kg."""
+    model = pin.Model()
+    model.name = "tangency"
+    model.gravity.linear = np.array([0.0, -G, 0.0])
+    pivot = pin.SE3(np.eye(3), np.append(_pivot(reach), 0.0))
+    ground = pin.SE3.Identity()
+    bars = (
+        ("input", 0, pivot, INPUT),
+        ("coupler", 1, along_x(INPUT), COUPLER),
+        ("crank", 0, ground, BAR),
+        ("rod", 3, along_x(BAR), BAR),
+    )
+    for name, parent, placement, length in bars:
+        joint = model.addJoint(parent, pin.JointModelRZ(), placement, name)
+        model.appendBodyToJoint(joint, rod(1.0, length), pin.SE3.Identity())
+        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+    loops = (
+        srm.LoopClosure(
+            "point",
+            srm.Anchor("coupler", xyz=(COUPLER, 0.0, 0.0)),
+            srm.Anchor("crank", xyz=(1.0, 0.0, 0.0)),
+            name="four_bar",
+        ),
+        srm.LoopClosure(
+            "point_on_plane",
+            srm.Anchor("rod", xyz=(BAR, 0.0, 0.0)),
+            srm.Anchor("world"),
+            (0.0, 1.0, 0.0),
+            "slide",
+        ),
+    )
+    coupler, crank = _angles(FIRST, reach)
+    dcoupler, dcrank = _rates(FIRST, reach)
+    q = np.array([FIRST, coupler - FIRST, crank, -2.0 * crank])
+    v = RATE * np.array([1.0, dcoupler - 1.0, dcrank, -2.0 * dcrank])
+    return srm.Mechanism(model, loops, q0=q, v0=v)
+
+
+def inputs(reach: float, times: np.ndarray) -> np.ndarray:
+    """The input angle at ``times``, by SciPy from the conservation of energy; it does not stop."""
+
+    def energies(psi: float) -> tuple[float, float]:
+        """Twice the kinetic energy over the square of the input's rate, and the potential."""
+        (coupler, crank), (dcoupler, dcrank) = _angles(psi, reach), _rates(psi, reach)
+        centre = INPUT * _across(psi) + 0.5 * COUPLER * dcoupler * _across(coupler)
+        rod_centre = dcrank * (BAR * _across(crank) - 0.5 * BAR * _across(-crank))
+        square = INPUT**2 / 3.0 + centre @ centre + (COUPLER * dcoupler) ** 2 / 12.0
+        square += (BAR * dcrank) ** 2 * (1.0 / 3.0 + 1.0 / 12.0) + rod_centre @ rod_centre
+        height = 1.5 * INPUT * np.sin(psi) + 0.5 * COUPLER * np.sin(coupler) + BAR * np.sin(crank)
+        return float(square), G * float(height)
+
+    square, potential = energies(FIRST)
+    total = 0.5 * square * RATE**2 + potential
+
+    def field(t: float, y: np.ndarray) -> list[float]:
+        square, potential = energies(float(y[0]))
+        return [float(np.sqrt(2.0 * (total - potential) / square))]
+
+    run = solve_ivp(field, (0.0, times[-1]), [FIRST], "DOP853", times, rtol=1e-13, atol=1e-13)
+    assert run.success
+    return np.asarray(run.y[0])

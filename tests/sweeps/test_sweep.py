@@ -1,0 +1,483 @@
+"""Sweeps: the same numbers on every executor, nothing lost and nothing twice."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from benchmarks import sweep_throughput as throughput
+from srm_mbs.sweeps.fingerprint import fingerprint
+from tests.support.sweeping import deadly, dying_once, lowest, pendulum, period, states
+
+COUNT = 5
+SPEEDS = np.linspace(0.5, 2.5, COUNT)
+spawning = multiprocessing.get_context("spawn")
+
+
+@pytest.fixture(scope="module")
+def four_bar() -> srm.Mechanism:
+    return srm.load("four_bar")
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Executor]:
+    """Two processes that inherit nothing."""
+    with ProcessPoolExecutor(2, mp_context=spawning) as executor:
+        yield executor
+
+
+def starts(mechanism: srm.Mechanism) -> dict[str, Any]:
+    """Columns of initial states: the mechanism's own, at several speeds."""
+    unit = mechanism.v0 / np.abs(mechanism.v0).max()
+    return {"q0": np.tile(mechanism.q0, (COUNT, 1)), "v0": np.outer(SPEEDS, unit)}
+
+
+def check_against_single_runs(sweep: srm.Sweep, mechanism: srm.Mechanism, t_end: float) -> None:
+    assert len(sweep) == COUNT
+    assert not sweep.failures
+    columns = starts(mechanism)
+    for k, (q0, v0) in enumerate(zip(columns["q0"], columns["v0"])):
+        single = states(srm.simulate(mechanism, t_end, q0=q0, v0=v0, rtol=1e-8))
+        for name, value in single.items():
+            if name != "process":
+                assert sweep.table[name][k] == value, (k, name)
+
+
+@pytest.mark.parametrize("workers", ["none", "threads", "processes"])
+@pytest.mark.parametrize("chunk", [1, 2])
+def test_every_executor_gives_the_numbers_of_single_runs(
+    workers: str, chunk: int, four_bar: srm.Mechanism, request: pytest.FixtureRequest
+) -> None:
+    with ThreadPoolExecutor(2) as threads:
+        executor = {
+            "none": lambda: None,
+            "threads": lambda: threads,
+            "processes": lambda: request.getfixturevalue("processes"),
+        }[workers]()
+        sweep = srm.sweep(
+            four_bar,
+            starts(four_bar),
+            1.0,
+            measure=states,
+            executor=executor,
+            chunk=chunk,
+            rtol=1e-8,
+        )
+    check_against_single_runs(sweep, four_bar, 1.0)
+    elsewhere = set(sweep.table["process"].tolist()) - {os.getpid()}
+    assert bool(elsewhere) == (workers == "processes")
+
+
+class Backwards(Executor):
+    """Runs what it was given when it is asked for the last of ``count``, last first."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._given: list[tuple[Future[Any], Callable[[], Any]]] = []
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self._given.append((future, partial(fn, *args, **kwargs)))
+        if len(self._given) == self._count:
+            for waiting, call in reversed(self._given):
+                waiting.set_result(call())
+        return future
+
+
+def test_rows_keep_the_order_of_the_cases_whatever_finishes_first() -> None:
+    lengths = [0.5, 2.0, 1.0, 1.5]
+    order: list[int] = []
+    sweep = srm.sweep(
+        pendulum,
+        {"length": lengths},
+        0.2,
+        executor=Backwards(4),
+        progress=lambda done, total: order.append(done),
+    )
+    assert sweep.table["length"].tolist() == lengths
+    assert order == [1, 2, 3, 4]
+    single = [srm.simulate(pendulum(length=length), 0.2).energy for length in lengths]
+    assert sweep.table["energy_change"].tolist() == [energy[-1] - energy[0] for energy in single]
+
+
+def test_periods_of_pendulums_are_those_of_the_elliptic_integral(processes: Executor) -> None:
+    from scipy.special import ellipk
+
+    angles, lengths = np.array([0.1, 1.0, 2.5, 0.5]), np.array([1.0, 2.0, 0.5, 1.3])
+    sweep = srm.sweep(
+        pendulum,
+        {"angle": angles, "length": lengths, "mass": np.ones(4)},
+        9.0,
+        measure=period,
+        executor=processes,
+        events=lowest,
+        rtol=1e-10,
+    )
+    exact = 4.0 * np.sqrt(lengths / 9.81) * ellipk(np.sin(0.5 * angles) ** 2)
+    assert sweep.table["period"] == pytest.approx(exact, rel=1e-9)
+
+
+def test_masses_and_lengths_reach_the_runs() -> None:
+    masses, lengths = np.array([1.0, 3.0, 0.5]), np.array([1.0, 0.4, 2.0])
+    sweep = srm.sweep(
+        pendulum, {"mass": masses, "length": lengths}, 0.5, measure=lambda s: {"E": s.energy[-1]}
+    )
+    exact = -masses * 9.81 * lengths * np.cos(0.3)
+    assert sweep.table["E"] == pytest.approx(exact, rel=1e-6)
+
+
+def test_joint_values_are_assembled_case_by_case(four_bar: srm.Mechanism) -> None:
+    cases = [{"q": {"crank": angle}, "v": {"crank": 1.5}} for angle in (0.6, 0.9)]
+    sweep = srm.sweep(four_bar, cases, 0.3, measure=states)
+    for k, case in enumerate(cases):
+        state = srm.assemble(four_bar, case["q"], case["v"])
+        single = srm.simulate(four_bar, 0.3, q0=state.q, v0=state.v)
+        assert sweep.table["q_0"][k] == single.q[-1, 0]
+    assert sweep.table["q.crank"].tolist() == [0.6, 0.9]
+
+
+def test_controllers_and_ends_come_from_the_case() -> None:
+    def braked(gain: float, t_end: float) -> tuple[srm.Mechanism, dict[str, Any]]:
+        return pendulum(), {"controller": lambda t, q, v: -gain * v, "t_end": t_end}
+
+    cases = {"gain": [0.0, 0.5], "t_end": [1.0, 2.0]}
+    with pytest.raises(srm.InputError, match="no parameter 'gain'"):
+        srm.sweep(pendulum(), cases, 3.0)
+    made = srm.sweep(braked, cases, 3.0, measure=lambda s: {"end": s.span[1], "q": s.q[-1, 0]})
+    chosen = srm.sweep(
+        pendulum(),
+        cases,
+        3.0,
+        measure=lambda s: {"end": s.span[1], "angle": s.q[-1, 0]},
+        options=lambda case: braked(**case)[1],
+    )
+    assert made.table["end"].tolist() == [1.0, 2.0]
+    assert made.table["q"].tolist() == chosen.table["angle"].tolist()
+    assert chosen.table["angle"][0] == srm.simulate(pendulum(), 1.0).q[-1, 0]
+
+
+def test_what_is_raised_is_kept_with_its_case_and_the_others_go_on(processes: Executor) -> None:
+    cases = {"short": {"length": 0.5}, "none": {"length": 0.0}, "long": {"length": 2.0}}
+    sweep = srm.sweep(pendulum, cases, 0.2, executor=processes)
+    (failure,) = sweep.failures
+    assert (failure.index, failure.name, failure.parameters) == (1, "none", {"length": 0.0})
+    assert failure.message == "ValueError: the length 0 m is not positive"
+    assert "in pendulum" in failure.traceback
+    assert sweep.table["case"].tolist() == ["short", "none", "long"]
+    assert sweep.table["status"].tolist() == ["finished", "error", "finished"]
+    assert np.isnan(sweep.table["drift"]).tolist() == [False, True, False]
+    assert repr(sweep) == "Sweep(3 cases, 2 reached the end, 1 failures, 0 resumed)"
+
+
+def test_a_run_that_ends_early_is_a_row_that_says_why() -> None:
+    def pushed(t: float, q: Any, v: Any) -> Any:
+        return [1.0 / (0.5 - t) if t < 0.5 else np.nan]
+
+    sweep = srm.sweep(pendulum, [{}], 1.0, controller=pushed)
+    assert not sweep.failures
+    assert not sweep.table["success"][0]
+    assert sweep.table["status"][0] == "failed"
+    assert "Stopped at t = " in sweep.table["message"][0]
+    assert 0.0 < sweep.table["t_end"][0] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("returned", "match"),
+    [({"q": np.zeros(2)}, "'q'"), ({"length": 1.0}, "column already"), (None, "returned None")],
+)
+def test_measures_that_are_no_numbers_are_failures(returned: Any, match: str) -> None:
+    sweep = srm.sweep(pendulum, [{"length": 1.0}], 0.1, measure=lambda solution: returned)
+    assert match in sweep.failures[0].message
+
+
+def test_a_dead_worker_process_leaves_the_finished_cases(tmp_path: Path) -> None:
+    cases = [{"length": length} for length in (0.5, 1.0, np.inf, 1.5)]
+    file = tmp_path / "sweep.jsonl"
+    with ProcessPoolExecutor(1, mp_context=spawning) as executor:
+        sweep = srm.sweep(deadly, cases, 0.1, executor=executor, resume=file)
+    assert sweep.table["status"].tolist()[:2] == ["finished", "finished"]
+    assert [failure.index for failure in sweep.failures] == [2, 3]
+    assert all(BrokenProcessPool.__name__ in failure.message for failure in sweep.failures)
+    again = srm.sweep(deadly, [case for case in cases if case["length"] < 2.0], 0.1, resume=file)
+    assert (again.resumed, len(again.failures)) == (2, 0)
+
+
+def test_a_sweep_that_was_killed_is_resumed_where_it_stopped(tmp_path: Path) -> None:
+    file = tmp_path / "sweep.jsonl"
+    cases = [{"length": length} for length in (0.5, 1.0, 1.0, 1.5, 2.0)]
+    whole = srm.sweep(pendulum, cases, 0.2, measure=states)
+    script = (
+        "import os, signal\nimport srm_mbs as srm\nfrom tests.sweeping import *\n"
+        "def kill(done, total):\n    done == 3 and os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"cases = {cases!r}\n"
+        f"srm.sweep(pendulum, cases, 0.2, measure=states, resume={str(file)!r}, progress=kill)\n"
+    )
+    root = Path(__file__).parents[2]
+    status = os.spawnve(
+        os.P_WAIT,
+        sys.executable,
+        [sys.executable, "-c", script],
+        {**os.environ, "PYTHONPATH": str(root)},
+    )
+    assert status == -signal.SIGKILL
+    with file.open("a", encoding="utf-8") as opened:
+        opened.write('{"case": "0123')  # as if it had died while it wrote
+    ran: list[int] = []
+    sweep = srm.sweep(
+        pendulum,
+        [cases[4], *cases[:4]],
+        0.2,
+        measure=states,
+        resume=file,
+        progress=lambda done, total: ran.append(done),
+    )
+    assert (sweep.resumed, ran) == (3, [4, 5])
+    for name in ("q_0", "v_0", "steps"):
+        assert sweep.table[name].tolist() == np.roll(whole.table[name], 1).tolist()
+    lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    assert len({line["case"] for line in lines[1:]}) == len(lines) - 1 == 5
+
+
+def test_cases_that_raised_are_tried_again(tmp_path: Path) -> None:
+    tries: list[float] = []
+
+    def fails_once(length: float) -> srm.Mechanism:
+        tries.append(length)
+        return pendulum(length=0.0 if len(tries) == 2 else length)
+
+    # What the function encloses decides which sweep it is: the list must not be compared.
+    def measure(solution: srm.Solution) -> dict[str, float]:
+        return {"end": solution.span[1]}
+
+    factory = Unchanging(fails_once)
+    cases = {"length": [1.0, 2.0, 3.0]}
+    first = srm.sweep(factory, cases, 0.1, measure=measure, resume=tmp_path / "s.jsonl")
+    assert [failure.index for failure in first.failures] == [1]
+    second = srm.sweep(factory, cases, 0.1, measure=measure, resume=tmp_path / "s.jsonl")
+    assert not second.failures
+    assert tries == [1.0, 2.0, 3.0, 2.0]
+
+
+class Unchanging:
+    """Calls a function that counts as the same one whatever it encloses."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, **parameters: Any) -> Any:
+        return self._function(**parameters)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
+
+
+def test_the_file_of_another_sweep_is_refused(tmp_path: Path, four_bar: srm.Mechanism) -> None:
+    file = tmp_path / "sweep.jsonl"
+    again = partial(srm.sweep, resume=file)
+    cases = [{}]
+    again(four_bar, cases, 0.1)
+    kept = file.read_bytes()
+    springy = replace(four_bar, forces=(srm.TorsionSpring("crank", stiffness=1.0),))
+    for other, match in (
+        (lambda: again(springy, cases, 0.1), "another mechanism"),
+        (lambda: again(four_bar, cases, 0.2), "another t_end"),
+        (lambda: again(four_bar, cases, 0.1, rtol=1e-8), "another options"),
+        (lambda: again(four_bar, cases, 0.1, measure=states), "another measure"),
+    ):
+        with pytest.raises(srm.InputError, match=match):
+            other()
+    assert again(srm.load("four_bar"), cases, 0.1).resumed == 1
+    assert file.read_bytes() == kept
+    file.write_bytes(kept + b"[]\n")
+    with pytest.raises(srm.InputError, match="line 3 is damaged"):
+        again(four_bar, cases, 0.1)
+    file.write_bytes(b"my notes")
+    with pytest.raises(srm.InputError, match="not a file of a sweep"):
+        again(four_bar, cases, 0.1)
+    assert file.read_bytes() == b"my notes"
+    with pytest.raises(srm.InputError, match="cannot be used"):
+        srm.sweep(four_bar, cases, 0.1, resume=tmp_path / "nowhere" / "sweep.jsonl")
+
+
+def test_fingerprints_tell_values_apart_and_know_equal_ones() -> None:
+    def adding(number: float) -> Callable[[float], float]:
+        return lambda x: x + number
+
+    different = [1, 1.0, True, "1", None, [1], [[1]], {"a": 1}, {"a": 2}, np.ones(1), adding(1.0)]
+    different += [adding(2.0), lambda x: x - 1.0, srm.PSRM(), srm.PSRM(tableau="heun"), np.ones(2)]
+    prints = [fingerprint(value) for value in different]
+    assert len(set(prints)) == len(prints)
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": np.int64(1)})
+    assert fingerprint(adding(1.0)) == fingerprint(adding(1.0))
+    used = srm.PSRM()
+    srm.simulate(pendulum(), 0.1, method=used)
+    assert fingerprint(used) == fingerprint(srm.PSRM())
+    looped: list[Any] = []
+    looped.append(looped)
+    assert fingerprint(looped) != fingerprint([[]])
+
+
+@pytest.mark.parametrize("name", ["slider_crank", "stewart_platform", "squeezing_mechanism"])
+def test_a_mechanism_comes_out_of_a_pickle_as_it_was(name: str) -> None:
+    mechanism = srm.load(name)
+    if name == "slider_crank":
+        law = srm.Table(t=(0.0, 0.5, 1.0, 2.0), values=(0.0, 0.1, 0.4, 0.5))
+        driven = replace(mechanism, drives=(srm.Drive(law, joint="crank"),))
+        state = srm.assemble(driven)
+        mechanism = driven.with_state(state.q, state.v)
+    single = srm.simulate(mechanism, 0.01)
+    copied = pickle.loads(pickle.dumps(mechanism))
+    assert fingerprint(copied) == fingerprint(mechanism)
+    assert copied.structure.sigma_ref == mechanism.structure.sigma_ref
+    assert not copied.q0.flags.writeable
+    again = srm.simulate(copied, 0.01)
+    assert np.array_equal(single.q, again.q)
+    assert np.array_equal(single.v, again.v)
+
+
+def test_tables_are_written_and_read_back(tmp_path: Path) -> None:
+    pandas, parquet = pytest.importorskip("pandas"), pytest.importorskip("pyarrow.parquet")
+    cases = [{"length": 1.0, "mass": 2}, {"length": 0.0}, {"mass": 3}]
+    sweep = srm.sweep(pendulum, cases, 0.1)
+    frame = sweep.to_pandas()
+    assert list(frame) == list(sweep.table)
+    assert list(frame)[:6] == ["case", "length", "mass", "success", "status", "message"]
+    sweep.to_parquet(tmp_path / "sweep.parquet")
+    again = parquet.read_table(tmp_path / "sweep.parquet").to_pandas()
+    pandas.testing.assert_frame_equal(frame, again, check_dtype=False)
+    sweep.to_csv(tmp_path / "sweep.csv")
+    with (tmp_path / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == list(sweep.table)
+    column = head.index("energy_change")
+    assert float(rows[2][column]) == sweep.table["energy_change"][2]
+
+
+def test_a_table_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = srm.sweep(pendulum, [{}], 0.1)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(srm.InputError, match=r"pandas is not installed.*srm-mbs\[sweep\]"):
+        sweep.to_pandas()
+    with pytest.raises(srm.InputError, match="pyarrow is not installed"):
+        sweep.to_parquet("sweep.parquet")
+
+
+def test_bad_input_is_refused_before_any_run(four_bar: srm.Mechanism, processes: Executor) -> None:
+    one = [{}]
+    for call, match in (
+        (lambda: srm.sweep("four_bar", one, 1.0), "neither a mechanism nor a function"),
+        (lambda: srm.sweep(four_bar, [], 1.0), "no cases"),
+        (lambda: srm.sweep(four_bar, "q0", 1.0), "no cases"),
+        (lambda: srm.sweep(four_bar, [3.0], 1.0), r"cases\[0\]: 3.0 is not a set"),
+        (lambda: srm.sweep(four_bar, {"q0": [[0.0]], "v0": []}, 1.0), "lengths"),
+        (lambda: srm.sweep(four_bar, {"q0": 1.0}, 1.0), "not columns"),
+        (lambda: srm.sweep(four_bar, {"a": {"mass": 1.0}}, 1.0), r"cases\['a'\].*'mass'"),
+        (lambda: srm.sweep(four_bar, [{"q": {}, "v0": [0.0]}], 1.0), "Give one of the two"),
+        (lambda: srm.sweep(pendulum, [{"status": 1.0}], 1.0), "column of every table"),
+        (lambda: srm.sweep(four_bar, one, -1.0), "t_end"),
+        (lambda: srm.sweep(four_bar, one, 1.0, rtoll=1e-3), "no option 'rtoll'"),
+        (lambda: srm.sweep(four_bar, one, 1.0, q0=four_bar.q0), "Give it in the cases"),
+        (lambda: srm.sweep(four_bar, one, 1.0, method="euler"), "no method 'euler'"),
+        (lambda: srm.sweep(four_bar, one, 1.0, measure=3), "measure = 3"),
+        (lambda: srm.sweep(four_bar, one, 1.0, chunk=0), "chunk = 0"),
+        (lambda: srm.sweep(four_bar, one, 1.0, executor=3), "has no submit"),
+    ):
+        with pytest.raises(srm.InputError, match=match):
+            call()
+    held = (line for line in ())
+    with pytest.raises(srm.InputError, match="cannot be sent"):
+        srm.sweep(four_bar, one, 1.0, measure=lambda s: {"n": held}, executor=processes)
+
+
+def test_an_interrupted_run_ends_the_sweep_and_keeps_what_was_finished(tmp_path: Path) -> None:
+    def interrupted(t: float, q: Any, v: Any) -> Any:
+        raise KeyboardInterrupt
+
+    def options(case: Any) -> dict[str, Any]:
+        return {"controller": interrupted} if case["length"] == 2.0 else {}
+
+    run = partial(srm.sweep, pendulum, {"length": [1.0, 2.0, 3.0]}, 0.1, options=options)
+    with pytest.raises(KeyboardInterrupt):
+        run(resume=tmp_path / "sweep.jsonl")
+    assert len((tmp_path / "sweep.jsonl").read_text(encoding="utf-8").splitlines()) == 2
+
+
+def test_a_dask_cluster_that_loses_a_worker_loses_no_run_and_repeats_none(
+    tmp_path: Path,
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    lengths, count, fatal = np.linspace(0.5, 2.5, 30), 30, 12
+    cluster = distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
+    file = tmp_path / "sweep.jsonl"
+    with cluster, distributed.Client(cluster) as client:
+        workers = set(client.run(os.getpid).values())
+        sweep = srm.sweep(
+            dying_once,
+            {
+                "length": lengths,
+                "fatal": np.arange(count) == fatal,
+                "folder": [str(tmp_path)] * count,
+            },
+            0.5,
+            measure=states,
+            executor=client.get_executor(),
+            resume=file,
+        )
+    assert len(workers) == 2
+    died = int((tmp_path / "died").read_text(encoding="utf-8"))
+    assert died in workers
+    assert sweep.table["process"][fatal] not in (died, os.getpid())
+    assert not sweep.failures
+    assert sweep.table["case"].tolist() == list(range(count))
+    single = [srm.simulate(pendulum(length=length), 0.5) for length in lengths]
+    assert sweep.table["q_0"].tolist() == [solution.q[-1, 0] for solution in single]
+    assert len(file.read_text(encoding="utf-8").splitlines()) == 1 + count
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_shows_how_many_cases_are_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    srm.sweep(pendulum, {"length": [1.0, 2.0, 3.0]}, 0.1, progress=True)
+    assert "3 / 3 cases" in terminal.getvalue()
+
+
+def test_throughput_is_measured_on_equal_rows() -> None:
+    rows = throughput.measure(0.05, seconds=0.01, repeats=1, workers=[1])
+    assert [(row.executor, row.chunk) for row in rows] == [
+        ("serial", 1),
+        ("threads", 1),
+        ("processes", 1),
+        ("processes", throughput.CHUNK),
+    ]
+    assert rows[0].of_serial == 1.0
+    assert all(row.runs_per_second > 0.0 for row in rows)

@@ -1,0 +1,638 @@
+"""What a page shows beside the bodies: values, passages, springs, paths, gaps, reactions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+import srm_mbs as srm
+from srm_mbs.cli.app import app
+from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.visualization.animation import overlays
+from srm_mbs.visualization.animation import overlays as closure_overlays
+from srm_mbs.visualization.animation.overlays import Wanted, gaps_of, ramp_colours, turns_along
+from srm_mbs.visualization.animation.page import make_page, read_out
+from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
+from tests.support.browsing import opened
+from tests.support.bundled import load
+from tests.support.mechanisms import floating_ring
+from tests.support.pacing import assert_pace
+
+ROD = srm.Anchor("rod", xyz=(0.5, 0.0, 0.2))
+
+
+def place(solution: srm.Solution, t: float, anchor: srm.Anchor) -> Any:
+    """Where an anchor is at t, by forward kinematics of the dense output."""
+    model = solution.mechanism.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, solution(t)[0])
+    joint, placement = anchor.resolve(model)
+    return (data.oMi[joint] * placement).translation
+
+
+@pytest.fixture(scope="module")
+def slider_crank() -> srm.Solution:
+    return srm.simulate(load("slider_crank"), 8.0)
+
+
+@pytest.fixture(scope="module")
+def page(
+    browser: Any,
+    slider_crank: srm.Solution,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Any]:
+    """The slider-crank with the path of a point of its rod, at whole 1/64 s."""
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    slider_crank.export_html(path, fps=64.0, trace=[ROD])
+    with opened(browser, path.as_uri(), (660, 400)) as shown:
+        yield shown
+
+
+READ = """async t => {
+  seek(t);
+  const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
+  await frame(); await frame();
+  return [...document.querySelectorAll("#panel tr")].map(row =>
+    [...row.cells].map(cell => cell.textContent));
+}"""
+
+
+def panel(page: Any, t: float) -> dict[str, tuple[float, str]]:
+    """Values and units in the panel at the animation's time t."""
+    rows = page.evaluate(READ, t)
+    return {name: (float(text.replace("\u2212", "-")), unit) for name, text, unit in rows}
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("t", [0.0, 0.640625, 2.5, 5.015625, 8.0])
+def test_the_panel_shows_time_drift_energy_and_sigma_of_the_run_at_that_time(
+    page: Any, slider_crank: srm.Solution, t: float
+) -> None:
+    there = slider_crank.at([0.0, t])
+    found = panel(page, t)
+    assert found["t"] == (pytest.approx(t, abs=5.1e-4), "s")
+    assert found["drift |g|"] == (pytest.approx(there.drift[1, 0], rel=6e-3), "m")
+    change = there.energy[1] - there.energy[0]
+    assert found["energy change"] == (pytest.approx(change, rel=6e-3), "J")
+    # Evaluated there; in the panel it is recorded at the stages.
+    q, v = slider_crank(t)
+    sigma = slider_crank._system.evaluate(t, np.concatenate([q, v])).sigma
+    assert found["sigma"][0] == pytest.approx(sigma, abs=4e-3)
+    assert found["sigma"][1] == ""
+
+
+@pytest.mark.browser
+def test_passages_are_marked_on_the_slider_where_its_thumb_is_at_their_times(
+    page: Any, slider_crank: srm.Solution
+) -> None:
+    crossings = slider_crank.crossings
+    assert len(crossings) == 4
+    line = page.locator("#time").bounding_box()
+    marks = page.locator("#marks button")
+    assert marks.count() == len(crossings)
+    for mark, crossing in zip(marks.all(), crossings):
+        box = mark.bounding_box()
+        middle = box["x"] + 0.5 * box["width"]
+        thumb = line["x"] + 8.0 + crossing.time / 8.0 * (line["width"] - 16.0)
+        assert middle == pytest.approx(thumb, abs=0.6)
+        said = mark.get_attribute("title")
+        assert f"t = {crossing.time:.4g} s: {', '.join(crossing.loops)}" in said
+        assert crossing.loops
+        mark.click()
+        assert page.evaluate("animator.time") == pytest.approx(crossing.time, rel=1e-9)
+        assert page.evaluate("animator.playing") is False
+        assert panel(page, crossing.time)["sigma"][0] < 1e-6
+
+
+def choose_speed(page: Any, speed: str) -> None:
+    page.locator("#speed").select_option(speed)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(
+    "seconds", [1.0, pytest.param(7.3, marks=pytest.mark.stress)], ids=["short", "all"]
+)
+def test_the_run_is_played_in_real_time_to_two_percent(page: Any, seconds: float) -> None:
+    page.evaluate("seek(0.1)")
+    assert_pace(page, seconds)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("speed", ["0.25", "4"])
+def test_the_motion_is_played_at_the_chosen_speed_after_scrubbing(page: Any, speed: str) -> None:
+    page.locator("#time").fill("2.5")
+    assert page.evaluate("[animator.playing, animator.time]") == [False, 2.5]
+    choose_speed(page, speed)
+    assert_pace(page, 0.6, float(speed))
+    choose_speed(page, "1")
+    page.locator("#time").fill("1")
+    assert_pace(page, 0.5)
+
+
+@pytest.mark.browser
+def test_a_page_that_cannot_keep_up_leaves_pictures_out_and_keeps_the_time(page: Any) -> None:
+    page.evaluate("""() => {
+      seek(0.5);
+      window.heavy = true;
+      (function burn() {
+        const until = performance.now() + 120;
+        while (performance.now() < until);
+        if (window.heavy) requestAnimationFrame(burn);
+      })();
+    }""")
+    assert_pace(page, 1.2)
+    page.evaluate("window.heavy = false")
+
+
+@pytest.mark.browser
+def test_keys_play_pause_and_scrub(page: Any) -> None:
+    def now() -> tuple[bool, float]:
+        playing, t = page.evaluate("[animator.playing, animator.time]")
+        return playing, t
+
+    page.evaluate("seek(2)")
+    page.locator("#meshcat-pane").click(position={"x": 300, "y": 200})  # the focus is nowhere
+    page.keyboard.press("Space")
+    page.wait_for_function("animator.playing && animator.time > 2.05")
+    page.keyboard.press("Space")
+    assert now()[0] is False
+    for key, t in [("Home", 0.0), ("ArrowRight", 0.08), ("ArrowRight", 0.16), ("ArrowLeft", 0.08)]:
+        page.keyboard.press(key)
+        assert now() == (False, pytest.approx(t, abs=1e-9))
+    page.keyboard.press("End")
+    assert now() == (False, 8.0)
+    page.keyboard.press("ArrowRight")
+    assert now() == (False, 8.0)
+    # The keys of a control are its own.
+    page.locator("#speed").focus()
+    page.keyboard.press("ArrowDown")
+    assert page.locator("#speed").input_value() == "2"
+    assert now() == (False, 8.0)
+    page.keyboard.press("ArrowUp")
+    page.locator("#loop").focus()
+    page.keyboard.press("Space")
+    assert page.locator("#loop").is_checked() is False
+    page.keyboard.press("Space")
+    assert now()[0] is False
+    page.locator("#toggle").focus()
+    page.keyboard.press("Space")
+    assert now()[0] is True
+    page.keyboard.press("Enter")
+    assert now()[0] is False
+    first = page.evaluate("about.passages[0].time")
+    page.locator("#marks button").first.focus()
+    page.keyboard.press("Enter")
+    assert page.evaluate("animator.time") == pytest.approx(first)
+
+
+@pytest.mark.browser
+def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: Any) -> None:
+    named = {
+        page.get_by_role("slider", name="time"): "#time",
+        page.get_by_role("combobox", name="speed"): "#speed",
+        page.get_by_role("checkbox", name="Loop"): "#loop",
+        page.get_by_role("img", name="slider_crank"): "#meshcat-pane",
+        page.get_by_role("group", name="values of the run"): "#panel",
+    }
+    for found, selector in named.items():
+        assert found.count() == 1, selector
+        assert found.evaluate("(node, s) => node.matches(s)", selector)
+    page.evaluate("seek(2)")
+    assert page.get_by_role("button", name="Play", exact=True).count() == 1
+    assert page.get_by_role("button", name="singular configuration passed").count() == 4
+    page.wait_for_function("slider.getAttribute('aria-valuetext') === '2.00 / 8.00 s'")
+    page.locator("#toggle").focus()
+    reached = []
+    for _ in range(4):
+        reached.append(page.evaluate("document.activeElement.id"))
+        page.keyboard.press("Tab")
+    assert reached == ["toggle", "speed", "loop", "time"]
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("size", [(1280, 720), (400, 760)])
+def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[int, int]) -> None:
+    before = page.viewport_size
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    # The canvas follows in the handler of the window's event, a frame later or more.
+    for element in ("window.inner", "pane.client", "viewer.renderer.domElement.client"):
+        page.wait_for_function(f"{element}Width === {size[0]}")
+    boxes = {
+        name: page.locator(name).bounding_box()
+        for name in ("#meshcat-pane canvas", "#bar", "#panel", "#time", "output", "#toggle")
+    }
+    for name, box in boxes.items():
+        assert box["x"] >= 0.0, name
+        assert box["x"] + box["width"] <= size[0] + 0.5, name
+        assert box["y"] + box["height"] <= size[1] + 0.5, name
+    canvas, bar = boxes["#meshcat-pane canvas"], boxes["#bar"]
+    assert canvas["y"] + canvas["height"] == pytest.approx(bar["y"], abs=1.0)
+    assert boxes["#panel"]["height"] < 0.2 * size[1]
+    assert page.evaluate("parseFloat(getComputedStyle(element('panel')).fontSize)") >= 13.0
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    page.set_viewport_size(before)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(
+    ("span", "panel", "clock"),
+    [
+        ((5.0, 9.0), "6.000", "6.00 / 9.00 s"),
+        ((-3.0, 1.0), "\u22122.000", "\u22122.00 / 1.00 s"),
+        ((0.0, 4e-6), "0.000001000", "0.00000100 / 0.00000400 s"),
+    ],
+)
+def test_panel_and_slider_tell_the_time_of_the_run_with_the_digits_that_it_needs(
+    browser: Any, tmp_path: Path, span: tuple[float, float], panel: str, clock: str
+) -> None:
+    solution = srm.simulate(load("slider_crank"), span[1], t0=span[0])
+    solution.export_html(tmp_path / "page.html")
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        page.evaluate("seek(0.25 * viewer.animator.duration)")
+        page.wait_for_function(
+            "words => document.querySelector('output').value === words", arg=clock
+        )
+        assert (
+            page.evaluate("document.querySelector('#panel td:nth-child(2)').textContent") == panel
+        )
+        assert page.locator("#time").get_attribute("aria-valuetext") == clock
+
+
+@pytest.mark.browser
+def test_without_the_loop_the_motion_stops_at_its_end_and_can_be_played_again(page: Any) -> None:
+    page.locator("#loop").uncheck()
+    page.evaluate("seek(7.8)")
+    page.locator("#toggle").click()
+    page.wait_for_function("!viewer.animator.playing")
+    assert page.evaluate("viewer.animator.time") == pytest.approx(8.0, abs=1e-6)
+    page.locator("#toggle").click()
+    page.wait_for_function("viewer.animator.playing && viewer.animator.time < 2")
+    page.locator("#loop").check()
+    page.evaluate("seek(7.9)")
+    page.locator("#toggle").click()
+    page.wait_for_function("viewer.animator.playing && viewer.animator.time < 2")
+
+
+@pytest.mark.browser
+def test_the_path_of_a_traced_point_is_where_forward_kinematics_puts_it(
+    page: Any, slider_crank: srm.Solution
+) -> None:
+    points = np.array(
+        page.evaluate("""() => [...viewer.scene_tree.find(["overlays", "trace_0"])
+            .children["<object>"].object.geometry.attributes.position.array]""")
+    ).reshape(-1, 3)
+    assert len(points) == 513
+    for i in range(0, 513, 37):
+        assert np.abs(points[i] - place(slider_crank, i / 64.0, ROD)).max() < 1e-6
+    ball = ends_in(page, "point_", 2.5)[0, 0]
+    assert np.abs(ball - place(slider_crank, 2.5, ROD)).max() < 1e-6
+
+
+ENDS = """([kind, t]) => {
+  seek(t);
+  viewer.scene.updateMatrixWorld(true);
+  const root = viewer.scene_tree.find(["overlays"]);
+  const world = root.object.matrixWorld.clone().invert();
+  return Object.entries(root.children).filter(([name, _]) => name.startsWith(kind))
+    .map(([_, node]) => [0, 1].map(z => new MeshCat.THREE.Vector3(0, 0, z)
+      .applyMatrix4(node.object.matrixWorld).applyMatrix4(world).toArray()));
+}"""
+
+
+def ends_in(page: Any, kind: str, t: float) -> Any:
+    """Where the overlays of a kind have their points (0, 0, 0) and (0, 0, 1), (k, 2, 3), at the
+    animation's time t."""
+    return np.array(page.evaluate(ENDS, [kind, t]))
+
+
+@pytest.mark.browser
+def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_their_reaction(
+    browser: Any,
+    tmp_path: Path,
+) -> None:
+    solution = srm.simulate(load("stewart_platform"), 1.0)
+    solution.export_html(tmp_path / "page.html", fps=64.0, reactions=True)
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        for t in (0.0, 0.515625, 1.0):
+            springs, ends = (
+                [s for s, _ in overlays.springs_of(solution)],
+                ends_in(page, "spring_", t),
+            )
+            assert len(ends) == len(springs) == 6
+            for spring, (a, b) in zip(springs, ends):
+                assert np.abs(a - place(solution, t, spring.a)).max() < 1e-6
+                assert np.abs(b - place(solution, t, spring.b)).max() < 1e-6
+        legend = page.locator("#notes").inner_text()
+        colour = page.evaluate("""() => [...viewer.scene_tree.find(["overlays", "closure_3",
+            "part_0", "<object>"]).object.material.color.toArray()]""")
+    sizes = [
+        np.linalg.norm(wrench[:, :3], axis=1)
+        for wrench in solution.at(np.arange(65) / 64.0).reactions.values()
+    ]
+    top = np.percentile(np.concatenate(sizes), closure_overlays.HIGH)
+    assert float(re.findall(r"([\d.]+) N", legend)[0]) == pytest.approx(top, rel=6e-3)
+    expected = ramp_colours(sizes[3][-1:] / top)[0]
+    assert np.abs(np.array(colour) - expected).max() < 1e-6
+
+
+@pytest.mark.browser
+def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
+    browser: Any,
+    tmp_path: Path,
+) -> None:
+    solution = srm.simulate(load("spatial_four_bar"), 1.0, rtol=1e-4)
+    solution.export_html(tmp_path / "page.html", fps=64.0, gaps=True)
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        words = page.locator("#notes").inner_text()
+        ((start, end),) = ends_in(page, "gap_", 0.75)
+    power = words.split("10")[-1].split()[0].translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
+    (gap,) = gaps_of(solution, np.array([0.75]))
+    assert np.linalg.norm(gap.arrows) > 1e-9  # there is one
+    np.testing.assert_allclose(end - start, 10.0 ** int(power) * gap.arrows[0], atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def let_go_and_tied() -> srm.Solution:
+    """The slider-crank, whose pin lets go at 0.5 s and which a rope ties at 0.9 s."""
+    mechanism = load("slider_crank")
+    mechanism = srm.Mechanism(mechanism.model, mechanism.loops, mechanism.q0, mechanism.v0)
+    freed = mechanism.without_loop("pin")
+    post, end = srm.Anchor("world", xyz=(0.0, 0.0, -5.0)), srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
+
+    def tie(t: float, q: Any, v: Any) -> srm.Switch:
+        data = freed.model.createData()
+        pin.forwardKinematics(freed.model, data, q)
+        joint, placement = end.resolve(freed.model)
+        way = (data.oMi[joint] * placement).translation - np.array(post.xyz)
+        length = float(np.linalg.norm(way))
+        return srm.Switch(
+            freed.with_loop(srm.LoopClosure("distance", end, post, name="rope", length=length))
+        )
+
+    events = [
+        srm.Event(lambda t, q, v: t - 0.5, action=lambda t, q, v: srm.Switch(freed)),
+        srm.Event(lambda t, q, v: t - 0.9, action=tie),
+    ]
+    return srm.simulate(mechanism, 1.5, events=events, rtol=1e-5)
+
+
+SEEN = """t => {
+  seek(t);
+  const seen = {};
+  const overlays = Object.entries(viewer.scene_tree.find(["overlays"]).children);
+  const shapes = Object.entries(viewer.scene_tree.find(["mechanism", "rod"]).children);
+  for (const [name, node] of [...overlays, ...shapes]) seen[name] = node.object.visible;
+  return seen;
+}"""
+
+
+@pytest.mark.browser
+def test_closures_are_drawn_while_they_are_there_and_not_before_or_after(
+    browser: Any, tmp_path: Path, let_go_and_tied: srm.Solution
+) -> None:
+    let_go_and_tied.export_html(tmp_path / "page.html", fps=10.0, reactions=True, gaps=True)
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        # Between the key frames at 0.4, 0.5, ...: to the very time.
+        for t, pinned, tied in [
+            (0.0, True, False),
+            (0.499, True, False),
+            (0.501, False, False),
+            (0.899, False, False),
+            (0.901, False, True),
+            (1.5, False, True),
+        ]:
+            seen = page.evaluate(SEEN, t)
+            assert (seen["closure_0"], seen["gap_0"]) == (pinned, pinned), t
+            assert (seen["closure_1"], seen["gap_1"]) == (tied, tied), t
+            # Bars, as there are no visuals: both closures end on the rod, whose bar stays.
+            balls = [seen[name] for name in sorted(seen) if name.startswith("shape_")]
+            assert balls.count(False) == (not pinned) + (not tied), t
+        rope = ends_in(page, "closure_1", 1.2)[0, 0]
+        end = srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
+        assert np.abs(rope - place(let_go_and_tied, 1.2, end)).max() < 1e-6
+        rows = {name: value for name, value, _ in page.evaluate(READ, 0.7)}
+        assert (rows["drift |g|"], rows["sigma"]) == ("0", "\u2013")  # there are no closures
+        page.evaluate("seek(1.45)")
+        page.evaluate("animator.play()")
+        page.wait_for_function("animator.time < 0.4")  # over again
+        assert page.evaluate(SEEN, 0.2)["closure_0"] is True
+
+
+def test_what_is_not_there_has_no_gap_and_no_part_in_the_scale(
+    let_go_and_tied: srm.Solution,
+) -> None:
+    times = np.linspace(0.0, 1.5, 31)
+    pinned, tied = gaps_of(let_go_and_tied, times)
+    assert (pinned.loop.name, tied.loop.name) == ("pin", "rope")
+    assert pinned.spans == ((0.0, pytest.approx(0.5)),)
+    assert tied.spans == ((pytest.approx(0.9), 1.5),)
+    assert np.all(pinned.arrows[times > 0.51] == 0.0)
+    assert np.all(tied.arrows[times < 0.89] == 0.0)
+    assert np.linalg.norm(pinned.arrows, axis=1).max() < 1e-3
+
+
+@pytest.mark.browser
+def test_a_motion_that_was_not_simulated_has_its_time_only(
+    browser: Any,
+    tmp_path: Path,
+) -> None:
+    mechanism = load("four_bar")
+    run = srm.simulate(mechanism, 1.0)
+    srm.JointMotion(mechanism, run.t, run.q).export_html(tmp_path / "page.html", fps=20.0)
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        assert panel(page, 0.5) == {"t": (0.5, "s")}
+        assert page.locator("#marks button").count() == 0
+
+
+@pytest.mark.parametrize("name", ["slider_crank", "spatial_four_bar", "bricard", "delta_robot"])
+def test_gaps_are_as_large_as_the_errors_of_the_rows_of_length(name: str) -> None:
+    solution = srm.simulate(load(name), 0.3)
+    q = np.array([solution.mechanism.model.nq * [0.0]]) + solution.q[-1]
+    q[0, -1] += 0.03  # opened: rounding would show nothing
+    opened_loops = srm.JointMotion(solution.mechanism, np.zeros(1), q)
+    errors = constraint_errors(solution.mechanism, np.zeros(1), q, solution.v[-1:])[0][0]
+    at = 0
+    gaps = {gap.loop.name: gap.arrows for gap in gaps_of(opened_loops, np.zeros(1))}
+    assert gaps
+    for loop in solution.mechanism.loops:
+        rows = errors[at : at + loop.rows.count][loop.rows.blocks[0]]
+        at += loop.rows.count
+        if len(rows):
+            size = np.linalg.norm(gaps[loop.name])
+            assert size == pytest.approx(np.linalg.norm(rows), rel=1e-9, abs=1e-15)
+
+
+def test_quaternions_along_a_turning_direction_turn_z_to_it_without_twist() -> None:
+    angle = np.linspace(0.0, 4.0 * np.pi, 200)  # through -z, where the shortest turn is not unique
+    directions = np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)])
+    quaternions = turns_along(directions)
+    for quaternion, direction in zip(quaternions, directions):
+        turned = pin.Quaternion(quaternion).matrix()
+        np.testing.assert_allclose(turned[:, 2], direction, atol=1e-12)
+        np.testing.assert_allclose(turned[:, 1], [0.0, 1.0, 0.0], atol=1e-12)
+    assert np.all(np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"trace": ["rod"]}, "'rod' is not a point of a link"),
+        ({"trace": ROD}, "trace is one anchor"),
+        ({"trace": [srm.Anchor("nothing")]}, "no link 'nothing'"),
+        ({"trace": [srm.Anchor("world", xyz=(1.0, 0.0, 0.0))]}, "lies on the ground"),
+    ],
+)
+def test_what_cannot_be_traced_is_an_input_error(
+    tmp_path: Path, slider_crank: srm.Solution, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(srm.InputError, match=words):
+        slider_crank.export_html(tmp_path / "page.html", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_reactions_and_gaps_of_an_open_chain_and_reactions_of_a_prescribed_motion_are_refused(
+    tmp_path: Path, slider_crank: srm.Solution
+) -> None:
+    pendulum = srm.simulate(load("simple_pendulum"), 0.1)
+    for what in ("reactions", "gaps"):
+        with pytest.raises(srm.InputError, match=f"no closures with {what}"):
+            pendulum.export_html(tmp_path / "page.html", **{what: True})
+    motion = srm.JointMotion(slider_crank.mechanism, slider_crank.t, slider_crank.q)
+    with pytest.raises(srm.InputError, match="not simulated has no reactions"):
+        motion.export_html(tmp_path / "page.html", reactions=True)
+
+
+def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Solution) -> None:
+    far = srm.Anchor("rod", xyz=(9.0, 0.0, 0.0))
+    view = make_picture(slider_crank, 20.0, Wanted([far])).view
+    path = np.array([place(slider_crank, t, far) for t in np.linspace(0.0, 8.0, 161)])
+    x, y, depth = view.axes @ (path - view.target).T
+    slope = np.tan(np.radians(0.5 * FIELD_OF_VIEW)) * (view.distance + depth)
+    reach = max(np.abs(x / slope).max() / ASPECT, np.abs(y / slope).max())
+    assert reach == pytest.approx(FILLED, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def flight() -> srm.Solution:
+    """A ring of four rods that crosses 200 m in 4 s."""
+    ring = floating_ring()
+    v = np.array(ring.v0)
+    v[:3] += 50.0 * np.array([1.0, 0.0, 0.0])  # a free joint's rates are in its body's axes
+    return srm.simulate(ring, 4.0, v0=v)
+
+
+def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.Solution) -> None:
+    picture = make_picture(flight, 30.0, Wanted())
+    assert picture.along is not None
+    assert picture.along[0] == pytest.approx(0.0, abs=1e-12)
+    assert 150.0 < np.linalg.norm(picture.along[-1]) < 210.0
+    assert picture.view.distance < 20.0
+    (note,) = picture.overlays.notes
+    assert re.fullmatch(r"the picture goes along with .* which travels \d+ m", note["text"])
+
+
+def test_the_picture_stands_still_where_a_joint_holds_to_the_ground_or_little_is_gained(
+    slider_crank: srm.Solution,
+) -> None:
+    assert make_picture(slider_crank, 30.0, Wanted()).along is None
+    assert make_picture(srm.simulate(floating_ring(), 1.0), 30.0, Wanted()).along is None
+
+
+@pytest.mark.browser
+def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera(
+    browser: Any, flight: srm.Solution, tmp_path: Path
+) -> None:
+    point = srm.Anchor("d", xyz=(1.0, 0.0, 0.0))
+    flight.export_html(tmp_path / "page.html", trace=[point])
+    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+        for t in (0.0, 1.0, 2.5, 4.0):
+            middles, ball = page.evaluate(
+                """t => {
+                  seek(t);
+                  viewer.scene.updateMatrixWorld(true);
+                  const at = node => new MeshCat.THREE.Vector3().setFromMatrixPosition(
+                    node.object.matrixWorld).toArray();
+                  const {mechanism, overlays} = viewer.scene_tree.children;
+                  return [Object.values(mechanism.children).filter(x => x.children.shape_0 ||
+                    Object.keys(x.children).length > 1).map(at), at(overlays.children.point_0)];
+                }""",
+                t,
+            )
+            assert len(middles) >= 4
+            assert np.abs(middles).max() < 3.0
+            assert min(np.linalg.norm(np.array(ball) - middle) for middle in middles) < 1.0 + 1e-3
+
+
+def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
+    for name, t_end, named in [("n_four_bar_2", 2.0, True), ("n_four_bar_13", 2.0, False)]:
+        solution = srm.simulate(load(name), t_end)
+        about = read_out(solution, np.linspace(0.0, t_end, 5))
+        assert len(about["passages"]) == len(solution.crossings) > 0
+        assert all((": " in passage["text"]) == named for passage in about["passages"])
+    solution = srm.simulate(load("slider_crank"), 240.0)
+    assert len(solution.crossings) > 100
+    texts = [passage["text"] for passage in read_out(solution, np.linspace(0, 240, 5))["passages"]]
+    assert not any(": " in text for text in texts)
+
+
+def test_names_do_not_end_the_script_of_a_page() -> None:
+    from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
+
+    about = {"notes": [{"text": "</script><script>alert(1)</script>"}]}
+    page = make_page(import_meshcat(), "a</title>b", about, [])
+    assert "</script><script>alert(1)" not in page
+    assert "a</title>b" not in page
+
+
+def test_what_the_page_is_made_of_is_package_data() -> None:
+    folder = Path(srm.__file__).parent / "visualization/animation/web"
+    assert {"page.html", "page.js"} <= {file.name for file in folder.iterdir()}
+
+
+@pytest.mark.browser
+def test_the_command_line_draws_the_path_of_a_point_of_a_link(
+    browser: Any, tmp_path: Path, slider_crank: srm.Solution
+) -> None:
+    path = tmp_path / "page.html"
+    options = ["--t-end", "8", "--html", str(path), "--trace", "rod:0.5,0,0.2"]
+    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
+    assert done.exit_code == 0, done.output
+    with opened(browser, path.as_uri()) as page:
+        ball = ends_in(page, "point_", 2.5)[0, 0]
+    assert np.abs(ball - place(slider_crank, 2.5, ROD)).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "words"),
+    [
+        ("slider_crank", ["--trace", "rod"], "'rod' is not a point of a link"),
+        ("slider_crank", ["--trace", "rod:1,2"], "'rod:1,2' is not a point of a link"),
+        ("slider_crank", ["--trace", "bar:1,2,3"], "--trace: there is no link 'bar'"),
+        ("slider_crank", ["--trace", "rod:1,2,nan"], "--trace: 'rod:1,2,nan' is not a point"),
+        ("simple_pendulum", ["--reactions"], "--reactions: the mechanism has no closures"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_the_run(
+    model: str, options: list[str], words: str, tmp_path: Path
+) -> None:
+    page = ["--html", str(tmp_path / "page.html")]
+    done = CliRunner().invoke(app, ["simulate", model, *page, *options])
+    assert done.exit_code == 2
+    assert words in done.output
+    assert "steps" not in done.output
+
+
+@pytest.mark.parametrize("options", [["--trace", "rod:1,0,0"], ["--gaps"], ["--reactions"]])
+def test_what_would_be_drawn_nowhere_is_refused_before_the_run(options: list[str]) -> None:
+    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
+    assert done.exit_code == 2
+    assert f"error: {options[0]}: it is drawn in the animation" in done.output
+    assert "--html" in done.output
+    assert "steps" not in done.output

@@ -1,0 +1,313 @@
+"""What the README and the pages of docs/ show runs as it stands, and the site has all of it."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import tomllib
+from collections.abc import Callable
+from functools import cache, cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+from PIL import Image
+
+import srm_mbs as srm
+from srm_mbs.dynamics.constraints.rows import closure_errors
+from srm_mbs.formats.toml.description import parse_description
+from tools import plot_pictures, singular_pictures
+from tools.method_tables import filled
+from tools.singular_pictures import by_scipy
+
+ROOT = Path(__file__).parents[3]
+DOCS = ROOT / "docs"
+SOURCE = ROOT / "srm_mbs"
+PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
+FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+LANGUAGES = {"python", "toml", "sh", ""}
+"""Of fenced blocks; one in another language would be run by no test."""
+Ran = Callable[[str], tuple[dict[str, Any], Path]]
+
+
+@cache
+def blocks(page: str) -> tuple[tuple[str, str], ...]:
+    """Language and text of the fenced blocks of a page."""
+    return tuple(FENCE.findall(PAGES[page].read_text(encoding="utf-8")))
+
+
+def is_whole(text: str) -> bool:
+    """Whether a TOML block is a whole description, and not some tables of one."""
+    return text.lstrip().startswith(("format", "#")) and "\nformat = " in f"\n{text}"
+
+
+def describe(text: str, folder: Path) -> None:
+    """Load a description as ``folder/[models/]NAME.toml``, where it finds its URDF."""
+    named = re.match(r"# (\S+\.toml)\n", text)
+    path = folder / (named[1] if named else f"models/{tomllib.loads(text)['name']}.toml")
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    if not named:
+        (folder / "urdf").symlink_to(ROOT / "urdf")
+    srm.load(path)
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """Run the blocks of a page, once: what they left behind, and their folder."""
+
+    @cache
+    def run(page: str) -> tuple[dict[str, Any], Path]:
+        folder = tmp_path_factory.mktemp("page")
+        names: dict[str, Any] = {"__name__": "page"}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            for number, (language, text) in enumerate(blocks(page), start=1):
+                if language == "python":
+                    code = compile(text, f"{page}, block {number}", "exec", dont_inherit=True)
+                    exec(code, names)
+                elif language == "toml" and is_whole(text):
+                    describe(text, folder)
+        return names, folder
+
+    return run
+
+
+def with_code() -> list[str]:
+    return [page for page in PAGES if any(kind in ("python", "toml") for kind, _ in blocks(page))]
+
+
+@pytest.mark.parametrize("page", with_code())
+def test_the_blocks_of_a_page_run_in_order(page: str, ran: Ran) -> None:
+    names, _ = ran(page)
+    for name, value in names.items():
+        if isinstance(value, srm.Solution):
+            assert value.success, (name, value.message)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_block_of_a_page_is_in_a_language_that_is_known_here(page: str) -> None:
+    text = PAGES[page].read_text(encoding="utf-8")
+    assert {language for language, _ in blocks(page)} <= LANGUAGES
+    assert 2 * len(blocks(page)) == text.count("```")
+
+
+def fragments() -> list[tuple[str, str]]:
+    return [
+        (page, text)
+        for page in PAGES
+        for language, text in blocks(page)
+        if language == "toml" and not is_whole(text)
+    ]
+
+
+@pytest.mark.parametrize(("page", "text"), fragments())
+def test_the_tables_of_descriptions_on_a_page_are_valid(page: str, text: str) -> None:
+    description = parse_description('format = 1\nurdf = "x.urdf"\n' + text, page)
+    found = len(description.loop) + len(description.drive) + len(description.force)
+    assert found == text.count("[[")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_files_that_a_page_names_are_there(page: str) -> None:
+    text = PAGES[page].read_text(encoding="utf-8")
+    folders = "srm_mbs|tests|benchmarks|tools|docs|models|urdf|examples"
+    named = re.findall(rf"`((?:{folders})/[\w./]+)`", text)
+    assert [path for path in named if not list(ROOT.glob(f"{path}*"))] == []
+
+
+# --- the site ------------------------------------------------------------------------------------
+
+
+def test_the_site_leads_to_every_page() -> None:
+    def pages(entry: Any) -> list[str]:
+        if isinstance(entry, str):
+            return [entry]
+        parts = entry.values() if isinstance(entry, dict) else entry
+        return [page for part in parts for page in pages(part)]
+
+    listed = pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
+    assert sorted(listed) == sorted(page.name for page in DOCS.glob("*.md"))
+
+
+def test_the_page_of_the_api_has_every_public_name() -> None:
+    listed = re.findall(r"^::: srm_mbs\.(\w+)$", PAGES["api.md"].read_text(), re.MULTILINE)
+    assert len(listed) == len(set(listed))
+    assert set(listed) == set(srm.__all__)
+
+
+def members(value: type) -> list[str]:
+    """Public methods and properties that a class defines itself."""
+    own = vars(value).items()
+    code = (property, cached_property, classmethod, staticmethod)
+    return [
+        key
+        for key, member in own
+        if not key.startswith("_") and (isinstance(member, code) or inspect.isfunction(member))
+    ]
+
+
+@pytest.mark.parametrize("name", [name for name in srm.__all__ if callable(getattr(srm, name))])
+def test_every_public_function_and_class_is_documented_with_its_members(name: str) -> None:
+    value = getattr(srm, name)
+    doc = value.__doc__ or ""
+    assert len(doc) > 20
+    assert not doc.startswith(f"{name}("), "a dataclass writes its signature where it has nothing"
+    if isinstance(value, type):
+        without = [key for key in members(value) if not inspect.getdoc(getattr(value, key))]
+        assert not without
+
+
+@pytest.mark.parametrize("name", [name for name in srm.__all__ if not callable(getattr(srm, name))])
+def test_every_public_table_is_documented_in_its_module(name: str) -> None:
+    (home,) = re.findall(
+        rf'^    "{name}": "([\w.]+)",$', (SOURCE / "__init__.py").read_text(), re.M
+    )
+    body = ast.parse((SOURCE / f"{home.replace('.', '/')}.py").read_text(encoding="utf-8")).body
+    after = next(
+        b for a, b in pairwise(body) if getattr(getattr(a, "target", None), "id", "") == name
+    )
+    assert isinstance(after, ast.Expr)
+    assert isinstance(after.value, ast.Constant)
+
+
+# --- what the README shows -----------------------------------------------------------------------
+
+
+def test_the_readme_leaves_the_files_that_it_names(ran: Ran) -> None:
+    _, folder = ran("README.md")
+    assert (folder / "drift.png").stat().st_size > 10_000
+    assert (folder / "slider_crank.html").stat().st_size > 500_000
+
+
+def test_the_description_in_the_readme_is_the_bundled_slider_crank() -> None:
+    (shown,) = (text for language, text in blocks("README.md") if language == "toml")
+    bundled = (ROOT / "models" / "slider_crank.toml").read_text(encoding="utf-8")
+    assert tomllib.loads(shown)["loop"] == tomllib.loads(bundled)["loop"]
+
+
+def test_the_readme_starts_with_exactly_two_commands() -> None:
+    language, first = blocks("README.md")[0]
+    commands = [line for line in first.splitlines() if line and not line.startswith("#")]
+    assert language == "sh"
+    assert len(commands) == 2
+    assert "pip install ." in commands[0]
+    assert "srm-mbs simulate slider_crank" in commands[0]
+    assert commands[1] == "tests/run"
+
+
+# --- what single pages promise -------------------------------------------------------------------
+
+
+def test_the_page_on_control_says_what_is_out_of_scope() -> None:
+    page = PAGES["control.md"].read_text(encoding="utf-8")
+    assert "Contact between bodies" in page[page.index("## What this is not for") :]
+
+
+def test_the_run_with_an_impact_on_the_page_on_control_has_segments(ran: Ran) -> None:
+    names, _ = ran("control.md")
+    assert len(names["bounced"].segments) > 1
+
+
+def test_the_page_on_forces_and_drives_has_every_type() -> None:
+    page = PAGES["forces_and_drives.md"].read_text(encoding="utf-8")
+    for name in (*srm.FORCE_TYPES, *srm.LAW_TYPES):
+        assert f"`{name}`" in page or f'"{name}"' in page
+
+
+def test_the_joint_on_the_page_on_forces_and_drives_meets_its_stop(ran: Ran) -> None:
+    names, _ = ran("forces_and_drives.md")
+    assert names["solution"].energy_balance.relative < 1e-6
+    assert 1.5 < names["stopped"].joint("crank")[0].max() < 1.7
+
+
+def test_the_page_on_closures_has_every_type() -> None:
+    page = PAGES["closures.md"].read_text(encoding="utf-8")
+    assert [name for name in srm.CLOSURE_TYPES if f"`{name}`" not in page] == []
+
+
+def test_the_sweeps_on_their_page_give_a_row_per_case(ran: Ran) -> None:
+    names, folder = ran("sweeps.md")
+    assert (names["again"].resumed, len(names["again"])) == (4, 6)
+    assert len(names["broken"].failures) == 1
+    assert not any(names[name].failures for name in ("sweep", "same", "swings", "on_dask"))
+    assert (folder / "swings.parquet").exists()
+
+
+def test_the_table_on_the_page_on_methods_is_that_of_the_committed_benchmark() -> None:
+    results = json.loads((DOCS / "work_precision.json").read_text(encoding="utf-8"))
+    page = PAGES["methods.md"].read_text(encoding="utf-8")
+    assert filled(page, results) == page, "run python -m tools.method_tables"
+
+
+def test_the_page_on_methods_has_every_tableau_with_its_order_and_stages() -> None:
+    page = PAGES["methods.md"].read_text(encoding="utf-8")
+    for line in page[page.index("## Tableau") : page.index("The README lists")].splitlines():
+        if line.startswith("| `"):
+            names, orders, stages, estimate, _ = (
+                cell.strip() for cell in line.strip("|").split("|")
+            )
+            for name, order, count in zip(
+                re.findall(r"`(\w+)`", names), orders.split(","), stages.split(","), strict=True
+            ):
+                tableau = srm.TABLEAUS[name]
+                assert (tableau.order, tableau.n_stages) == (int(order), int(count))
+                assert (tableau.error is not None) == (estimate == "yes")
+    assert [name for name in srm.TABLEAUS if f"`{name}`" not in page] == []
+
+
+def test_the_run_that_jumps_on_the_page_on_singular_configurations_hardly_shows_it() -> None:
+    mechanism = srm.load("slider_crank")
+    model, data = mechanism.model, mechanism.model.createData()
+    run = by_scipy(mechanism, 10.0)
+    q, v = np.ascontiguousarray(run.y[:2].T), np.ascontiguousarray(run.y[2:].T)
+    assert np.abs(q[:, 1] + 2.0 * q[:, 0]).max() > 1.0, "it stayed on its branch"
+    gap, _ = closure_errors(model, mechanism.loops, q, v)
+    energy = np.array([pin.computeMechanicalEnergy(model, data, *state) for state in zip(q, v)])
+    assert np.abs(gap).max() < 5e-6
+    assert np.abs(energy / energy[0] - 1.0).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("page", "folder", "draw"),
+    [
+        ("singular_configurations.md", "singular", singular_pictures.draw),
+        ("plots.md", "plots", plot_pictures.draw),
+    ],
+)
+def test_the_pictures_of_a_page_can_be_drawn_again(
+    page: str, folder: str, draw: Callable[[Path], None], tmp_path: Path
+) -> None:
+    draw(tmp_path)
+    shown = re.findall(rf"\({folder}/(\w+\.png)\)", PAGES[page].read_text(encoding="utf-8"))
+    assert sorted(shown) == sorted(path.name for path in tmp_path.iterdir())
+    for name in shown:
+        with Image.open(tmp_path / name) as new, Image.open(DOCS / folder / name) as old:
+            assert new.size == old.size, name
+            assert np.std(np.asarray(new.convert("L"), dtype=float)) > 5.0, f"{name} is blank"
+    assert sum(path.stat().st_size for path in (DOCS / folder).iterdir()) < 150_000
+
+
+# --- docstrings on the site ----------------------------------------------------------------------
+
+
+def test_the_roles_of_docstrings_become_links_and_formulae_code() -> None:
+    roles = pytest.importorskip("tools.docstring_roles", reason="needs the extra docs")
+    text = roles.without_roles(
+        r"See :class:`~srm_mbs.model.mechanism.Mechanism`, :math:`\dot G v`."
+    )
+    link = '<autoref optional identifier="srm_mbs.model.mechanism.Mechanism">`Mechanism`</autoref>'
+    assert text == rf"See {link}, `\dot G v`."
+
+
+def test_parameters_described_together_are_listed_by_all_their_names() -> None:
+    roles = pytest.importorskip("tools.docstring_roles", reason="needs the extra docs")
+    text = "    q0 : (nq,), v0 : (nv,)\n        Initial state."
+    assert roles.listed_together(text) == "    q0, v0 : (nq,), (nv,)\n        Initial state."
+    assert roles.listed_together("    t : (n,)\n        s") == "    t : (n,)\n        s"

@@ -1,0 +1,121 @@
+"""The page of every bundled mechanism, and of one with meshes and a floating base, in a browser."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.formats.load import bundled_models
+from srm_mbs.visualization.animation.meshcat_scene import node_names
+from srm_mbs.visualization.animation.scene import MAX_BODY_FRAMES
+from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
+from tests.support.browsing import bodies_in, opened, placements
+from tests.support.bundled import load, problem
+
+FPS = 32.0
+SPANS = {"squeezing_mechanism": 0.03125, "cassie": 0.375}
+"""Whole key frames (s); these two move fast, or far."""
+PHONE = (200, 350)
+
+REACH = """times => times.map(t => {
+  seek(t);
+  viewer.scene.updateMatrixWorld(true);
+  viewer.camera.updateMatrixWorld(true);
+  const reach = [0, 0, 0];
+  const measure = o => {
+    if (!o.isMesh) return;
+    o.geometry.computeBoundingBox();
+    const {min, max} = o.geometry.boundingBox;
+    for (const x of [min.x, max.x]) for (const y of [min.y, max.y]) for (const z of [min.z, max.z])
+      new MeshCat.THREE.Vector3(x, y, z).applyMatrix4(o.matrixWorld).project(viewer.camera)
+        .toArray().forEach((c, i) => { reach[i] = Math.max(reach[i], Math.abs(c)); });
+  };
+  for (const name of ["mechanism", "overlays"])
+    viewer.scene_tree.find([name]).object.traverse(measure);
+  return reach;
+})"""
+"""How far the shapes reach in the picture at some times: across, up and in depth, 1 at its edges.
+All at once, so that the pictures need not be drawn."""
+
+
+@cache
+def run(name: str) -> srm.Solution:
+    span = SPANS.get(name, 1.5)
+    if name == "cassie":
+        return srm.simulate(problem("cassie").mechanism, span, rtol=1e-6)
+    return srm.simulate(load(name), span)
+
+
+CHOSEN = {"slider_crank", "stewart_platform"}
+"""Planar, and spatial with springs; all others take a minute."""
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cassie",
+        *(
+            pytest.param(name, marks=[] if name in CHOSEN else pytest.mark.stress)
+            for name in bundled_models()
+        ),
+    ],
+)
+def test_the_page_is_small_needs_no_network_and_shows_every_body_in_its_place(
+    browser: Any, tmp_path: Path, name: str
+) -> None:
+    solution = run(name)
+    mechanism = solution.mechanism
+    end = solution.span[1]
+    path = tmp_path / "page.html"
+    solution.export_html(path, fps=FPS)
+    assert path.stat().st_size < 5e6
+    names = node_names(mechanism)
+    drawn = {visual.joint for visual in visuals_of(mechanism)} | {0}
+    with opened(browser, path.as_uri()) as page:
+        # On key frames: single precision; between them the browser goes straight.
+        for t in {0.0, end, round(0.4 * end * FPS) / FPS}:
+            found = bodies_in(page, t)
+            expected = placements(mechanism, solution(t)[0])
+            for joint in drawn - {0}:
+                apart = found[names[joint]] - expected[joint].homogeneous
+                assert np.abs(apart).max() < 1e-6, (names[joint], t)
+        reach = np.array(page.evaluate(REACH, np.linspace(0.0, end, 7).tolist()))
+        assert reach.shape == (7, 3)
+        assert reach.max() < 1.0
+        assert reach[:, :2].max() > 0.3  # it is not a speck either
+        if name in ("slider_crank", "stewart_platform"):
+            page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+            page.wait_for_function("away > 1.5")
+            assert np.max(page.evaluate(REACH, [0.0, 0.5 * end, end])) < 1.0
+
+
+def test_cassie_is_drawn_by_the_meshes_of_its_file_on_every_moving_body() -> None:
+    mechanism = run("cassie").mechanism
+    visuals = visuals_of(mechanism)
+    assert sum(isinstance(visual.shape, Mesh) for visual in visuals) >= 20
+    assert {visual.joint for visual in visuals} >= set(range(1, mechanism.model.njoints))
+
+
+@pytest.mark.browser
+def test_a_thousand_seconds_are_a_light_page(browser: Any, tmp_path: Path) -> None:
+    solution = srm.simulate(srm.load("slider_crank"), 1000.0)
+    path = tmp_path / "page.html"
+    solution.export_html(path)
+    assert path.stat().st_size < 5e6
+    with opened(browser, path.as_uri()) as page:
+        loaded = page.evaluate("performance.timing.loadEventEnd - performance.timing.fetchStart")
+        assert loaded < 10e3  # 1 to 2.5 s on two cores that do six other things
+        frames = page.evaluate(
+            "Math.max(...animator.actions.flatMap(a => a._clip.tracks.map(t => t.times.length)))"
+        )
+        assert frames == 1 + MAX_BODY_FRAMES // 2
+        t = 1000.0 * 7503 / 15000
+        found, expected = bodies_in(page, t), placements(solution.mechanism, solution(t)[0])
+        # The page counts the time in single precision: 3e-5 s here, at up to 3 rad/s and 4 m.
+        assert np.abs(found["rod"] - expected[2].homogeneous).max() < 5e-4

@@ -28,7 +28,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.kernel import backend
-from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.kernel.system import make_kernel_system
 from tests.support import reduced
 from tests.support.convergence import observed_order, turning
 from tests.support.mechanisms import floating_ring
@@ -161,8 +161,8 @@ def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float, float]:
     inside = 2000
     compiled = float("nan")
     if backend.core is not None:
-        twin = twin_of(system)
-        compiled = per_call(lambda: twin.repeat(0.0, state, inside), 1) / inside
+        kernel_system = make_kernel_system(system)
+        compiled = per_call(lambda: kernel_system.repeat(0.0, state, inside), 1) / inside
     return compiled, per_call(whole), per_call(pinocchio_only)
 
 

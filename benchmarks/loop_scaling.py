@@ -100,14 +100,16 @@ def main() -> None:
         for choice in ("auto", "dense", "sparse"):
             if choice in cells:
                 continue
-            twin = core.System(model, constants | {"algebra": choice}, None)
-            name = "sparse" if twin.sparse else "dense"
+            kernel_system = core.System(model, constants | {"algebra": choice}, None)
+            name = "sparse" if kernel_system.sparse else "dense"
             chosen = name if choice == "auto" else chosen
             cells[name] = [
-                least(partial(twin.repeat, 0.0, np.concatenate(state(model, angle))), repeats)
+                least(
+                    partial(kernel_system.repeat, 0.0, np.concatenate(state(model, angle))), repeats
+                )
                 for angle in ANGLES.values()
             ]
-            del twin
+            del kernel_system
         theirs = np.nan
         if n <= LOOPS_OF_PINOCCHIO:
             theirs = least(pinocchio(model, n, *state(model, ANGLES["half-way"])), repeats)

@@ -34,7 +34,7 @@ from srm_mbs.integration.driver import Closures
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.methods import psrm
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.split_step import later_stages
 from srm_mbs.simulation.options import step_size_control
 
@@ -49,10 +49,10 @@ KERNEL_REPEATS = 10
 """Runs on the kernel per run in Python: they are that much shorter."""
 
 
-def plain_start(system: System, t: float, state: FloatArray) -> Memory:
+def plain_start(system: System, t: float, state: FloatArray) -> IntegratorState:
     """First stage; no multiplier history."""
     terms = system.evaluate(t, state)
-    return Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    return IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
 
 
 def plain_step(
@@ -61,7 +61,7 @@ def plain_step(
     t: float,
     h: float,
     state: FloatArray,
-    memory: Memory,
+    memory: IntegratorState,
     norm: ErrorNorm,
     theta: float,
 ) -> StepResult:
@@ -101,7 +101,7 @@ def plain_step(
     )
 
 
-def plain_accept(memory: Memory, result: StepResult) -> None:
+def plain_accept(memory: IntegratorState, result: StepResult) -> None:
     """Rate, sigma and size at the end of the step."""
     memory.steps += 1
     memory.rate = result.end_rate
@@ -124,7 +124,9 @@ def nothing_for_singular_configurations() -> Iterator[None]:
     ) -> Any:
         return step_size_control(method.scheme, *span, step, first_step), ()
 
-    def start(system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any) -> Memory:
+    def start(
+        system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any
+    ) -> IntegratorState:
         return method.start(system, t, state, norm)  # type: ignore[no-any-return]
 
     with (

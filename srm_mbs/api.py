@@ -10,7 +10,7 @@ import numpy as np
 from srm_mbs.dynamics.controllers import Controller, HeldForce
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
-from srm_mbs.integration.breakpoints import Passing, pieces_between
+from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.prescribed_times import Placing
 from srm_mbs.integration.control.step_size import initial_step
 from srm_mbs.integration.driver import RunRecord, Tick, integrate
@@ -43,10 +43,10 @@ from srm_mbs.simulation.options import (
 from srm_mbs.simulation.result import Request, Settings, Solution
 from srm_mbs.simulation.runner import (
     absolute_tolerance,
-    bifurcations_told,
+    assemble_result,
+    bifurcation_sentences,
     check_consistent,
     check_mechanism,
-    collected,
     event_watch,
     initial_state,
     mechanism_method,
@@ -189,7 +189,7 @@ def simulate(
     times = checked_times(t_eval, t0, t_end)
     samples = checked_samples(sample_time, controller, t0, t_end)
     kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(t0, t_end)])
-    pieces = pieces_between(kinks, samples, t0, t_end)
+    pieces = smooth_intervals(kinks, samples, t0, t_end)
     check_avoidable(avoided, pieces.ends, t_end - t0)
     on_kernel = uses_kernel(backend, method, placement, avoided)
     mechanism, state = initial_state(mechanism, t0, q0, v0)
@@ -206,15 +206,15 @@ def simulate(
     log_start(mechanism.name, t0, t_end, method, norm, step, by)
     watch = event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()
-    twin: Any = None
+    kernel_system: Any = None
     record: RunRecord
     try:
         if on_kernel:
-            twin = taken(system)
-        evaluator = system if twin is None else Evaluator(system, twin)
-        passing = Passing(pieces, system, method, norm, evaluator)
+            kernel_system = taken(system)
+        evaluator = system if kernel_system is None else Evaluator(system, kernel_system)
+        passing = BreakpointHandler(pieces, system, method, norm, evaluator)
         if held is not None and controller is not None:
-            passing.sample = sampler(system, held, controller, twin)
+            passing.sample = sampler(system, held, controller, kernel_system)
             passing.sample(t0, state)
         memory = start(system, method, t0, state, norm, t_end, evaluator)
 
@@ -231,7 +231,7 @@ def simulate(
             if on_kernel and isinstance(method, PSRM):
                 check_embedded(method.scheme, step)
                 run = CompiledRun(
-                    twin,
+                    kernel_system,
                     method,
                     norm,
                     memory,
@@ -271,8 +271,8 @@ def simulate(
                     breakpoints=passing,
                 )
         passing.done()
-        if twin is not None:
-            given_back(system, twin)
+        if kernel_system is not None:
+            given_back(system, kernel_system)
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = {t0:.6g} s: {error}."
@@ -287,11 +287,11 @@ def simulate(
         tuple(avoided.tolist()),
         by,
     )
-    solution = collected(
-        mechanism, system, method, record, wrappers, watch, times, settings, norm, twin
+    solution = assemble_result(
+        mechanism, system, method, record, wrappers, watch, times, settings, norm, kernel_system
     )
     solution.request = Request.of(t_end, options)
-    solution.message += bifurcations_told(solution)
+    solution.message += bifurcation_sentences(solution)
     log_end(mechanism.name, solution)
     if raise_on_failure and not solution.success:
         raise SimulationError(solution.message, solution)

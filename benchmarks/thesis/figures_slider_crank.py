@@ -18,9 +18,9 @@ from benchmarks.thesis.systems import Index2, Published, slider_crank
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.multibody import ClosedSystem
-from srm_mbs.integration.control.step_size import Proposal, Verdict
+from srm_mbs.integration.control.step_size import Proposal, StepDecision
 from srm_mbs.integration.driver import integrate
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from tests.support import reduced
 
 PERIOD = 4.29657624142677449
@@ -119,7 +119,9 @@ class _Log(PublishedControl):
     that of the two last sweeps over the tolerance, at the start of the attempt.
     """
 
-    def __init__(self, t_end: float, first_step: float, memory: Memory, norm: ErrorNorm) -> None:
+    def __init__(
+        self, t_end: float, first_step: float, memory: IntegratorState, norm: ErrorNorm
+    ) -> None:
         super().__init__(t_end, first_step, ORDER, SMALLEST)
         self._memory, self._norm = memory, norm
         self.times: list[float] = []
@@ -128,10 +130,10 @@ class _Log(PublishedControl):
         self.gaps: list[float] = []
         self.verdicts: list[str] = []
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """The control's verdict, recorded."""
         forced = self.forced
-        verdict = super().judge(proposal, result)
+        verdict = super().decide(proposal, result)
         self.times.append(proposal.t_new - proposal.h)
         self.steps.append(proposal.h)
         self.ratios.append(math.inf if result is None else result.error_ratio)

@@ -18,8 +18,8 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.integration.control.step_size import Proposal, Verdict
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult, SweepNode
+from srm_mbs.integration.control.step_size import Proposal, StepDecision
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult, SweepNode
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.sweep import (
     Answer,
@@ -58,16 +58,24 @@ class PublishedSRM:
         """The Runge-Kutta data."""
         return get_tableau(self.tableau)
 
-    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
         """All sweeps at ``state`` with multiplier 0."""
         terms = system.evaluate(t, state)
-        memory = Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
         node = SweepNode(state, np.zeros(system.multiplier_size), None, 0.0, None)
         memory.sweeps = (node,) * self.iterations
         return memory
 
     def step(
-        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         scheme, s = self.scheme, self.scheme.n_stages
@@ -118,12 +126,12 @@ class PublishedSRM:
             ),
         )
 
-    def gap(self, memory: Memory, norm: ErrorNorm) -> float:
+    def gap(self, memory: IntegratorState, norm: ErrorNorm) -> float:
         """||x_m - x_{m-1}|| over the tolerance, where the sweeps stand."""
         last, lower = memory.sweeps[-1].state, memory.sweeps[-2].state
         return norm(last - lower, norm.weights(np.abs(last)))
 
-    def accept(self, memory: Memory, result: StepResult) -> None:
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
@@ -156,13 +164,13 @@ class PublishedControl:
         self._just_rejected = False
         self.accepted = self.rejected = self.forced = 0
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The step that the last error allows."""
         if t + self._h >= self._t_end:
             return Proposal(self._t_end - t, self._t_end)
         return Proposal(self._h, t + self._h)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Accept if xi <= 1, or if the step cannot be made smaller."""
         xi = math.inf if result is None else result.error_ratio
         largest = 1.0 if self._just_rejected else LARGEST_FACTOR
@@ -173,8 +181,8 @@ class PublishedControl:
         if result is None or (xi > 1.0 and not forced):
             self.rejected += 1
             self._just_rejected = True
-            return Verdict.REJECTED
+            return StepDecision.REJECTED
         self.accepted += 1
         self.forced += forced
         self._just_rejected = False
-        return Verdict.ACCEPTED
+        return StepDecision.ACCEPTED

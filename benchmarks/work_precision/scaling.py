@@ -39,7 +39,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.kernel.run import CompiledRun
-from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.kernel.system import make_kernel_system
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
 LOOPS_OF_ALL = 160
@@ -110,14 +110,16 @@ def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
 def kernel_evaluation(mechanism: srm.Mechanism, t_end: float, repeats: int) -> tuple[float, float]:
     """Microseconds of an evaluation, and of the pass over the tree in it, in the kernel's own loop:
     means over states of a run."""
-    twin = twin_of(make_system(mechanism))
+    kernel_system = make_kernel_system(make_system(mechanism))
     states = srm.simulate(mechanism, t_end, rtol=RTOL).steps.states
     chosen = states[np.linspace(0, len(states) - 1, STATES).astype(int)]
     number = 20
 
     def costs(state: FloatArray) -> tuple[float, float]:
-        evaluation = per_call(lambda: twin.repeat(0.0, state, number), repeats, 0.005)
-        return evaluation, per_call(lambda: twin.repeat_tree(state, number), repeats, 0.005)
+        evaluation = per_call(lambda: kernel_system.repeat(0.0, state, number), repeats, 0.005)
+        return evaluation, per_call(
+            lambda: kernel_system.repeat_tree(state, number), repeats, 0.005
+        )
 
     evaluation, tree = np.mean([costs(state) for state in chosen], axis=0) / number
     return float(evaluation), float(tree)

@@ -178,8 +178,8 @@ def _islands() -> Item:
 
     def evaluate(algebra: str) -> Callable[[], None]:
         constants = system.constants() | {"algebra": algebra}
-        twin = kernel.core.System(double.model, constants, None)
-        return lambda: twin.repeat(0.0, state, 10000)
+        kernel_system = kernel.core.System(double.model, constants, None)
+        return lambda: kernel_system.repeat(0.0, state, 10000)
 
     return Item(
         "islands factorised apart",

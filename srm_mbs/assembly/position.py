@@ -19,10 +19,10 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.constraints.row_algebra import shortest, weakest
+from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
 from srm_mbs.dynamics.scaling import coordinate_units, counted_turns, row_angles
-from srm_mbs.dynamics.singularities.local_analysis import sharpened
+from srm_mbs.dynamics.singularities.local_analysis import refine_singular_point
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import OPEN, LimitSpring
 from srm_mbs.model.mechanism import Mechanism
@@ -209,7 +209,7 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
     for _ in range(60):
         if error == 0.0:
             break
-        step = shortest(G[:, free], g, RANK)
+        step = min_norm_solution(G[:, free], g, RANK)
         q = problem.move(q, -step, free)
         g, G = problem.closure(q)
         new_error = float(np.abs(g).max())
@@ -222,12 +222,12 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
 def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Sharpen a double root of g; q itself where this does not help."""
     rows = problem.normalised(q)[:, free]
-    if not weakest(rows, 1e-13) < NEARLY_SINGULAR:
+    if not smallest_singular_value(rows, 1e-13) < NEARLY_SINGULAR:
         return q
     rank = int(np.sum(np.linalg.svd(rows, compute_uv=False) > NEARLY_SINGULAR))
     # A regular closing close to a singular one must stay: g may not become larger.
     closed = max(2e-15, float(np.abs(problem.closure(q)[0]).max()))
-    found = sharpened(problem, q, rank, NEARLY_SINGULAR, closed, free)
+    found = refine_singular_point(problem, q, rank, NEARLY_SINGULAR, closed, free)
     return q if found is None else found
 
 

@@ -16,7 +16,11 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.diagnosis import free_coordinates, quoted
 from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.rheonomic import DriveRows
-from srm_mbs.dynamics.constraints.row_algebra import null_basis, ranked, weakest
+from srm_mbs.dynamics.constraints.row_algebra import (
+    null_basis,
+    rank_revealing_qr,
+    smallest_singular_value,
+)
 from srm_mbs.dynamics.singularities.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
 from srm_mbs.dynamics.singularities.local_analysis import (
     SINGULAR,
@@ -72,7 +76,7 @@ def consistent_rates(
 
     def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
         """The rates nearest to u that satisfy the conditions; None if there are none."""
-        moved = ranked(to.rows[:, free], SINGULAR)
+        moved = rank_revealing_qr(to.rows[:, free], SINGULAR)
         u = u.copy()
         for _ in range(2):  # the second pass removes the rounding of the first
             u[free] -= moved.solve(to.rows @ u - to.right)
@@ -96,7 +100,7 @@ def consistent_rates(
         return u, float(np.abs(G @ u - asked).max()), True
 
     # Next to a singular configuration q lies off its branch by round-off over the distance.
-    smallest = min(weakest(normalised, EXACTLY), 1.0)
+    smallest = min(smallest_singular_value(normalised, EXACTLY), 1.0)
     tolerance = max(RATE_TOLERANCE, min(ROUNDING / smallest, LOOSEST))
     tolerance *= max(1.0, fastest)
 
@@ -125,7 +129,7 @@ def consistent_rates(
     remedy = f"Change or free one of {quoted(guilty)}" if guilty else "Give other rates"
     if driven and not held:
         remedy = "Change or remove a drive, or start where the motion can follow it"
-    if weakest(normalised, 1e-13) < 10.0 * SINGULAR:
+    if smallest_singular_value(normalised, 1e-13) < 10.0 * SINGULAR:
         remedy += (
             "; the held positions lie so close to a singular configuration that the rates are not "
             "determined: give them with all digits, or further away"
@@ -177,7 +181,7 @@ def _conditions(
         return out
 
     here = _with_drives(normalised, drives, curvature)
-    if not weakest(normalised, EXACTLY) < NEARLY:
+    if not smallest_singular_value(normalised, EXACTLY) < NEARLY:
         return here, None
     # G determines the rates to round-off over the square of the distance: use the branch.
     rank = mechanism.structure.loop_rank

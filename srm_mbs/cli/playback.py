@@ -124,10 +124,10 @@ def drawn(
     InputError
         If a trace is none, its point is not there or does not move, or no closure has reactions.
     """
-    from srm_mbs.visualization.animation.overlays import Wanted
+    from srm_mbs.visualization.animation.overlays import OverlayOptions
 
     anchors = given_points(trace or [], "--trace")
-    Wanted(anchors, gaps, reactions).check(mechanism)
+    OverlayOptions(anchors, gaps, reactions).check(mechanism)
     return {"trace": anchors, "gaps": gaps, "reactions": reactions}
 
 

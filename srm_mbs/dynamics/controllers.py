@@ -47,7 +47,9 @@ Controller = Callable[[float, FloatArray, FloatArray], Any]
 """(t, q, v) -> generalised forces tau (nv,), N and N m."""
 
 
-def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+def evaluate_controller(
+    controller: Controller, t: float, q: FloatArray, v: FloatArray
+) -> FloatArray:
     """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v`` and may
     return the same array every time.
 
@@ -60,7 +62,7 @@ def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> Fl
         tau = np.array(controller(t, q.copy(), v.copy()), dtype=float, order="C")
     except Exception as error:
         raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
-    trouble = unusable(tau, len(v))
+    trouble = controller_error(tau, len(v))
     if trouble:
         raise ControllerError(
             f"the controller returned {trouble} at t = {t:.6g} s; it must return {len(v)} finite "
@@ -69,7 +71,7 @@ def called(controller: Controller, t: float, q: FloatArray, v: FloatArray) -> Fl
     return tau
 
 
-def unusable(given: FloatArray, size: int) -> str:
+def controller_error(given: FloatArray, size: int) -> str:
     """What is wrong with an array that should be ``size`` finite numbers; empty if nothing is."""
     if given.shape != (size,):
         return f"an array of shape {given.shape}"

@@ -36,7 +36,7 @@ from srm_mbs.dynamics.constraints.rows import (
     support,
     world_jacobian,
 )
-from srm_mbs.dynamics.controllers import unusable
+from srm_mbs.dynamics.controllers import controller_error
 from srm_mbs.errors import ControllerError, EvaluationError
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.forces import (
@@ -337,7 +337,7 @@ class _UserForceEvaluator:
             raise ControllerError(
                 f"the force {self.name!r} raised {error!r} at t = {t:.6g} s"
             ) from error
-        trouble = unusable(given, self.size)
+        trouble = controller_error(given, self.size)
         if trouble:
             raise ControllerError(
                 f"the force {self.name!r} returned {trouble} at t = {t:.6g} s; it must return "
@@ -440,7 +440,9 @@ class ForceKinematics:
         """Whether there are functions of the user among the elements."""
         return any(isinstance(element, _UserForceEvaluator) for element in self._elements)
 
-    def called(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+    def evaluate_controller(
+        self, data: pin.Data, q: FloatArray, v: FloatArray, t: float
+    ) -> FloatArray:
         """tau (nv,) of those functions alone; ``data`` is a workspace."""
         pin.forwardKinematics(self._model, data, q, v)
         pin.computeJointJacobians(self._model, data, q)

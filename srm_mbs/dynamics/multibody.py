@@ -32,7 +32,7 @@ from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, P
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
-from srm_mbs.dynamics.controllers import Controller, HeldForce, called
+from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.scaling import constraint_units
@@ -217,7 +217,7 @@ class Mechanics(Manifold):
         output is held, and those among the force elements."""
         tau = np.zeros(self.nv) if self.held is not None else self.controlled_force(t, q, v)
         if self._forces is not None and self._forces.calls:
-            tau = tau + self._forces.called(self.data, q, v, t)
+            tau = tau + self._forces.evaluate_controller(self.data, q, v, t)
         return tau
 
     @property
@@ -235,10 +235,10 @@ class Mechanics(Manifold):
         self._first, self._last = first, last
 
     def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Generalised forces (nv,) of the controller, as :func:`called` returns them."""
+        """Generalised forces (nv,) of the controller, as :func:`evaluate_controller` returns them."""
         if self._controller is None:
             return np.zeros(self.nv)
-        return called(self._controller, t, q, v)
+        return evaluate_controller(self._controller, t, q, v)
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
@@ -390,7 +390,7 @@ class ClosedSystem(Mechanics):
         if self._driven is not None:
             return self._driven
         resolved: LoopKinematics = self.mechanism.derived("loops", self._resolved_loops)
-        return resolved.anew()
+        return resolved.copy_workspace()
 
     @cached_property
     def _driven(self) -> DrivenKinematics | None:

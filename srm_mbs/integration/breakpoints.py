@@ -17,7 +17,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import EvaluationError, InputError
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.near_singular import ROUNDING, ZONE_LARGEST
 from srm_mbs.integration.singular_endpoints import LOOK, arrive, start
 
@@ -37,7 +37,7 @@ _NONE = np.zeros(0, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class SmoothIntervals:
     """The pieces of a run, n of them.
 
     Attributes
@@ -61,7 +61,9 @@ class Pieces:
         return len(self.ends)
 
 
-def pieces_between(times: FloatArray, marked: FloatArray, t0: float, t_end: float) -> Pieces:
+def smooth_intervals(
+    times: FloatArray, marked: FloatArray, t0: float, t_end: float
+) -> SmoothIntervals:
     """The pieces into which ``times`` cut the run from ``t0`` to ``t_end`` (s).
 
     Parameters
@@ -69,11 +71,11 @@ def pieces_between(times: FloatArray, marked: FloatArray, t0: float, t_end: floa
     times : (k,) s
         Breakpoints in any order; those outside the run are left out.
     marked : (j,) s
-        Further ones, which :attr:`Pieces.given` tells apart; those at the ends of the run count
-        as outside.
+        Further ones, which :attr:`SmoothIntervals.given` tells apart; those at the ends of the run
+        count as outside.
     """
     if not len(times) and not len(marked):
-        return Pieces(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
+        return SmoothIntervals(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
     order = np.concatenate([marked, times])
     is_marked = np.arange(len(order)) < len(marked)
     by_time = np.argsort(order, kind="stable")
@@ -92,7 +94,7 @@ def pieces_between(times: FloatArray, marked: FloatArray, t0: float, t_end: floa
     after = final + BESIDE * np.spacing(np.abs(final))
     between = (begin > t0 + near) & (begin < t_end - near)
     at_start, at_end = after[begin <= t0 + near], before[begin >= t_end - near]
-    return Pieces(
+    return SmoothIntervals(
         ends=np.append(begin[between], t_end),
         first=np.concatenate([at_start[-1:] if len(at_start) else [-np.inf], after[between]]),
         last=np.concatenate([before[between], at_end[:1] if len(at_end) else [np.inf]]),
@@ -100,7 +102,7 @@ def pieces_between(times: FloatArray, marked: FloatArray, t0: float, t_end: floa
     )
 
 
-def direct_from(memory: Memory, norm: ErrorNorm, span: float, nv: int) -> float:
+def direct_from(memory: IntegratorState, norm: ErrorNorm, span: float, nv: int) -> float:
     """sigma from which the first stage of a piece of length ``span`` (s) can be evaluated directly.
 
     Rounding in a direct solve grows with 1/sigma^2; over a short piece it is harmless.  At most,
@@ -115,7 +117,7 @@ def direct_from(memory: Memory, norm: ErrorNorm, span: float, nv: int) -> float:
     return min(ZONE_LARGEST, float(np.sqrt(weighed / ALLOWED)))
 
 
-class Nearness:
+class SingularProximity:
     """When the singular configuration next to the first stage of a piece is worth looking for.
 
     Attributes
@@ -127,7 +129,7 @@ class Nearness:
     def __init__(self) -> None:
         self.looked = LOOK
 
-    def matters(self, fresh: Memory, norm: ErrorNorm, span: float, nv: int) -> bool:
+    def matters(self, fresh: IntegratorState, norm: ErrorNorm, span: float, nv: int) -> bool:
         """Whether for ``fresh``, at the start of a piece of length ``span`` (s)."""
         if fresh.sigma >= LOOK:
             self.looked = LOOK
@@ -145,8 +147,8 @@ def beside_singular(
     norm: ErrorNorm,
     end: float,
     evaluator: Any,
-    fresh: Memory,
-) -> Memory:
+    fresh: IntegratorState,
+) -> IntegratorState:
     """``fresh``, of the first stage of a piece up to ``end``, made accurate next to a singular
     configuration; the parameters are those of
     :func:`~srm_mbs.integration.singular_endpoints.start`.
@@ -162,7 +164,7 @@ def beside_singular(
         raise EvaluationError(f"at the breakpoint {error}") from error
 
 
-class Passing:
+class BreakpointHandler:
     """What happens at the breakpoints of a run, and before those, or an end, that lie beside a
     singular configuration; used by the drivers.
 
@@ -185,7 +187,7 @@ class Passing:
 
     def __init__(
         self,
-        pieces: Pieces,
+        pieces: SmoothIntervals,
         system: OpenSystem | ClosedSystem,
         method: Method,
         norm: ErrorNorm,
@@ -199,7 +201,7 @@ class Passing:
         self.sample: Callable[[float, FloatArray], None] | None = None
         self.arrivals = isinstance(system, ClosedSystem)
         self._index = 0
-        self._nearness = Nearness()
+        self._nearness = SingularProximity()
         self._evaluate_within(0)
 
     @property
@@ -224,7 +226,7 @@ class Passing:
         self._index = index
         self._evaluate_within(index)
 
-    def next(self, t: float, state: FloatArray, memory: Memory) -> Memory:
+    def next(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
         """Go on to the next piece; ``memory`` with its first stage.
 
         Raises
@@ -240,7 +242,7 @@ class Passing:
             return self._resolved(t, state, fresh)
         return fresh
 
-    def resolved(self, t: float, state: FloatArray, memory: Memory) -> Memory:
+    def resolved(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
         """``memory`` with the first stage of the current piece, from where it starts, evaluated
         with a look at the singular configuration nearby.
 
@@ -252,14 +254,14 @@ class Passing:
         fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
         return self._resolved(t, state, fresh)
 
-    def _resolved(self, t: float, state: FloatArray, fresh: Memory) -> Memory:
+    def _resolved(self, t: float, state: FloatArray, fresh: IntegratorState) -> IntegratorState:
         return beside_singular(
             self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
         )
 
     def arrive(
-        self, t: float, state: FloatArray, memory: Memory, index: int | None = None
-    ) -> Memory:
+        self, t: float, state: FloatArray, memory: IntegratorState, index: int | None = None
+    ) -> IntegratorState:
         """``memory`` with the multipliers known up to the end of the piece, which lies beside a
         singular configuration; see :func:`~srm_mbs.integration.singular_endpoints.arrive`.
 

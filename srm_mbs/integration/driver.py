@@ -11,11 +11,11 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
-from srm_mbs.integration.breakpoints import Passing
-from srm_mbs.integration.control.step_size import StepSizeControl, Verdict
+from srm_mbs.integration.breakpoints import BreakpointHandler
+from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 SMALLEST_STEP = 1e-14
@@ -39,7 +39,7 @@ NOT_FINITE = "the state is no longer finite"
 
 
 @dataclass(frozen=True)
-class Words:
+class ProblemVocabulary:
     """What messages call the problem: what is singular, what drives it, what to check."""
 
     singular: str
@@ -47,12 +47,12 @@ class Words:
     goes_on: str
 
 
-MECHANISM = Words(
+MECHANISM = ProblemVocabulary(
     "The closures are close to a singular configuration",
     "what acts on the mechanism",
     "the mechanism can move on from there (solution.q[-1])",
 )
-DAE = Words(
+DAE = ProblemVocabulary(
     "G B is almost singular there",
     "its right-hand side",
     "the problem has a solution from there on (solution.x[-1])",
@@ -66,7 +66,7 @@ class Attempt:
     t: float
     h: float
     error_ratio: float
-    verdict: Verdict
+    verdict: StepDecision
 
 
 @dataclass
@@ -115,7 +115,7 @@ class RunRecord:
         """Mark it as ended by a terminal event."""
         self.status, self.stop, self.message = "event", stop.time, stop.message
 
-    def broken_off(self, t: float, error: BaseException) -> None:
+    def mark_aborted(self, t: float, error: BaseException) -> None:
         """Mark it as interrupted, or failed because a function of the user did, at ``t``."""
         kept = "verything up to there is kept."
         if isinstance(error, KeyboardInterrupt):
@@ -146,7 +146,7 @@ def integrate(
     method: Method,
     control: StepSizeControl,
     norm: ErrorNorm,
-    memory: Memory,
+    memory: IntegratorState,
     state: FloatArray,
     t0: float,
     t_end: float,
@@ -154,8 +154,8 @@ def integrate(
     max_step: float = np.inf,
     tick: Tick | None = None,
     events: EventWatch | None = None,
-    breakpoints: Passing | None = None,
-    words: Words = MECHANISM,
+    breakpoints: BreakpointHandler | None = None,
+    words: ProblemVocabulary = MECHANISM,
 ) -> RunRecord:
     """Integrate from ``t0`` to ``t_end``; never raises for what happens on the way.
 
@@ -192,7 +192,7 @@ def integrate(
     trouble = ""
     redone = False
     if breakpoints is not None:
-        control.aim(breakpoints.end)
+        control.set_target_time(breakpoints.end)
     try:
         if events is not None:
             events.begin(t, x)
@@ -200,7 +200,7 @@ def integrate(
             if breakpoints is not None and t >= breakpoints.end:
                 record.breaks.append(len(record.times))
                 memory = breakpoints.next(t, x, memory)
-                control.aim(breakpoints.end)
+                control.set_target_time(breakpoints.end)
             limit = min(max_step, system.step_limit(x))
             proposal = control.propose(t, limit, memory)
             if proposal.arriving and breakpoints is not None:
@@ -222,13 +222,13 @@ def integrate(
             except EvaluationError as error:
                 result = None
                 trouble = str(error)
-            verdict = control.judge(proposal, result)
+            verdict = control.decide(proposal, result)
             placement = "redone" if redone else "a priori" if proposal.placed else ""
-            redone = verdict is Verdict.REPLACED
-            if verdict is not Verdict.ACCEPTED or result is None:
+            redone = verdict is StepDecision.REPLACED
+            if verdict is not StepDecision.ACCEPTED or result is None:
                 ratio = np.inf if result is None else result.error_ratio
                 record.attempts.append(Attempt(t, h, ratio, verdict))
-                if not control.adaptive and verdict is Verdict.REJECTED:
+                if not control.adaptive and verdict is StepDecision.REJECTED:
                     fail(record, t, h, memory, trouble or NOT_FINITE, False, words)
                     break
                 continue
@@ -247,11 +247,11 @@ def integrate(
                 record.ended(stop)
                 break
             if tick is not None:
-                tell(tick, t, h, x)
+                call_progress(tick, t, h, x)
         else:
             record.finished(t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
-        record.broken_off(t, error)
+        record.mark_aborted(t, error)
     # An interrupt between the two appends would leave one list longer.
     del record.times[min(len(record.times), len(record.steps)) :]
     del record.steps[len(record.times) :]
@@ -259,7 +259,7 @@ def integrate(
     return record
 
 
-def standstill(covered: float, words: Words = MECHANISM) -> str:
+def standstill(covered: float, words: ProblemVocabulary = MECHANISM) -> str:
     """What is wrong where WATCHED_STEPS steps covered only ``covered`` (s)."""
     return (
         f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; {words.forces} changes too "
@@ -274,7 +274,7 @@ def _stands_still(record: RunRecord, t: float, t_end: float) -> bool:
     return t - record.times[-WATCHED_STEPS] < STANDSTILL * (t_end - record.t0)
 
 
-def tell(tick: Tick, t: float, h: float, x: FloatArray) -> None:
+def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
     """Call ``tick`` with a copy of ``x``; what it raises must not lose the run."""
     try:
         tick(t, h, x.copy())
@@ -318,10 +318,10 @@ def fail(
     record: RunRecord,
     t: float,
     h: float,
-    memory: Memory,
+    memory: IntegratorState,
     trouble: str,
     adaptive: bool,
-    words: Words = MECHANISM,
+    words: ProblemVocabulary = MECHANISM,
 ) -> None:
     """Mark ``record`` as failed at ``t`` with the step ``h`` and say why.
 

@@ -39,7 +39,7 @@ from srm_mbs.dynamics.singularities.local_analysis import SingularConfiguration
 from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.control.placement import BESIDE
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.multiplier_history import WINDOW, MultiplierHistory
 from srm_mbs.integration.methods.near_singular import ZONE_LARGEST
 from srm_mbs.integration.methods.psrm import PSRM
@@ -148,7 +148,7 @@ def block_of(
                 history = MultiplierHistory(times[nodes], solved)
             # Known everywhere: every stage takes the interpolated multiplier.
             known = replace(history, known_until=np.inf, known_below=np.inf)
-            memory = Memory(here.rate, here.sigma, system.magnitudes(here.state), known)
+            memory = IntegratorState(here.rate, here.sigma, system.magnitudes(here.state), known)
             result = method.step(system, t, t_next - t, here.state, memory, norm)
             point = _solved(system, geometry, t_next, result.state, direct)
             if point is None:
@@ -224,10 +224,10 @@ def arrive(
     system: OpenSystem | ClosedSystem,
     t: float,
     state: FloatArray,
-    memory: Memory,
+    memory: IntegratorState,
     norm: ErrorNorm,
     end: float,
-) -> Memory:
+) -> IntegratorState:
     """``memory`` at ``t`` (s), with the multipliers known up to ``end``, of the run or its piece.
 
     Unchanged where they cannot be found: the steps are then made as everywhere else.
@@ -280,7 +280,9 @@ def _known(
     )
 
 
-def _error(history: MultiplierHistory, memory: Memory, norm: ErrorNorm, span: float) -> float:
+def _error(
+    history: MultiplierHistory, memory: IntegratorState, norm: ErrorNorm, span: float
+) -> float:
     """Error of interpolating between the nodes over ``span`` (s), over the tolerance."""
     nv = history.values.shape[1]
     error = np.zeros(2 * nv)
@@ -389,8 +391,8 @@ def start(
     norm: ErrorNorm,
     t_end: float,
     evaluator: System | None = None,
-    memory: Memory | None = None,
-) -> Memory:
+    memory: IntegratorState | None = None,
+) -> IntegratorState:
     """The memory of ``method`` at the initial state, also on a singular configuration.
 
     Parameters

@@ -67,7 +67,7 @@ BESIDE = 0.05
 """Part of the values around at which the velocity is taken before and after a passage."""
 
 
-class Watched:
+class ConstraintMonitor:
     """The closures and drives along the dense output of a run."""
 
     def __init__(self, system: ClosedSystem, dense: DenseOutput) -> None:
@@ -145,7 +145,7 @@ class Crossing:
     sigma: float
     rank: int
     placement: str
-    _watched: Watched = field(repr=False, compare=False)
+    _watched: ConstraintMonitor = field(repr=False, compare=False)
     _beside: float = field(repr=False, compare=False)
     _range: tuple[float, float] = field(repr=False, compare=False)
 
@@ -322,7 +322,7 @@ def _minima(values: FloatArray) -> list[tuple[int, int, int]]:
 
 
 def _turned(
-    watched: Watched, time: float, certain: bool, before: float, after: float
+    watched: ConstraintMonitor, time: float, certain: bool, before: float, after: float
 ) -> float | None:
     """Cosine between what G has lost at ``time`` as it is ``before`` and ``after``.
 
@@ -358,7 +358,7 @@ def _placement(steps: StepData, i: int) -> str:
     return here or (PLACEMENTS[int(steps.placements[i - 1])] if i else "")
 
 
-def passage_at(watched: Watched, steps: StepData, time: float, beside: float) -> Crossing:
+def passage_at(watched: ConstraintMonitor, steps: StepData, time: float, beside: float) -> Crossing:
     """The passage of a run at ``time`` (s), whose velocity is taken ``beside`` (s) it."""
     i = int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
     return Crossing(
@@ -388,7 +388,7 @@ def find_crossings(
     t, sigma = t[inside], sigma[inside]
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
-    watched = Watched(system, dense)
+    watched = ConstraintMonitor(system, dense)
     if system.structure.sigma_ref < BLUNT:
         sigma = watched.smallest(t)
         sigma = sigma / np.median(sigma)
@@ -513,7 +513,7 @@ def _ranges(marked: list[int], steps: StepData) -> list[tuple[int, int]]:
     return out
 
 
-def _closest(watched: Watched, t: FloatArray) -> float:
+def _closest(watched: ConstraintMonitor, t: FloatArray) -> float:
     """When, within the times t (SAMPLES,), sigma is smallest."""
     sigma = watched.smallest(t)
     k = int(np.argmin(sigma))
@@ -522,7 +522,7 @@ def _closest(watched: Watched, t: FloatArray) -> float:
     return float(t[k])
 
 
-def _turn(watched: Watched, t: FloatArray) -> float:
+def _turn(watched: ConstraintMonitor, t: FloatArray) -> float:
     """When, within the times t (k,), the motion turns back."""
     from scipy.optimize import brentq
 
@@ -572,7 +572,7 @@ def find_bifurcations(
     found: list[Bifurcation] = []
     if not marked:
         return ()
-    watched = Watched(system, dense)
+    watched = ConstraintMonitor(system, dense)
     for first, final in _ranges(marked, steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
         stayed = final > first or first in held

@@ -15,7 +15,7 @@ from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
 from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read
 from srm_mbs.integration.methods.base import Method
-from srm_mbs.simulation.result import Settings, Statistics, Stepped
+from srm_mbs.simulation.result import RunOutcome, Settings, Statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,7 +24,7 @@ MULTIPLIER_POINTS = 5
 """Ends of steps through which the multiplier of sweeps is interpolated."""
 
 
-class DaeSolution(Stepped):
+class DaeSolution(RunOutcome):
     """Result of :func:`srm_mbs.solve_dae`.
 
     Attributes

@@ -11,7 +11,7 @@ from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
 from srm_mbs.integration.control.branch_guard import RateGuard
 from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import Verdict, initial_step
+from srm_mbs.integration.control.step_size import StepDecision, initial_step
 from srm_mbs.integration.dense_output import step_data
 from srm_mbs.integration.driver import DAE, RunRecord, Tick, integrate
 from srm_mbs.integration.events import EventWatch, prepare_events
@@ -277,7 +277,7 @@ def solve_dae(
     )
     stats = Statistics(
         steps=data.count,
-        rejected=sum(a.verdict is Verdict.REJECTED for a in record.attempts),
+        rejected=sum(a.verdict is StepDecision.REJECTED for a in record.attempts),
         placements=sum(wrapper.placed for wrapper in wrappers),
         replaced=sum(wrapper.replaced for wrapper in wrappers),
         zone_steps=len(data.zones),

@@ -15,14 +15,14 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import EvaluationError
-from srm_mbs.integration.breakpoints import Nearness, beside_singular, pieces_between
+from srm_mbs.integration.breakpoints import SingularProximity, beside_singular, smooth_intervals
 from srm_mbs.integration.control.prescribed_times import Placing
-from srm_mbs.integration.control.step_size import StepSizeControl, Verdict, initial_step
+from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl, initial_step
 from srm_mbs.integration.driver import integrate
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
-from srm_mbs.integration.kernel.system import Evaluator, twin_of
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, Method
+from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.singular_endpoints import start
 
@@ -55,18 +55,18 @@ class _Live:
         self._held = held
         self._evaluator = evaluator
 
-    def _first(self, t: float, state: FloatArray, span: float) -> tuple[Memory, float]:
+    def _first(self, t: float, state: FloatArray, span: float) -> tuple[IntegratorState, float]:
         """Memory at ``state``, and the length of the first step of ``span`` (s)."""
         memory = start(self.system, self.method, t, state, self.norm, np.inf, self._evaluator)
         order = self.method.scheme.controller_order or 1
         first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
         return memory, first
 
-    def _matters(self, fresh: Memory, span: float) -> bool:
+    def _matters(self, fresh: IntegratorState, span: float) -> bool:
         """Whether the singular configuration next to ``fresh`` does; the kernel has asked."""
         return True
 
-    def _renewed(self, memory: Memory, end: float) -> Memory:
+    def _renewed(self, memory: IntegratorState, end: float) -> IntegratorState:
         fresh = self.method.resume(self._evaluator, self.t, self.state, memory, self.norm)
         if not self._matters(fresh, end - self.t):
             return fresh
@@ -96,17 +96,17 @@ class KernelRun(_Live):
         max_step: float,
         placement: str,
     ) -> None:
-        twin = twin_of(system)
-        super().__init__(system, held, method, norm, Evaluator(system, twin))
+        kernel_system = make_kernel_system(system)
+        super().__init__(system, held, method, norm, Evaluator(system, kernel_system))
         nothing = np.zeros(2 * system.nv)
         state = np.zeros(system.nq + system.nv)
-        pieces = pieces_between(nothing[:0], nothing[:0], 0.0, 1.0)
-        self._twin = twin
+        pieces = smooth_intervals(nothing[:0], nothing[:0], 0.0, 1.0)
+        self._kernel_system = kernel_system
         self._run = CompiledRun(
-            twin,
+            kernel_system,
             method,
             norm,
-            Memory(nothing, 1.0, nothing),
+            IntegratorState(nothing, 1.0, nothing),
             state,
             pieces,
             step=step,
@@ -128,7 +128,7 @@ class KernelRun(_Live):
     def begin(self, t: float, state: FloatArray, force: FloatArray, span: float) -> None:
         """Start from ``state`` at ``t`` (s), under ``force`` (nv,), for steps of ``span`` (s)."""
         self._held.only(force)
-        self._twin.hold(t, force, False)
+        self._kernel_system.hold(t, force, False)
         self._evaluator.between(-np.inf, np.inf)
         self._run.begin(t, state, *self._first(t, state, span))
 
@@ -188,12 +188,12 @@ class KernelRun(_Live):
         """Go on from a :meth:`snapshot` of another run like this."""
         kept, force = snapshot
         self._held.only(force)
-        self._twin.hold(kept["t"], force, False)
+        self._kernel_system.hold(kept["t"], force, False)
         self._run.restore(kept)
 
     def counts(self) -> dict[str, int]:
         """Work done, in the words of :class:`~srm_mbs.simulation.result.Statistics`."""
-        run, twin, system = self._run, self._twin, self.system
+        run, kernel_system, system = self._run, self._kernel_system, self.system
         steps, rejected, zones = run.totals()
         return {
             "steps": steps,
@@ -201,8 +201,8 @@ class KernelRun(_Live):
             "placements": run.placed,
             "replaced": run.replaced,
             "zone_steps": zones,
-            "evaluations": twin.evaluations + system.evaluations,
-            "factorisations": twin.factorisations + system.factorisations,
+            "evaluations": kernel_system.evaluations + system.evaluations,
+            "factorisations": kernel_system.factorisations + system.factorisations,
         }
 
 
@@ -233,8 +233,8 @@ class ReferenceRun(_Live):
         self._max_step = max_step
         self._control: StepSizeControl
         self._wrappers: tuple[Placing, ...] = ()
-        self._memory: Memory
-        self._nearness = Nearness()
+        self._memory: IntegratorState
+        self._nearness = SingularProximity()
         self._counted = np.zeros(5, dtype=int)
 
     def begin(self, t: float, state: FloatArray, force: FloatArray, span: float) -> None:
@@ -251,7 +251,7 @@ class ReferenceRun(_Live):
         self._counted[3] += sum(wrapper.replaced for wrapper in self._wrappers)
         self._wrappers = ()
 
-    def _matters(self, fresh: Memory, span: float) -> bool:
+    def _matters(self, fresh: IntegratorState, span: float) -> bool:
         return self._nearness.matters(fresh, self.norm, span, self.system.nv)
 
     def go_on(
@@ -268,7 +268,7 @@ class ReferenceRun(_Live):
                 self._memory = self._renewed(self._memory, end)
             except EvaluationError as error:
                 return f"Stopped at t = {self.t:.6g} s: {error}. {LAST_GOOD}."
-        self._control.aim(end, (self.t, grid) if grid else None)
+        self._control.set_target_time(end, (self.t, grid) if grid else None)
         record = integrate(
             self.system,
             self.method,
@@ -282,7 +282,7 @@ class ReferenceRun(_Live):
         )
         if record.times:
             self.t, self.state = record.times[-1], record.steps[-1].state
-        rejected = sum(a.verdict is Verdict.REJECTED for a in record.attempts)
+        rejected = sum(a.verdict is StepDecision.REJECTED for a in record.attempts)
         zones = sum(step.zone is not None for step in record.steps)
         self._counted += [len(record.times), rejected, 0, 0, zones]
         if record.status == "interrupted":

@@ -14,7 +14,7 @@ BEYOND = 0.1
 """How much longer a second run of one that failed may be: it tells whether that one goes on."""
 
 
-def why_not(solution: Solution) -> str:
+def unsupported_reason(solution: Solution) -> str:
     """Why ``solution`` cannot be made again; empty if it can."""
     request = solution.request
     if request is None:
@@ -24,7 +24,7 @@ def why_not(solution: Solution) -> str:
     return ""
 
 
-def second_run(
+def rerun(
     solution: Solution,
     *,
     rtol: float | None = None,
@@ -50,7 +50,7 @@ def second_run(
     InputError
         If it cannot be made again; the message says why.
     """
-    reason, request = why_not(solution), solution.request
+    reason, request = unsupported_reason(solution), solution.request
     if reason or request is None:
         raise InputError(
             f"the run cannot be made again: {reason}",

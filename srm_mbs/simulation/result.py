@@ -31,7 +31,7 @@ from srm_mbs.integration.singular_passages import (
     find_crossings,
 )
 from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.visualization.animation.joint_motion import Shown
+from srm_mbs.visualization.animation.joint_motion import AnimationMixin
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,7 +127,7 @@ def attempt_array(attempts: Iterable[Any]) -> NDArray[np.void]:
     return np.array(rows, dtype=ATTEMPT)
 
 
-class Stepped:
+class RunOutcome:
     """A run of steps.
 
     Attributes
@@ -169,7 +169,7 @@ class Stepped:
         return np.column_stack([chosen["t"], chosen["h"]])
 
 
-class Solution(Stepped, Shown):
+class Solution(RunOutcome, AnimationMixin):
     """Result of :func:`srm_mbs.simulate`.
 
     Attributes

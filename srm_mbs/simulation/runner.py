@@ -14,13 +14,13 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
-from srm_mbs.dynamics.controllers import Controller, HeldForce, called
+from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.errors import InputError
 from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import StepSizeControl, Verdict
+from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
 from srm_mbs.integration.dense_output import DenseOutput
 from srm_mbs.integration.driver import RunRecord
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
@@ -43,7 +43,7 @@ ROUND_OFF = 1e-12
 """Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
 
 
-def collected(
+def assemble_result(
     mechanism: Mechanism,
     system: OpenSystem | ClosedSystem,
     method: Method,
@@ -53,7 +53,7 @@ def collected(
     t_eval: FloatArray | None,
     settings: Settings,
     norm: ErrorNorm,
-    twin: Any,
+    kernel_system: Any,
 ) -> Solution:
     """Arrays and statistics from a run record."""
     scheme = method.scheme
@@ -65,9 +65,9 @@ def collected(
     if not isinstance(record, CompiledRecord):
         dense = DenseOutput(system, scheme, data)
     else:
-        dense = CompiledDenseOutput(None if shared(system) else twin, system, scheme, data)
+        dense = CompiledDenseOutput(None if shared(system) else kernel_system, system, scheme, data)
         placed, replaced, suspects = record.placed, record.replaced, record.suspects
-    rejected = [a for a in record.attempts if a.verdict is Verdict.REJECTED]
+    rejected = [a for a in record.attempts if a.verdict is StepDecision.REJECTED]
     stats = Statistics(
         steps=data.count,
         rejected=len(rejected),
@@ -108,7 +108,7 @@ def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     return f" A drive ({names}) may lead where the mechanism cannot follow."
 
 
-def bifurcations_told(solution: Solution) -> str:
+def bifurcation_sentences(solution: Solution) -> str:
     """A sentence for each singular configuration that was reached without momentum."""
     found = solution.bifurcations
     more = f" There were {len(found)} of them." if len(found) > TOLD else ""
@@ -252,15 +252,15 @@ def event_watch(
 
 
 def sampler(
-    system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, twin: Any
+    system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, kernel_system: Any
 ) -> Callable[[float, FloatArray], None]:
     """What samples ``controller`` at (t, state), for ``held`` and for the kernel."""
 
     def sample(t: float, state: FloatArray) -> None:
-        force = called(controller, t, *system.split(state))
+        force = evaluate_controller(controller, t, *system.split(state))
         held.hold(t, force)
-        if twin is not None:
-            twin.hold(t, force, True)
+        if kernel_system is not None:
+            kernel_system.hold(t, force, True)
 
     return sample
 

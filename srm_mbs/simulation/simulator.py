@@ -13,7 +13,7 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
-from srm_mbs.integration.breakpoints import pieces_between
+from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -248,7 +248,7 @@ class Simulator:
         return 0.0 if self._step is None else length / math.ceil(length / self._step - 1e-9)
 
     def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> str:
-        pieces = pieces_between(kinks, _NONE, t, end)
+        pieces = smooth_intervals(kinks, _NONE, t, end)
         for k, until in enumerate(pieces.ends.tolist()):
             first, last = float(pieces.first[k]), float(pieces.last[k])
             anew = k > 0 or first > -math.inf

@@ -26,7 +26,7 @@ from benchmarks.thesis.systems import (
     slider_crank,
     slider_crank_state,
 )
-from srm_mbs.integration.control.step_size import Verdict
+from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.methods.base import ErrorNorm, StepResult
 
 PAGE = Path(__file__).parents[2] / "docs/thesis.md"
@@ -151,16 +151,16 @@ def test_the_published_estimate_tends_to_the_gap_of_the_sweeps_and_not_to_zero()
 def test_the_control_of_appendix_b_forces_steps_at_its_threshold() -> None:
     control = PublishedControl(t_end=1.0, first_step=0.1, order=3, smallest=0.02)
 
-    def judged(xi: float) -> tuple[Verdict, float]:
+    def judged(xi: float) -> tuple[StepDecision, float]:
         proposal = control.propose(0.0, math.inf, None)  # type: ignore[arg-type]
         result = StepResult.__new__(StepResult)
         result.error_ratio = xi
-        return control.judge(proposal, result), proposal.h
+        return control.decide(proposal, result), proposal.h
 
-    assert judged(16.0) == (Verdict.REJECTED, 0.1)
+    assert judged(16.0) == (StepDecision.REJECTED, 0.1)
     assert judged(1.0e6)[1] == pytest.approx(0.1 * 0.8 * 16.0**-0.25)
     verdict, h = judged(2.0)
-    assert (verdict, h) == (Verdict.ACCEPTED, 0.02)
+    assert (verdict, h) == (StepDecision.ACCEPTED, 0.02)
     assert (control.accepted, control.rejected, control.forced) == (1, 2, 1)
     judged(1e-9)
     assert judged(1.0)[1] == pytest.approx(0.02 * 5.0)

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
-from srm_mbs.integration.breakpoints import pieces_between
+from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel import backend as kernel
 from tests.support import reduced
 from tests.support.lockstep import compare
@@ -384,13 +384,13 @@ def test_many_breakpoints_cost_little(slider_crank: srm.Mechanism) -> None:
 
 
 def test_pieces_join_times_that_no_step_fits_between() -> None:
-    pieces = pieces_between(np.array([0.3, 3 * 0.1, -1.0, 7.0]), np.array([0.6]), 0.0, 1.0)
+    pieces = smooth_intervals(np.array([0.3, 3 * 0.1, -1.0, 7.0]), np.array([0.6]), 0.0, 1.0)
     assert pieces.ends.tolist() == [0.3, 0.6, 1.0]
     assert pieces.given.tolist() == [False, True]
     assert pieces.last[0] < 0.3 < 3 * 0.1 < pieces.first[1]
     assert pieces.first[0] == -np.inf
     assert pieces.last[-1] == np.inf
-    ends = pieces_between(np.array([0.0, 1.0]), np.zeros(0), 0.0, 1.0)
+    ends = smooth_intervals(np.array([0.0, 1.0]), np.zeros(0), 0.0, 1.0)
     assert ends.count == 1
     assert 0.0 < ends.first[0] < 1e-300
     assert 1.0 - 1e-14 < ends.last[0] < 1.0

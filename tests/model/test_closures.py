@@ -27,7 +27,7 @@ from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.kernel import backend
-from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.model.anchors import WORLD, Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure, perpendicular_basis
 
@@ -706,11 +706,11 @@ def test_the_kernel_evaluates_every_type_like_the_reference(kind: str) -> None:
         system = ClosedSystem(mechanism)
         for algebra in ("dense", "sparse"):
             constants = system.constants() | {"algebra": algebra}
-            twin = backend.core.System(model, constants, None)  # type: ignore[union-attr]
+            kernel_system = backend.core.System(model, constants, None)  # type: ignore[union-attr]
             for _ in range(2):
                 x = np.concatenate(random_state(model, rng))
                 terms = system.evaluate(0.0, x)
-                found = twin.terms(0.0, x, -1.0)
+                found = kernel_system.terms(0.0, x, -1.0)
                 assert found["rank"] == terms.rank
                 for what in ("rate", "correction"):
                     expected = getattr(terms, what)()
@@ -728,9 +728,9 @@ def test_the_kernel_refuses_points_that_coincide_as_well() -> None:
     loop = random_loop("distance", "two branches", rng)
     closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
     system = ClosedSystem(srm.Mechanism(model, (closed,)))
-    twin = twin_of(system)
+    kernel_system = make_kernel_system(system)
     with pytest.raises(ArithmeticError):
-        twin.terms(0.0, np.concatenate([q, v]), -1.0)
+        kernel_system.terms(0.0, np.concatenate([q, v]), -1.0)
 
 
 def test_the_page_of_closures_lists_every_type_with_its_rows_and_keys() -> None:

@@ -321,9 +321,9 @@ def test_two_gears_that_say_the_same_share_their_force(tmp_path: Path) -> None:
     run = srm.simulate(mechanism, 0.5, rtol=1e-9)
     assert run.indeterminate_reactions == ("gear.coupling", "twin.coupling")
     acceleration = 2.0 / (0.5 + 0.2 / 4.0)
-    gear, twin = (run.coupling_forces[name] for name in ("gear", "twin"))
-    assert_close((gear + twin)[:, 1], 0.1 * acceleration, atol=1e-9)
-    assert_close(gear, twin, atol=1e-12)
+    gear, kernel_system = (run.coupling_forces[name] for name in ("gear", "twin"))
+    assert_close((gear + kernel_system)[:, 1], 0.1 * acceleration, atol=1e-9)
+    assert_close(gear, kernel_system, atol=1e-12)
 
 
 def test_a_mechanism_with_couplings_is_drawn_and_described(tmp_path: Path) -> None:
@@ -355,7 +355,7 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
     )
     mechanism = srm.Mechanism(model, loops)
     system = ClosedSystem(mechanism)
-    twin = kernel.core.System(  # type: ignore[union-attr]
+    kernel_system = kernel.core.System(  # type: ignore[union-attr]
         model, system.constants() | {"algebra": algebra}, None
     )
     rng = np.random.default_rng(3)
@@ -363,7 +363,7 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
         q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
         x = np.concatenate([q, rng.uniform(-1.0, 1.0, model.nv)])
         terms = system.evaluate(0.0, x)
-        found = twin.terms(0.0, x, -1.0)
+        found = kernel_system.terms(0.0, x, -1.0)
         for what in ("rate", "correction", "multiplier", "sigma", "gap"):
             theirs = getattr(terms, what)
             theirs = theirs if what == "sigma" else theirs()

@@ -69,11 +69,11 @@ class Mutation:
         What may become of it.
     twin
         Input that says the same in so many words (a default written out): the outcome, refused or
-        loaded, must be that of ``twin``.
+        loaded, must be that of ``kernel_system``.
     """
 
     model: str
     change: str
     files: Files
     expectation: Expectation
-    twin: Files | None = None
+    kernel_system: Files | None = None

@@ -83,7 +83,10 @@ def differences(ours: dict[str, Any], theirs: dict[str, Any]) -> set[str]:
 
 
 def complaint(
-    mutation: Mutation, got: dict[str, Any], original: dict[str, Any], twin: dict[str, Any] | None
+    mutation: Mutation,
+    got: dict[str, Any],
+    original: dict[str, Any],
+    kernel_system: dict[str, Any] | None,
 ) -> str | None:
     """What is wrong with an outcome; None if it is as expected."""
     expected = mutation.expectation
@@ -97,10 +100,10 @@ def complaint(
         return None if got["file"] else f"the message names no file: {got['message']}"
     if not expected.loads:
         return f"loaded; differs in {differences(got, original) or 'nothing'}"
-    if twin is not None:
-        if twin["is"] != "loaded":
-            return f"loaded, but with the default written out it is {twin}"
-        if differs := differences(got, twin):
+    if kernel_system is not None:
+        if kernel_system["is"] != "loaded":
+            return f"loaded, but with the default written out it is {kernel_system}"
+        if differs := differences(got, kernel_system):
             return f"differs in {differs} from the same with the default written out"
     if expected.noted and got["remarks"] > original["remarks"]:
         return None
@@ -132,9 +135,9 @@ def outcomes(
     folder = tmp_path_factory.mktemp("unmutated")
     originals = {name: write(folder / name, files) for name, files in bundled_files().items()}
     twins = {
-        path: write(folder / str(i), mutation.twin)
+        path: write(folder / str(i), mutation.kernel_system)
         for i, (mutation, path) in enumerate(written)
-        if mutation.twin is not None
+        if mutation.kernel_system is not None
     }
     everything = [*originals.values(), *(path for _, path in written), *twins.values()]
     results: dict[str, dict[str, Any]] = {}

@@ -102,26 +102,26 @@ class TomlMutator:
         outcome = operation(document, path, rng)
         if outcome is None:
             return None
-        change, expectation, text, twin = outcome
+        change, expectation, text, kernel_system = outcome
         files = Files(text or document_text(document), self.files.urdf)
         return Mutation(
             self.model,
             f"toml: {'.'.join(map(str, path))} {change}",
             files,
             expectation,
-            None if twin is None else Files(document_text(twin), self.files.urdf),
+            None if kernel_system is None else Files(document_text(kernel_system), self.files.urdf),
         )
 
     Outcome = tuple[str, Expectation, str | None, dict[str, Any] | None] | None
 
     def delete(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:
         key = path[-1]
-        twin = None
+        kernel_system = None
         if key in DEFAULT:
-            twin = copy.deepcopy(document)
-            holder(twin, path)[key] = DEFAULT[str(key)]
+            kernel_system = copy.deepcopy(document)
+            holder(kernel_system, path)[key] = DEFAULT[str(key)]
         del holder(document, path)[key]
-        return "deleted", self._without(path), None, twin
+        return "deleted", self._without(path), None, kernel_system
 
     def _without(self, path: Path) -> Expectation:
         key = path[-1]

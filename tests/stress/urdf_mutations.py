@@ -120,14 +120,14 @@ class UrdfMutator:
         outcome = operation(root, place, rng)
         if outcome is None:
             return None
-        change, expectation, text, twin = outcome
+        change, expectation, text, kernel_system = outcome
         text = text or ElementTree.tostring(root, encoding="unicode")
         return Mutation(
             self.model,
             f"urdf: {change}",
             Files(self.files.toml, text),
             expectation,
-            None if twin is None else Files(self.files.toml, twin),
+            None if kernel_system is None else Files(self.files.toml, kernel_system),
         )
 
     def delete_element(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
@@ -135,7 +135,7 @@ class UrdfMutator:
         if parent is None:
             return None
         change = f"{place.path} deleted"
-        twin = None
+        kernel_system = None
         if place.drawn:
             expectation = must_load_unchanged()
         elif tag in OPTIONAL or tag == "inertial":
@@ -146,11 +146,11 @@ class UrdfMutator:
                 ElementTree.SubElement(node, "inertia", MASSLESS)
             else:
                 node.attrib = dict(OPTIONAL[tag])
-            twin = ElementTree.tostring(root, encoding="unicode")
+            kernel_system = ElementTree.tostring(root, encoding="unicode")
         else:
             expectation = must_be_refused()
         parent.remove(node)
-        return change, expectation, None, twin
+        return change, expectation, None, kernel_system
 
     def duplicate_element(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
         if place.parent is None:
@@ -179,7 +179,7 @@ class UrdfMutator:
             return None
         key = str(rng.choice(sorted(node.attrib)))
         change = f"{place.path} without {key}"
-        twin = None
+        kernel_system = None
         if place.drawn or (tag == "limit" and key in ("lower", "upper")):
             expectation = must_load_unchanged()
         elif tag == "dynamics":
@@ -187,11 +187,11 @@ class UrdfMutator:
         elif tag == "origin":
             expectation = legal(*MOVING)
             node.set(key, OPTIONAL["origin"][key])
-            twin = ElementTree.tostring(root, encoding="unicode")
+            kernel_system = ElementTree.tostring(root, encoding="unicode")
         else:
             expectation = must_be_refused()
         del node.attrib[key]
-        return change, expectation, None, twin
+        return change, expectation, None, kernel_system
 
     def duplicate_attribute(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
         """An attribute twice is no XML; only the text can say it."""

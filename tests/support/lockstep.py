@@ -16,13 +16,13 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import EvaluationError
-from srm_mbs.integration.breakpoints import Passing, pieces_between
+from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.placement import SingularityPlacement
 from srm_mbs.integration.control.prescribed_times import SlopeOfSigma
-from srm_mbs.integration.control.step_size import FixedStep, PIControl, Verdict, initial_step
+from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
 from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
-from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
@@ -135,8 +135,8 @@ def compare(
     method = srm.PSRM(tableau, eps=eps)
     scheme = method.scheme
     system = make_system(mechanism, controller)
-    pieces = pieces_between(np.array(breakpoints), np.zeros(0), 0.0, t_end)
-    twin = twin_of(system)
+    pieces = smooth_intervals(np.array(breakpoints), np.zeros(0), 0.0, t_end)
+    kernel_system = make_kernel_system(system)
     norm = ErrorNorm(
         absolute_tolerance(mechanism, None, rtol),
         rtol,
@@ -150,7 +150,7 @@ def compare(
         system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0), arrivals
     )
     run = CompiledRun(
-        twin,
+        kernel_system,
         method,
         norm,
         memory,
@@ -165,12 +165,12 @@ def compare(
     out = Comparison()
     one = np.concatenate([norm.one, norm.one])[: 2 * system.nv]
     t = 0.0
-    passing = Passing(pieces, system, method, norm)
-    control.aim(passing.end)
+    passing = BreakpointHandler(pieces, system, method, norm)
+    control.set_target_time(passing.end)
     while t < t_end and out.attempts < 4000:
         if t >= passing.end:
             memory = passing.next(t, x, memory)
-            control.aim(passing.end)
+            control.set_target_time(passing.end)
             out.entered += 1
             assert run.at_breakpoint
             run.enter()
@@ -189,7 +189,7 @@ def compare(
             result = method.step(system, t, proposal.h, x, memory, norm)
         except EvaluationError:
             result = None
-        verdict = control.judge(proposal, result)
+        verdict = control.decide(proposal, result)
         out.attempts += 1
         out.h = max(out.h, abs(run.h - proposal.h) / proposal.h)
         if verdict is not twin_verdict:
@@ -233,8 +233,8 @@ def compare(
             assert result.rank == twin_result.rank
             assert result.held == twin_result.held
             assert result.quiet == twin_result.quiet
-        out.replaced += verdict is Verdict.REPLACED
-        if verdict is Verdict.ACCEPTED and result is not None:
+        out.replaced += verdict is StepDecision.REPLACED
+        if verdict is StepDecision.ACCEPTED and result is not None:
             method.accept(memory, result)
             t, x = proposal.t_new, result.state
     return out

@@ -17,7 +17,7 @@ from srm_mbs.analysis.accuracy.assessment import (
 from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of, energy_error
 from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
 from srm_mbs.errors import InputError
-from srm_mbs.simulation.rerun import why_not
+from srm_mbs.simulation.rerun import unsupported_reason
 from srm_mbs.simulation.result import Solution
 
 
@@ -117,7 +117,7 @@ def certify(
         )
     settings = checked_settings(solution, rtol)
     drift, energy = drift_of(solution), energy_error(solution)
-    reason = why_not(solution) if again else "it was not asked for"
+    reason = unsupported_reason(solution) if again else "it was not asked for"
     if not reason and not solution.steps.count:
         reason = "the run took no step"
     estimate = reason or estimate_error(solution, settings, progress)

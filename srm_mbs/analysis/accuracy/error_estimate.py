@@ -23,7 +23,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import positive, tightest_rtol
-from srm_mbs.simulation.rerun import second_run
+from srm_mbs.simulation.rerun import rerun
 from srm_mbs.simulation.result import Solution
 
 STEP_ENDS = 2000
@@ -321,7 +321,7 @@ def estimate_error(
     for setting in settings:
         options: dict[str, Any] = {name: setting}
         try:
-            again = second_run(solution, **options, progress=progress)
+            again = rerun(solution, **options, progress=progress)
         except InputError as error:
             return f"the run at {name} = {setting:.3g} was refused: {error}"
         if not again.steps.count:

@@ -31,7 +31,7 @@ from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.result import Solution
-from srm_mbs.visualization.animation.overlays import Wanted
+from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import NAMED_LOOPS
 from srm_mbs.visualization.animation.playback import page_of
 from srm_mbs.visualization.animation.snapshot import still_picture
@@ -209,7 +209,7 @@ def animation_section(solution: Solution) -> str:
     InputError
         If it cannot be made.
     """
-    page = page_of(solution, FRAMES_PER_SECOND, Wanted(), panel=True)
+    page = page_of(solution, FRAMES_PER_SECOND, OverlayOptions(), panel=True)
     name = text(solution.mechanism.name)
     marks = " Red marks on the time slider are passages through singular configurations."
     return section(

@@ -19,7 +19,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.rheonomic import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.constraints.rows import world_jacobian
-from srm_mbs.dynamics.constraints.structure import Walker, row_names
+from srm_mbs.dynamics.constraints.structure import ManifoldSampler, row_names
 
 if TYPE_CHECKING:
     from srm_mbs.model.mechanism import Mechanism
@@ -147,7 +147,7 @@ def _samples(mechanism: Mechanism) -> list[FloatArray]:
     """The initial configuration, and closed ones around it."""
     samples = [np.array(mechanism.q0)]
     if mechanism.structure.rank:
-        walker = Walker(mechanism, mechanism.structure.units)
+        walker = ManifoldSampler(mechanism, mechanism.structure.units)
         rng = np.random.default_rng(1)
         samples += walker.walk(samples[0], rng, RESTARTS, STEPS)
     return samples

@@ -272,30 +272,30 @@ class DenseAlgebra:
 class CompiledAlgebra:
     """:class:`RowAlgebra` by the kernel: sparse where that pays."""
 
-    def __init__(self, twin: Any) -> None:
-        self._twin = twin
+    def __init__(self, kernel_system: Any) -> None:
+        self._kernel_system = kernel_system
         self._one: FloatArray | None = None
 
     @property
     def entries(self) -> int:
         """Numbers that Q and R hold."""
-        return self._twin.entries  # type: ignore[no-any-return]
+        return self._kernel_system.entries  # type: ignore[no-any-return]
 
     @property
     def rank(self) -> int:
         """See :class:`RowAlgebra`."""
-        return self._twin.rank  # type: ignore[no-any-return]
+        return self._kernel_system.rank  # type: ignore[no-any-return]
 
     @property
     def pivots(self) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        falling: FloatArray = np.sort(self._twin.pivots)[::-1]
+        falling: FloatArray = np.sort(self._kernel_system.pivots)[::-1]
         return falling
 
     @property
     def row_squares(self) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        return self._twin.row_squares  # type: ignore[no-any-return]
+        return self._kernel_system.row_squares  # type: ignore[no-any-return]
 
     def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
         """See :class:`RowAlgebra`."""
@@ -304,26 +304,26 @@ class CompiledAlgebra:
                 self._one = np.eye(G.shape[1])
             M = self._one
         try:
-            self._twin.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
+            self._kernel_system.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
         except ArithmeticError:
             cholesky(M)  # says whether it is the mass matrix
             raise EvaluationError("the closures are not finite") from None
 
     def tangential(self, w: FloatArray) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        return self._twin.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
+        return self._kernel_system.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
 
     def solve(self, g: FloatArray) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        return self._twin.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
+        return self._kernel_system.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
 
     def multiplier(self, white: FloatArray) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        return self._twin.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
+        return self._kernel_system.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
 
     def complement(self) -> FloatArray:
         """See :class:`RowAlgebra`."""
-        basis: FloatArray = self._twin.complement()
+        basis: FloatArray = self._kernel_system.complement()
         return basis.T
 
 
@@ -374,7 +374,7 @@ INERT = 1e-9
 
 
 @dataclass(frozen=True)
-class Ranked:
+class RankRevealingQR:
     """What is left of A (m, n) when singular values, or pivots, below a cut are zero.
 
     Attributes
@@ -389,11 +389,11 @@ class Ranked:
     solve: Callable[[FloatArray], FloatArray]
 
 
-def ranked(A: FloatArray, cut: float) -> Ranked:
+def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
     """A (m, n) with everything below ``cut`` as zero."""
     algebra = _pivoted(A, cut)
     if algebra is not None:
-        return Ranked(algebra.complement(), algebra.solve)
+        return RankRevealingQR(algebra.complement(), algebra.solve)
     left, size, right = np.linalg.svd(A)
     rank = int(np.sum(size > cut))
 
@@ -401,7 +401,7 @@ def ranked(A: FloatArray, cut: float) -> Ranked:
         out: FloatArray = right[:rank].T @ ((left[:, :rank].T @ b) / size[:rank])
         return out
 
-    return Ranked(right[rank:].T, solve)
+    return RankRevealingQR(right[rank:].T, solve)
 
 
 def null_basis(A: FloatArray, cut: float) -> FloatArray:
@@ -415,7 +415,7 @@ def null_basis(A: FloatArray, cut: float) -> FloatArray:
     return out
 
 
-def shortest(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
+def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
     """The shortest x (n,) with the least |A x - b|; what is below rcond times the largest singular
     value is zero.  By pivots, the rows in use are satisfied and dependent ones left out."""
     longest = float(np.sqrt((A * A).sum(axis=1).max(initial=0.0)))
@@ -426,7 +426,7 @@ def shortest(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
     return out
 
 
-def weakest(A: FloatArray, zero: float) -> float:
+def smallest_singular_value(A: FloatArray, zero: float) -> float:
     """The smallest singular value of A (m, n) above ``zero``; infinite if there is none."""
     found = _weakest_pivoted(A, zero)
     if found is not None:

@@ -397,7 +397,7 @@ class LoopKinematics:
         self.G = np.zeros(self._support.shape)
         self._data: pin.Data | None = None
 
-    def anew(self) -> LoopKinematics:
+    def copy_workspace(self) -> LoopKinematics:
         """The same rows with memory of their own: anchors are not looked up again."""
         other = copy(self)
         other._loops = [copy(loop) for loop in self._loops]
@@ -456,7 +456,7 @@ def all_rows(mechanism: Mechanism) -> LoopKinematics:
     resolved: LoopKinematics = mechanism.derived(
         "all_rows", lambda: LoopKinematics(mechanism.model, mechanism.loops)
     )
-    return resolved.anew()
+    return resolved.copy_workspace()
 
 
 def closure_errors(

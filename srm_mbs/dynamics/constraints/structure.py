@@ -46,7 +46,7 @@ CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
 
 
-class Walker:
+class ManifoldSampler:
     """Closes loops and walks on the closure manifold.
 
     Parameters
@@ -367,7 +367,9 @@ class Structure:
         return int(np.sum(self.kept)) - self.rank
 
 
-def _closed(mechanism: Mechanism, walker: Walker, rng: np.random.Generator) -> Iterator[FloatArray]:
+def _closed(
+    mechanism: Mechanism, walker: ManifoldSampler, rng: np.random.Generator
+) -> Iterator[FloatArray]:
     """The closed configurations that the analysis looks at."""
     start, error = walker.close(mechanism.q0, iterations=100)
     if error < 1e-11:
@@ -398,7 +400,7 @@ class _Samples:
         return last
 
 
-def _sampled(walker: Walker, configurations: Iterable[FloatArray]) -> _Samples:
+def _sampled(walker: ManifoldSampler, configurations: Iterable[FloatArray]) -> _Samples:
     rows, closed_rows, nv = len(walker.scale), walker.closed, walker.model.nv
     visited: list[FloatArray] = []
     pivots: list[FloatArray] = []
@@ -417,9 +419,10 @@ def _sampled(walker: Walker, configurations: Iterable[FloatArray]) -> _Samples:
     return _Samples(visited, stacked(pivots, rows), stacked(of_loops, closed_rows), largest)
 
 
-def _balanced(walker: Walker, samples: _Samples, rank: int) -> _Samples:
-    """``samples`` after :meth:`Walker.separate` and :meth:`Walker.balance`; as they are, with
-    their scale, if that does not raise the last pivot or makes more rows independent."""
+def _balanced(walker: ManifoldSampler, samples: _Samples, rank: int) -> _Samples:
+    """``samples`` after :meth:`ManifoldSampler.separate` and :meth:`ManifoldSampler.balance`; as
+    they are, with their scale, if that does not raise the last pivot or makes more rows
+    independent."""
     regular = np.flatnonzero(samples.ranks() == rank)
     chosen = regular[:: -(-len(regular) // BALANCING_SAMPLES)]
     scale = walker.scale
@@ -458,7 +461,7 @@ def analyse(mechanism: Mechanism) -> Structure:
     if not names:
         return Structure((), np.ones(0), np.ones(0, bool), 0, 0, 1.0, units, 0, ())
     rng = np.random.default_rng(0)
-    walker = Walker(mechanism, units)
+    walker = ManifoldSampler(mechanism, units)
     walker.set_scale(mechanism, rng)
     samples = _sampled(walker, _closed(mechanism, walker, rng))
     notes: list[str] = []
@@ -484,12 +487,12 @@ def analyse(mechanism: Mechanism) -> Structure:
             "other: they must agree, and their forces are those of least norm"
         )
     if 0 < rank < samples.pivots.shape[1]:
-        weakest = float(samples.last_pivots(rank).min())
+        smallest_pivot = float(samples.last_pivots(rank).min())
         redundant = max(float(samples.pivots[:, rank:].max()), PIVOT_ZERO)
-        if weakest < RANK_GAP * redundant:
+        if smallest_pivot < RANK_GAP * redundant:
             notes.append(
                 f"the rank {rank} of the closures is uncertain: smallest independent pivot "
-                f"{weakest:.1e}, largest redundant pivot {redundant:.1e}"
+                f"{smallest_pivot:.1e}, largest redundant pivot {redundant:.1e}"
             )
             log.warning("%s: %s", mechanism.name, notes[-1])
     visited = len(samples.configurations)

@@ -28,7 +28,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     analyse_singular,
     determined_solution,
     nearest_singular,
-    sharpened,
+    refine_singular_point,
 )
 
 
@@ -237,7 +237,9 @@ def branch_limit(
     others = frame - np.outer(along, along @ frame)
     basis, size, _ = np.linalg.svd(others, full_matrices=False)
     geometry = singular.geometry
-    found = sharpened(geometry, q, singular.rank, NEAR, closed=1e-14, fixed=basis[:, size > 0.5])
+    found = refine_singular_point(
+        geometry, q, singular.rank, NEAR, closed=1e-14, fixed=basis[:, size > 0.5]
+    )
     if found is None:
         return None
     centre = analyse_singular(geometry, found, singular.structural_rank)

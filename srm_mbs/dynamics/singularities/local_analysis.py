@@ -62,7 +62,7 @@ def determined_solution(rows: FloatArray, right: FloatArray) -> FloatArray:
     return out
 
 
-def sharpened(
+def refine_singular_point(
     geometry: ClosureGeometry,
     q: FloatArray,
     rank: int,
@@ -154,7 +154,7 @@ def nearest_singular(
     for rank in sorted(ranks):
         if rank == structural_rank:
             rank -= 1
-        found = sharpened(geometry, q, rank, reach, closed=1e-14)
+        found = refine_singular_point(geometry, q, rank, reach, closed=1e-14)
         if found is not None:
             away = float(np.linalg.norm(geometry.difference(q, found)))
             # A search for a higher rank ends next to the same configuration, less accurately.

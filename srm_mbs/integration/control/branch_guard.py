@@ -29,8 +29,14 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import EvaluationError
-from srm_mbs.integration.control.step_size import Grid, Proposal, Propose, StepSizeControl, Verdict
-from srm_mbs.integration.methods.base import Memory, StepResult
+from srm_mbs.integration.control.step_size import (
+    Grid,
+    Proposal,
+    Propose,
+    StepDecision,
+    StepSizeControl,
+)
+from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.near_singular import AMBIGUOUS
 
 TURNED = 0.3
@@ -158,22 +164,22 @@ class BranchGuard:
         self._passages = AmbiguousPassages(system)
         self.propose = inner.propose
 
-    def _shorter(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def _shorter(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         return self._inner.propose(t, min(limit, self._limit), memory)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Redo a step whose velocity turned; otherwise the inner control's verdict."""
         if result is not None and result.quiet and not self._tries:
-            return self._inner.judge(proposal, result)
+            return self._inner.decide(proposal, result)
         suspect = result is not None and not result.quiet and self.suspect(result)
         if suspect and self._tries < MAX_REDONE:
             self._limit = 0.5 * proposal.h
             self.propose = self._shorter
             self._tries += 1
             self.replaced += 1
-            return Verdict.REPLACED
-        verdict = self._inner.judge(proposal, result)
-        if verdict is Verdict.ACCEPTED and result is not None:
+            return StepDecision.REPLACED
+        verdict = self._inner.decide(proposal, result)
+        if verdict is StepDecision.ACCEPTED and result is not None:
             if not result.quiet:
                 self._passages.watch(proposal.t_new, result)
             if suspect:
@@ -183,11 +189,11 @@ class BranchGuard:
             self._tries = 0
         return verdict
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
-        self._inner.aim(end, grid)
+        self._inner.set_target_time(end, grid)
 
-    def told(self) -> list[float]:
+    def suspect_times(self) -> list[float]:
         """Times (s) up to which the motion may have changed its branch: the suspects, and the ends
         of longer passages (:mod:`srm_mbs.integration.control.branch_guard`) without any."""
         longer = [
@@ -241,7 +247,7 @@ class RateGuard(BranchGuard):
             f"leave on another branch of g = 0{why}"
         )
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Redo a step whose rate jumped; otherwise the inner control's verdict.
 
         Raises
@@ -249,10 +255,10 @@ class RateGuard(BranchGuard):
         EvaluationError
             Where a run that ``stops`` takes another branch.
         """
-        verdict = super().judge(proposal, result)
-        if self._stops and verdict is Verdict.ACCEPTED:
+        verdict = super().decide(proposal, result)
+        if self._stops and verdict is StepDecision.ACCEPTED:
             self._refuse()
-        if verdict is Verdict.ACCEPTED and result is not None:
+        if verdict is StepDecision.ACCEPTED and result is not None:
             self._slope = (result.end_rate - result.rates[0]) / result.h
         return verdict
 

@@ -26,8 +26,8 @@ from enum import IntEnum
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.integration.control.step_size import Grid, Proposal, StepSizeControl, Verdict
-from srm_mbs.integration.methods.base import Memory, StepResult
+from srm_mbs.integration.control.step_size import Grid, Proposal, StepDecision, StepSizeControl
+from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 AHEAD = 3.0
@@ -234,7 +234,7 @@ class SingularityPlacement:
         self._arrival = self._watched
         self._known = False
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where a stage would come too close."""
         if self._redo is not None:
             limit = min(limit, self._redo)
@@ -258,11 +258,11 @@ class SingularityPlacement:
                 return Proposal(h, t + h, placed=True)
         return proposal
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
         self._t_end = end
         self._arrival = self._watched
-        self._inner.aim(end, grid)
+        self._inner.set_target_time(end, grid)
 
     def _arrives(self, t: float, proposal: Proposal) -> bool:
         """Whether the end beside a singular configuration is to be prepared for."""
@@ -302,7 +302,7 @@ class SingularityPlacement:
             return None
         return self._gaps.longest_step(zero * h, 0.98 * h)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Redo a badly placed step; otherwise the inner control's verdict."""
         slope = 0.0
         if result is None:
@@ -316,18 +316,18 @@ class SingularityPlacement:
             if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < BESIDE:
                 self._arrival, self._redo = Arrival.DUE, h
                 self.replaced += 1
-                return Verdict.REPLACED
+                return StepDecision.REPLACED
             if self._redone < MAX_REDONE and not self._known:
                 better = self._better_step(h, result.sigmas, slope, last)
                 if better is not None and 0.0 < better < h:
                     self._redo = better
                     self._redone += 1
                     self.replaced += 1
-                    return Verdict.REPLACED
-        verdict = self._inner.judge(proposal, result)
+                    return StepDecision.REPLACED
+        verdict = self._inner.decide(proposal, result)
         self._redo = None
         self._redone = 0
-        if verdict is Verdict.ACCEPTED and result is not None:
+        if verdict is StepDecision.ACCEPTED and result is not None:
             slowest = 0.5 * self._slope
             self._slope = slope if slope > slowest else slowest
             self._zero = None

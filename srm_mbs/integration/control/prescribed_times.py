@@ -26,8 +26,8 @@ from srm_mbs.integration.control.placement import (
     inverse_abscissae,
     sigma_slope,
 )
-from srm_mbs.integration.control.step_size import Grid, Proposal, StepSizeControl, Verdict
-from srm_mbs.integration.methods.base import Memory, StepResult
+from srm_mbs.integration.control.step_size import Grid, Proposal, StepDecision, StepSizeControl
+from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 PLACEMENTS = ("automatic", "halved", "off")
@@ -85,7 +85,7 @@ class AvoidTimes:
         self.adaptive = inner.adaptive
         self.placed = 0
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where it would come too close to a given time."""
         proposal = self._inner.propose(t, limit, memory)
         distances = self._times[self._times > t] - t
@@ -100,14 +100,14 @@ class AvoidTimes:
         h = self._longest_clear(longest, distances)
         return Proposal(h, t + h)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """The inner control's verdict."""
-        return self._inner.judge(proposal, result)
+        return self._inner.decide(proposal, result)
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
         self._t_end = end
-        self._inner.aim(end, grid)
+        self._inner.set_target_time(end, grid)
 
     def _clear(self, h: float, distances: FloatArray) -> bool:
         """Whether a step of length ``h`` stays clear of times at ``distances`` (s)."""
@@ -148,22 +148,22 @@ class SlopeOfSigma:
         self.placed = 0
         self.replaced = 0
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal."""
         memory.sigma_slope = self._slope
         return self._inner.propose(t, limit, memory)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """The inner control's verdict."""
-        verdict = self._inner.judge(proposal, result)
-        if verdict is Verdict.ACCEPTED and result is not None:
+        verdict = self._inner.decide(proposal, result)
+        if verdict is StepDecision.ACCEPTED and result is not None:
             slope = sigma_slope(self._inverse, result.sigmas, proposal.h)
             self._slope = max(slope, 0.5 * self._slope)
         return verdict
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
-        self._inner.aim(end, grid)
+        self._inner.set_target_time(end, grid)
 
 
 class HalvedStep(SlopeOfSigma):
@@ -195,7 +195,7 @@ class HalvedStep(SlopeOfSigma):
         # What is left of the rule: (part, whole), then (whole,).
         self._plan: tuple[float, ...] = ()
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The step that the rule prescribes, else the inner proposal."""
         proposal = super().propose(t, limit, memory)
         if not self._plan:
@@ -207,21 +207,21 @@ class HalvedStep(SlopeOfSigma):
             return Proposal(remaining, self._t_end)
         return Proposal(h, t + h)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Replace a step that ends on a singular point; otherwise the inner verdict."""
         free = not self._plan and proposal.t_new < self._t_end
         if free and result is not None and self._ends_on_a_singular_point(proposal.h, result):
             self._plan = (self._fraction * proposal.h, proposal.h)
             self.replaced += 1
-            return Verdict.REPLACED
-        verdict = super().judge(proposal, result)
-        self._plan = self._plan[1:] if verdict is Verdict.ACCEPTED else ()
+            return StepDecision.REPLACED
+        verdict = super().decide(proposal, result)
+        self._plan = self._plan[1:] if verdict is StepDecision.ACCEPTED else ()
         return verdict
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
         self._t_end = end
-        super().aim(end, grid)
+        super().set_target_time(end, grid)
 
     def _ends_on_a_singular_point(self, h: float, result: StepResult) -> bool:
         sigmas = result.sigmas
@@ -235,7 +235,12 @@ Placing = SingularityPlacement | SlopeOfSigma | AvoidTimes | BranchGuard
 
 def suspected(wrappers: Sequence[Placing]) -> list[float]:
     """Times (s) up to which the motion may have changed its branch, by the guard among them."""
-    return [t for wrapper in wrappers if isinstance(wrapper, BranchGuard) for t in wrapper.told()]
+    return [
+        t
+        for wrapper in wrappers
+        if isinstance(wrapper, BranchGuard)
+        for t in wrapper.suspect_times()
+    ]
 
 
 def placed(

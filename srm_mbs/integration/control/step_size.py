@@ -15,7 +15,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import EvaluationError
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 
 SAFETY = 0.9
 MIN_FACTOR, MAX_FACTOR = 0.2, 5.0
@@ -38,7 +38,7 @@ Grid = tuple[float, float]
 """Where a grid of fixed steps begins, and its spacing (s)."""
 
 
-class Verdict(Enum):
+class StepDecision(Enum):
     """What becomes of a proposed step."""
 
     ACCEPTED = "accepted"
@@ -65,7 +65,7 @@ class Proposal:
 class Propose(Protocol):
     """:meth:`StepSizeControl.propose`."""
 
-    def __call__(self, t: float, limit: float, memory: Memory) -> Proposal: ...
+    def __call__(self, t: float, limit: float, memory: IntegratorState) -> Proposal: ...
 
 
 class StepSizeControl(Protocol):
@@ -73,13 +73,13 @@ class StepSizeControl(Protocol):
 
     adaptive: bool
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The next step from ``t``, at most ``limit`` long where the control is adaptive."""
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Judge a step; ``result`` is None if a stage could not be evaluated."""
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """A step ends on ``end`` (s): a breakpoint, or the end of the run.
 
         With ``grid`` fixed steps are counted anew; others have none.
@@ -118,11 +118,11 @@ class PIControl:
         self._xi_old = 1.0
         self._just_rejected = False
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The step that the error allows."""
         return _until(t, min(self._h, limit), self._t_end)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Accept if the error ratio xi <= 1; no growth right after a rejection."""
         xi = FAILED_EVALUATION if result is None else result.error_ratio
         if not xi < FAILED_EVALUATION:
@@ -131,7 +131,7 @@ class PIControl:
         if xi > 1.0:
             self._h = proposal.h * max(MIN_FACTOR, SAFETY * xi ** (-1.0 / k))
             self._just_rejected = True
-            return Verdict.REJECTED
+            return StepDecision.REJECTED
         factor = SAFETY * max(xi, XI_FLOOR) ** (-INTEGRAL / k) * self._xi_old ** (PROPORTIONAL / k)
         factor = min(MAX_FACTOR, max(MIN_FACTOR, factor))
         if self._just_rejected:
@@ -143,9 +143,9 @@ class PIControl:
         self._h = h
         self._xi_old = max(xi, XI_OLD_FLOOR)
         self._just_rejected = False
-        return Verdict.ACCEPTED
+        return StepDecision.ACCEPTED
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`StepSizeControl`."""
         self._t_end = end
 
@@ -167,7 +167,7 @@ class FixedStep:
         self._t0, self._t_end, self._step = t0, t_end, step
         self._index = 1
 
-    def propose(self, t: float, limit: float, memory: Memory) -> Proposal:
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """To the next grid point, or ``limit`` towards it."""
         target = self._t0 + self._index * self._step
         if target > self._t_end - 1e-9 * self._step:
@@ -176,19 +176,19 @@ class FixedStep:
             return Proposal(limit, t + limit)
         return Proposal(target - t, target)
 
-    def judge(self, proposal: Proposal, result: StepResult | None) -> Verdict:
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Accept every step that could be evaluated."""
         if result is None or not np.isfinite(result.state).all():
-            return Verdict.REJECTED
+            return StepDecision.REJECTED
         while proposal.t_new >= self._t0 + self._index * self._step - self._sliver():
             self._index += 1
-        return Verdict.ACCEPTED
+        return StepDecision.ACCEPTED
 
     def _sliver(self) -> float:
         """Distance (s) before a grid point that is not worth a step."""
         return max(1e-9, 1e-14 * self._index) * self._step
 
-    def aim(self, end: float, grid: Grid | None = None) -> None:
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`StepSizeControl`; without a new grid the old one stays."""
         self._t_end = end
         if grid is not None:
@@ -201,7 +201,7 @@ _TOO_TIGHT = "the rates at the start are beyond all measure of atol: it is far t
 def initial_step(
     system: System,
     state: FloatArray,
-    memory: Memory,
+    memory: IntegratorState,
     norm: ErrorNorm,
     span: float,
     order: int,

@@ -35,7 +35,7 @@ def _unwanted() -> bool:
     return os.environ.get("SRM_MBS_BACKEND") == "python"
 
 
-def obstacle(method: Method, placement: str, singular_times: FloatArray) -> str:
+def unsupported_reason(method: Method, placement: str, singular_times: FloatArray) -> str:
     """Why the kernel cannot make a run: it is not there, or lacks an option; empty if it can."""
     if core is None:
         return missing
@@ -64,7 +64,7 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         )
     if asked == "python" or (asked == "auto" and _unwanted()):
         return False
-    reason = obstacle(method, placement, singular_times)
+    reason = unsupported_reason(method, placement, singular_times)
     if asked == "kernel" and reason:
         raise InputError(
             f"the compiled kernel cannot make this run: {reason}",

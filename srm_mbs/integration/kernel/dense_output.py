@@ -12,7 +12,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration import dense_output as hermite
 from srm_mbs.integration.dense_output import SLACK, DenseOutput, StepData
-from srm_mbs.integration.kernel.system import given_back, shared, taken, twin_of
+from srm_mbs.integration.kernel.system import given_back, make_kernel_system, shared, taken
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 
@@ -28,7 +28,7 @@ def dense_output(
     """
     if made_by == "kernel" and core is not None:
         return CompiledDenseOutput(
-            None if shared(system) else twin_of(system), system, scheme, steps
+            None if shared(system) else make_kernel_system(system), system, scheme, steps
         )
     return DenseOutput(system, scheme, steps)
 
@@ -47,7 +47,7 @@ class CompiledDenseOutput(DenseOutput):
 
     def __init__(
         self,
-        twin: Any,
+        kernel_system: Any,
         system: ClosedSystem | OpenSystem,
         scheme: ButcherTableau,
         steps: StepData,
@@ -55,7 +55,7 @@ class CompiledDenseOutput(DenseOutput):
         super().__init__(system, scheme, steps)
         self._mechanism_system = system
         self._scheme = scheme
-        self._twin = twin
+        self._kernel_system = kernel_system
         self._compiled: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -74,19 +74,21 @@ class CompiledDenseOutput(DenseOutput):
         if self._compiled is None:
             self._compiled = self._compile()
         system = self._mechanism_system
-        twin = taken(system) if self._twin is None else self._twin
-        before = twin.evaluations, twin.factorisations
+        kernel_system = taken(system) if self._kernel_system is None else self._kernel_system
+        before = kernel_system.evaluations, kernel_system.factorisations
         try:
-            return self._compiled.states(twin, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
+            return self._compiled.states(kernel_system, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().__call__(t)  # which says why
         except IndexError:
             self.check(t)  # raises
             raise
         finally:
-            system.count(twin.evaluations - before[0], twin.factorisations - before[1])
-            if self._twin is None:
-                given_back(system, twin)
+            system.count(
+                kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]
+            )
+            if self._kernel_system is None:
+                given_back(system, kernel_system)
 
     @cached_property
     def _lone_zones(self) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.integration import driver
-from srm_mbs.integration.breakpoints import Passing
+from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunRecord, Tick
 from srm_mbs.integration.events import EventWatch
@@ -67,7 +67,7 @@ def integrate(
     *,
     tick: Tick | None = None,
     events: EventWatch | None = None,
-    passing: Passing | None = None,
+    passing: BreakpointHandler | None = None,
 ) -> CompiledRecord:
     """As :func:`srm_mbs.integration.driver.integrate`, on the kernel.
 
@@ -114,16 +114,16 @@ def integrate(
                 record.ended(stop)
                 break
             if tick is not None:
-                driver.tell(tick, t, result.h, result.state)
+                driver.call_progress(tick, t, result.h, result.state)
         else:
             record.finished(run.t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
-        record.broken_off(run.t, error)
+        record.mark_aborted(run.t, error)
     record.attempts = [
         driver.Attempt(t, h, ratio, VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
     ]
     record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
-    system.count(run.twin.evaluations, run.twin.factorisations)
+    system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
 

@@ -13,14 +13,14 @@ import numpy as np
 from srm_mbs.integration import breakpoints, driver, singular_endpoints
 from srm_mbs.integration.control import branch_guard, placement, step_size
 from srm_mbs.integration.control import placement as kinks
-from srm_mbs.integration.control.step_size import Verdict
+from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.methods import near_singular, split_step
-from srm_mbs.integration.methods.base import Memory
+from srm_mbs.integration.methods.base import IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 
-VERDICTS = (Verdict.ACCEPTED, Verdict.REJECTED, Verdict.REPLACED)
-"""What the kernel numbers from 0: ``Verdict`` in control.hpp."""
+VERDICTS = (StepDecision.ACCEPTED, StepDecision.REJECTED, StepDecision.REPLACED)
+"""What the kernel numbers from 0: ``StepDecision`` in control.hpp."""
 CONSTANTS = {
     "watched": near_singular.WATCHED,
     "near": near_singular.NEAR,
@@ -113,7 +113,7 @@ def history_from(data: dict[str, Any]) -> MultiplierHistory:
     )
 
 
-def memory_data(memory: Memory) -> dict[str, Any]:
+def memory_data(memory: IntegratorState) -> dict[str, Any]:
     """``memory`` as the kernel reads it."""
     return {
         "rate": np.ascontiguousarray(memory.rate),
@@ -125,10 +125,10 @@ def memory_data(memory: Memory) -> dict[str, Any]:
     }
 
 
-def memory_from(data: dict[str, Any]) -> Memory:
+def memory_from(data: dict[str, Any]) -> IntegratorState:
     """What the kernel gave back, as a memory."""
     history = data["history"]
-    return Memory(
+    return IntegratorState(
         data["rate"],
         data["sigma"],
         data["magnitude"],

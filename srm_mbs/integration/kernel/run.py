@@ -11,8 +11,8 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration import driver, singular_endpoints
-from srm_mbs.integration.breakpoints import Passing, Pieces
-from srm_mbs.integration.control.step_size import Verdict
+from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals
+from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.kernel.marshalling import (
     CONSTANTS,
     VERDICTS,
@@ -21,7 +21,7 @@ from srm_mbs.integration.kernel.marshalling import (
     memory_from,
     scheme_data,
 )
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.psrm import PSRM
 
 CHUNK = 0.1
@@ -45,7 +45,7 @@ class CompiledRun:
     Parameters
     ----------
     twin
-        From :func:`~srm_mbs.integration.kernel.system.twin_of`.
+        From :func:`~srm_mbs.integration.kernel.system.make_kernel_system`.
     method, norm, memory, state
         As for :func:`~srm_mbs.integration.driver.integrate`.
     pieces
@@ -62,12 +62,12 @@ class CompiledRun:
 
     def __init__(
         self,
-        twin: Any,
+        kernel_system: Any,
         method: PSRM,
         norm: ErrorNorm,
-        memory: Memory,
+        memory: IntegratorState,
         state: FloatArray,
-        pieces: Pieces,
+        pieces: SmoothIntervals,
         *,
         t0: float = 0.0,
         step: float | None,
@@ -76,12 +76,12 @@ class CompiledRun:
         placed: str,
         arrivals: bool = False,
     ) -> None:
-        self.twin, self.method, self.norm = twin, method, norm
+        self.kernel_system, self.method, self.norm = kernel_system, method, norm
         self.start, self.t0, self.t_end = state.copy(), t0, float(pieces.ends[-1])
         self.adaptive = step is None
         eps = method.regularisation
         self._run = core.Run(  # type: ignore[union-attr]
-            twin,
+            kernel_system,
             {
                 "scheme": scheme_data(method.scheme),
                 "constants": CONSTANTS,
@@ -112,8 +112,8 @@ class CompiledRun:
         return int(self._run.advance(steps, CHUNK))
 
     def attempt_from(
-        self, t: float, state: FloatArray, memory: Memory, control: dict[str, Any]
-    ) -> tuple[int, Verdict | None]:
+        self, t: float, state: FloatArray, memory: IntegratorState, control: dict[str, Any]
+    ) -> tuple[int, StepDecision | None]:
         """One attempt from where the reference stands, for comparison with it.
 
         Parameters
@@ -138,11 +138,11 @@ class CompiledRun:
         near = None if known is None else Zone(threshold, known.predict_near, known.normals)
         return StepResult(zone=near, history=known, multiplier=None, **data)
 
-    def memory(self) -> Memory:
+    def memory(self) -> IntegratorState:
         """What it carries to the next step."""
         return memory_from(self._run.memory())
 
-    def pass_breakpoint(self, passing: Passing) -> None:
+    def pass_breakpoint(self, passing: BreakpointHandler) -> None:
         """Go on behind a breakpoint at which the kernel stopped.
 
         Raises
@@ -164,16 +164,18 @@ class CompiledRun:
         if not known:
             self.remember(passing.resolved(t, state, before))
 
-    def arrive(self, passing: Passing) -> None:
+    def arrive(self, passing: BreakpointHandler) -> None:
         """Prepare for the end beside a singular configuration before which the kernel stopped."""
         run = self._run
         self.remember(passing.arrive(run.t, run.state, self.memory(), run.piece))
 
-    def remember(self, memory: Memory) -> None:
+    def remember(self, memory: IntegratorState) -> None:
         """Carry ``memory`` to the next step."""
         self._run.remember(memory_data(memory))
 
-    def begin(self, t: float, state: FloatArray, memory: Memory, first_step: float) -> None:
+    def begin(
+        self, t: float, state: FloatArray, memory: IntegratorState, first_step: float
+    ) -> None:
         """Start again, from ``state`` at ``t`` (s); what was counted stays."""
         fresh = {"h": first_step, "xi_old": 1.0, "just_rejected": False, "index": 1, "slope": 0.0,
                  "zero": np.nan, "redo": 0.0, "redone": 0, "limit": np.inf, "tries": 0,

@@ -12,7 +12,7 @@ from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.control.step_size import initial_step
 from srm_mbs.integration.kernel.marshalling import FIRST_STEP
-from srm_mbs.integration.methods.base import ErrorNorm, Memory
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 
 KEPT = 4
 """Idle workspaces that a mechanism keeps at most."""
@@ -20,16 +20,16 @@ LARGEST_KEPT = 64
 """Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
 
 
-def twin_of(system: ClosedSystem | OpenSystem) -> Any:
+def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
     """The kernel's twin of ``system``, with a workspace of its own."""
     held = system.held
     calls = system.calls_forces or (system.controlled and held is None)
     controller = system.called_force if calls else None
-    twin = core.System(system.model, system.constants(), controller)  # type: ignore[union-attr]
-    if held is not None:
+    kernel_system = core.System(system.model, system.constants(), controller)  # type:
+    ignore[union-attr] if held is not None:
         for t, force in zip(held.times, held.values):
-            twin.hold(t, force, True)
-    return twin
+            kernel_system.hold(t, force, True)
+    return kernel_system
 
 
 def shared(system: ClosedSystem | OpenSystem) -> bool:
@@ -49,17 +49,17 @@ def taken(system: ClosedSystem | OpenSystem) -> Any:
     """
     if shared(system):
         with suppress(IndexError):  # deque: two threads never get the same
-            twin = _idle(system).pop()
-            twin.renew(**system.constants_of_start())
-            return twin
-    return twin_of(system)
+            kernel_system = _idle(system).pop()
+            kernel_system.renew(**system.constants_of_start())
+            return kernel_system
+    return make_kernel_system(system)
 
 
-def given_back(system: ClosedSystem | OpenSystem, twin: Any) -> None:
-    """Nobody uses ``twin`` any more: keep it for the mechanism's next run, if it is :func:`shared`
-    and there are not KEPT already."""
+def given_back(system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
+    """Nobody uses ``kernel_system`` any more: keep it for the mechanism's next run, if it is
+    :func:`shared` and there are not KEPT already."""
     if shared(system):
-        _idle(system).append(twin)
+        _idle(system).append(kernel_system)
 
 
 def _idle(system: ClosedSystem | OpenSystem) -> deque[Any]:
@@ -91,12 +91,12 @@ class Evaluator:
     Parameters
     ----------
     system, twin
-        The mechanism, and what :func:`twin_of` made of it.
+        The mechanism, and what :func:`make_kernel_system` made of it.
     """
 
-    def __init__(self, system: ClosedSystem | OpenSystem, twin: Any) -> None:
+    def __init__(self, system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
         self._system = system
-        self._twin = twin
+        self._kernel_system = kernel_system
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._system, name)
@@ -104,12 +104,12 @@ class Evaluator:
     def between(self, first: float, last: float) -> None:
         """Times of both within [``first``, ``last``] (s); see :mod:`..stepping.breakpoints`."""
         self._system.between(first, last)
-        self._twin.between(first, last)
+        self._kernel_system.between(first, last)
 
     def first_step(
         self,
         state: FloatArray,
-        memory: Memory,
+        memory: IntegratorState,
         norm: ErrorNorm,
         span: float,
         order: int,
@@ -117,7 +117,7 @@ class Evaluator:
     ) -> float:
         """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
         try:
-            return self._twin.first_step(  # type: ignore[no-any-return]
+            return self._kernel_system.first_step(  # type: ignore[no-any-return]
                 t, state, memory.rate, memory.magnitude, norm.atol, norm.one, norm.rtol, span,
                 order, FIRST_STEP,
             )  # fmt: skip
@@ -128,7 +128,7 @@ class Evaluator:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""
         if zone is None:
             try:
-                return _TwinTerms(self._twin.terms(t, state))
+                return _TwinTerms(self._kernel_system.terms(t, state))
             except ArithmeticError:
                 pass  # the reference says why
         return self._system.evaluate(t, state, zone)

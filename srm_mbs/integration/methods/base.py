@@ -92,7 +92,7 @@ class SweepNode:
 
 
 @dataclass
-class Memory:
+class IntegratorState:
     """What a method carries from one accepted step to the next.
 
     Attributes
@@ -211,11 +211,19 @@ class Method(Protocol):
     def scheme(self) -> ButcherTableau:
         """The Runge-Kutta data."""
 
-    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
         """Evaluate the first stage."""
 
     def step(
-        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
     ) -> StepResult:
         """Propose a step; changes nothing but the system's workspace.
 
@@ -225,12 +233,12 @@ class Method(Protocol):
             If a stage cannot be evaluated.
         """
 
-    def accept(self, memory: Memory, result: StepResult) -> None:
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
 
     def resume(
-        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
-    ) -> Memory:
+        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
+    ) -> IntegratorState:
         """``memory`` behind a breakpoint at ``t``, where forces may have jumped: nothing that
         depends on those before it is kept.
 

@@ -49,7 +49,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms
 from srm_mbs.errors import EvaluationError
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult, SweepNode
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult, SweepNode
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import (
@@ -106,7 +106,7 @@ def split_passing(
     t: float,
     h: float,
     state: FloatArray,
-    memory: Memory,
+    memory: IntegratorState,
     norm: ErrorNorm,
     remembers: bool,
 ) -> StepResult:
@@ -216,10 +216,12 @@ class IteratedSweeps:
     eps: Regularisation
     interpolant: DenseExtension | str
 
-    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
         """All sweeps at ``state``; own histories with multiplier 0, as in the thesis."""
         terms = system.evaluate(t, state)
-        memory = Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
         multiplier = np.zeros(system.multiplier_size)
         if self.first is not First.ZERO and system.predicts:
             multiplier = terms.prediction().copy()
@@ -237,7 +239,13 @@ class IteratedSweeps:
         return self.first in (First.EXACT, First.FUSED)
 
     def step(
-        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         eps = max(self.eps(h), EPS_SHRINKS * memory.sweeps[-1].eps)
@@ -322,7 +330,7 @@ class IteratedSweeps:
                 settled = max(0.0, norm(added, weights) - turning) / -math.expm1(-h / eps)
         return max(norm(error, weights), settled), norm(last.off, weights)
 
-    def accept(self, memory: Memory, result: StepResult) -> None:
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
@@ -330,8 +338,8 @@ class IteratedSweeps:
         memory.sweeps = result.sweeps
 
     def resume(
-        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
-    ) -> Memory:
+        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
+    ) -> IntegratorState:
         """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`.
 
         Multipliers of corrector sweeps follow from positions and velocities alone, (2.6), and do
@@ -350,7 +358,7 @@ class IteratedSweeps:
         t: float,
         h: float,
         eps: float,
-        memory: Memory,
+        memory: IntegratorState,
         stages: BranchStages,
     ) -> list[Sweep]:
         """Every sweep from its own state; the fused form is its one sweep with another equation."""
@@ -402,7 +410,7 @@ class IteratedSweeps:
         t: float,
         h: float,
         eps: float,
-        memory: Memory,
+        memory: IntegratorState,
         stages: BranchStages,
     ) -> list[Sweep]:
         """All sweeps from the accepted state, whose evaluation they share."""
@@ -451,7 +459,9 @@ class IteratedSweeps:
                 )
         return runs
 
-    def _gathered(self, system: System, memory: Memory, change: float) -> tuple[Memory, bool]:
+    def _gathered(
+        self, system: System, memory: IntegratorState, change: float
+    ) -> tuple[IntegratorState, bool]:
         """``memory`` with own histories restarted where they could change the branch, and whether.
 
         The first sweeps are off the closures by eps (yhat - y_0), a part of sigma next to a

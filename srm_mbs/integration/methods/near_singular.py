@@ -21,7 +21,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms, Zone
-from srm_mbs.integration.methods.base import ErrorNorm, Memory
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 
@@ -118,7 +118,7 @@ class BranchStages:
     """
 
     system: System
-    memory: Memory
+    memory: IntegratorState
     norm: ErrorNorm
     weights: FloatArray
     h: float

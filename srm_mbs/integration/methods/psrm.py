@@ -13,7 +13,7 @@ from functools import cached_property
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import InputError
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.regularisation import Regularisation, parse_eps
@@ -140,14 +140,22 @@ class PSRM:
         """The Runge-Kutta data."""
         return get_tableau(self.tableau)
 
-    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
         """First stage, and the first node of the multiplier history."""
         if self._sweeps is not None:
             return self._sweeps.start(system, t, state, norm)
         return split_start(system, t, state)
 
     def step(
-        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         if self._sweeps is not None:
@@ -156,7 +164,7 @@ class PSRM:
         theta = 1.0 if eps is None else -math.expm1(-h / eps(h))
         return split_step(system, self.scheme, t, h, state, memory, norm, theta)
 
-    def accept(self, memory: Memory, result: StepResult) -> None:
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
         if self._sweeps is not None:
             self._sweeps.accept(memory, result)
@@ -164,8 +172,8 @@ class PSRM:
         split_accept(memory, result)
 
     def resume(
-        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
-    ) -> Memory:
+        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
+    ) -> IntegratorState:
         """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
         if self._sweeps is not None:
             return self._sweeps.resume(system, t, state, memory, norm)

@@ -22,7 +22,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import (
@@ -42,10 +42,10 @@ def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
     return np.vstack([scheme.A[1:], scheme.b]), [*scheme.c[1:].tolist(), 1.0]
 
 
-def split_start(system: System, t: float, state: FloatArray) -> Memory:
+def split_start(system: System, t: float, state: FloatArray) -> IntegratorState:
     """First stage, and the first node of the multiplier history."""
     terms = system.evaluate(t, state)
-    memory = Memory(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
     if system.has_constraints:
         memory.history = MultiplierHistory.begin(t, terms.multiplier())
     return memory
@@ -57,7 +57,7 @@ def split_step(
     t: float,
     h: float,
     state: FloatArray,
-    memory: Memory,
+    memory: IntegratorState,
     norm: ErrorNorm,
     theta: float,
 ) -> StepResult:
@@ -162,14 +162,16 @@ def split_step(
     return result
 
 
-def split_resume(system: System, t: float, state: FloatArray, memory: Memory) -> Memory:
+def split_resume(
+    system: System, t: float, state: FloatArray, memory: IntegratorState
+) -> IntegratorState:
     """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
     fresh = split_start(system, t, state)
     fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
     return fresh
 
 
-def split_accept(memory: Memory, result: StepResult) -> None:
+def split_accept(memory: IntegratorState, result: StepResult) -> None:
     """Move ``memory`` to the end of an accepted step."""
     memory.steps += 1
     memory.rate = result.end_rate

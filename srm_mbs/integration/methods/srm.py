@@ -17,7 +17,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import InputError
-from srm_mbs.integration.methods.base import ErrorNorm, Memory, StepResult
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.regularisation import Regularisation, parse_eps
@@ -150,22 +150,30 @@ class SRM:
             interpolant(self.scheme, self.interpolation),
         )
 
-    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> Memory:
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
         """All sweeps at the initial state."""
         return self._sweeps.start(system, t, state, norm)
 
     def step(
-        self, system: System, t: float, h: float, state: FloatArray, memory: Memory, norm: ErrorNorm
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         return self._sweeps.step(system, t, h, state, memory, norm)
 
-    def accept(self, memory: Memory, result: StepResult) -> None:
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
         self._sweeps.accept(memory, result)
 
     def resume(
-        self, system: System, t: float, state: FloatArray, memory: Memory, norm: ErrorNorm
-    ) -> Memory:
+        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
+    ) -> IntegratorState:
         """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
         return self._sweeps.resume(system, t, state, memory, norm)

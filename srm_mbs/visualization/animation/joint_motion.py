@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from srm_mbs.visualization.animation.playback import Embedded
 
 
-class Shown:
+class AnimationMixin:
     """Base of :class:`~srm_mbs.Solution` and :class:`~srm_mbs.JointMotion`.
 
     Upward imports, made when something is to be seen.
@@ -76,7 +76,7 @@ class Playable(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class JointMotion(Shown):
+class JointMotion(AnimationMixin):
     """Configurations over time.
 
     Attributes

@@ -19,7 +19,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat, node_names
-from srm_mbs.visualization.animation.overlays import Overlays, Wanted
+from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays
 from srm_mbs.visualization.animation.page import DRIFT, ENERGY, as_json, drift_unit, make_page
 from srm_mbs.visualization.animation.playback import (
     REPLY_TIME,
@@ -83,7 +83,7 @@ class LiveView:
     def __init__(self, mechanism: Mechanism, *, open_browser: bool = True) -> None:
         self._meshcat = import_meshcat()
         start = JointMotion(mechanism, np.zeros(1), np.array(mechanism.q0)[None])
-        picture = make_picture(start, 1.0, Wanted())
+        picture = make_picture(start, 1.0, OverlayOptions())
         view = replace(picture.view, distance=WIDER * picture.view.distance)
         picture = replace(picture, view=view, overlays=Overlays())
         about = about_picture(start, picture, panel=True)
@@ -177,7 +177,7 @@ class LiveView:
         InputError
             If the server does not answer, or has stopped, or what is asked for cannot be drawn.
         """
-        picture = make_picture(solution, 60.0, Wanted(**drawn))
+        picture = make_picture(solution, 60.0, OverlayOptions(**drawn))
         about = about_picture(solution, picture, panel=True)
         with answered(self.visualizer.window, REPLY_TIME, ANEW):
             self.visualizer["/about"].set_property("about", as_json(about))

@@ -284,7 +284,7 @@ TURNS, AROUND, SECTION = 7, 12, 5
 
 
 @dataclass(frozen=True)
-class Wanted:
+class OverlayOptions:
     """What is drawn beside the bodies and springs.
 
     Parameters
@@ -352,7 +352,7 @@ def springs_of(solution: Playable) -> list[tuple[SpringDamper, Spans | None]]:
     )
 
 
-def joints_of(solution: Playable, wanted: Wanted) -> set[int]:
+def joints_of(solution: Playable, wanted: OverlayOptions) -> set[int]:
     """Joints whose motion :func:`make_overlays` needs."""
     model = solution.mechanism.model
     anchors = wanted.anchors(solution.mechanism)
@@ -364,7 +364,9 @@ def joints_of(solution: Playable, wanted: Wanted) -> set[int]:
     return {joint for joint, _ in anchors} - {0}
 
 
-def make_overlays(solution: Playable, wanted: Wanted, motion: Motion, extent: float) -> Overlays:
+def make_overlays(
+    solution: Playable, wanted: OverlayOptions, motion: Motion, extent: float
+) -> Overlays:
     """Springs, and what is wanted, at the key frames of ``motion``.
 
     Parameters

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
-from srm_mbs.visualization.animation.overlays import Wanted
+from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import make_page, read_out, write_page
 from srm_mbs.visualization.animation.scene import ASPECT, Picture, make_picture
 from srm_mbs.visualization.animation.server import SERVERLESS, start_server
@@ -103,7 +103,7 @@ def play(
         missing or cannot start.
     """
     meshcat = import_meshcat()
-    picture = make_picture(solution, check_fps(fps), Wanted(trace, gaps, reactions))
+    picture = make_picture(solution, check_fps(fps), OverlayOptions(trace, gaps, reactions))
     about = about_picture(solution, picture, panel=True)
     visualizer = serve(meshcat, make_page(meshcat, solution.mechanism.name, about, None), picture)
     show(visualizer, solution.mechanism.name, open_browser=open_browser)
@@ -280,12 +280,17 @@ def export_html(
         If ``fps`` is not a positive number, what is asked for cannot be drawn, meshcat is missing,
         or the file cannot be written.
     """
-    drawn = Wanted(trace, gaps, reactions)
+    drawn = OverlayOptions(trace, gaps, reactions)
     write_page(page_of(solution, fps, drawn, panel=panel), Path(path))
 
 
 def page_of(
-    solution: Playable, fps: float, wanted: Wanted, *, panel: bool, extra: Iterable[float] = ()
+    solution: Playable,
+    fps: float,
+    wanted: OverlayOptions,
+    *,
+    panel: bool,
+    extra: Iterable[float] = (),
 ) -> str:
     """The page of :func:`export_html`, with key frames at ``extra`` times (s); errors as there."""
     meshcat = import_meshcat()
@@ -361,5 +366,5 @@ def show_in_notebook(
             element="height",
             remedy="Give for example height=420",
         )
-    page = page_of(solution, fps, Wanted(trace, gaps, reactions), panel=panel)
+    page = page_of(solution, fps, OverlayOptions(trace, gaps, reactions), panel=panel)
     return Embedded(page, height)

@@ -15,8 +15,8 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.overlays import (
+    OverlayOptions,
     Overlays,
-    Wanted,
     joints_of,
     make_overlays,
     springs_of,
@@ -272,7 +272,7 @@ class Picture:
 
 
 def make_picture(
-    solution: Playable, fps: float, wanted: Wanted, extra: Iterable[float] = ()
+    solution: Playable, fps: float, wanted: OverlayOptions, extra: Iterable[float] = ()
 ) -> Picture:
     """Key frames of everything that is drawn of ``solution``.
 

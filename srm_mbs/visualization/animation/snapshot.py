@@ -22,7 +22,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.simulation.result import Solution
-from srm_mbs.visualization.animation.overlays import Wanted, springs_of
+from srm_mbs.visualization.animation.overlays import OverlayOptions, springs_of
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
 from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Shape
 from srm_mbs.visualization.animation.trajectory import within
@@ -60,7 +60,9 @@ def still_picture(solution: Solution, t: float) -> bytes:
     from PIL import Image
 
     start, end = solution.span
-    picture = make_picture(solution, FRAMES / (end - start) if end > start else 1.0, Wanted())
+    picture = make_picture(
+        solution, FRAMES / (end - start) if end > start else 1.0, OverlayOptions()
+    )
     mechanism, now = solution.mechanism, np.array([t])
     data = workspace(mechanism.model)
     pin.forwardKinematics(mechanism.model, data, solution(t)[0])

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srm_mbs.errors import CHECK_WRITING, InputError
-from srm_mbs.visualization.animation.overlays import Wanted
+from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import write_page
 from srm_mbs.visualization.animation.playback import check_fps, page_of
 
@@ -129,7 +129,7 @@ def photographer(
     own = browser() if chromium is None else nullcontext(chromium)
     with tempfile.TemporaryDirectory() as folder, own as opened:
         file = Path(folder) / "page.html"
-        write_page(page_of(solution, fps, Wanted(**drawn), panel=False, extra=times), file)
+        write_page(page_of(solution, fps, OverlayOptions(**drawn), panel=False, extra=times), file)
         page = opened.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")

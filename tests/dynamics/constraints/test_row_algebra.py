@@ -232,15 +232,18 @@ def test_ranks_of_many_coordinates_are_those_of_singular_values(
     expected = np.linalg.svd(A, compute_uv=False)
     assert A.shape[1] > ranks.LARGE
     assert abs(ranks.singular_value(A, 80) / expected[79] - 1.0) < 1e-9
-    assert abs(ranks.weakest(A, 1e-12) / expected[79] - 1.0) < 1e-9
-    null, solved = ranks.null_basis(A, 1e-7), ranks.ranked(A, 1e-7)
-    x = ranks.shortest(A, b, 1e-10)
+    assert abs(ranks.smallest_singular_value(A, 1e-12) / expected[79] - 1.0) < 1e-9
+    null, solved = ranks.null_basis(A, 1e-7), ranks.rank_revealing_qr(A, 1e-7)
+    x = ranks.min_norm_solution(A, b, 1e-10)
     monkeypatch.setattr(ranks, "LARGE", 10**6)
     known = ranks.null_basis(A, 1e-7)
     assert np.abs(null @ null.T - known @ known.T).max() < 1e-9
     assert np.abs(solved.null @ solved.null.T - known @ known.T).max() < 1e-9
     for found in (solved.solve(b), x):
-        assert np.abs(found - ranks.shortest(A, b, 1e-10)).max() < 1e-14 / expected[79] ** 2 + 1e-9
+        assert (
+            np.abs(found - ranks.min_norm_solution(A, b, 1e-10)).max()
+            < 1e-14 / expected[79] ** 2 + 1e-9
+        )
     assert abs(ranks.singular_value(A, 80) / expected[79] - 1.0) < 1e-9
 
 
@@ -254,7 +257,7 @@ def test_rows_that_depend_on_each_other_have_the_singular_values_of_all_of_them(
     expected = np.linalg.svd(A, compute_uv=False)[4]
     for module in (pivoting, ranks):
         monkeypatch.setattr(module, "LARGE", 0)
-    assert abs(ranks.weakest(A, 1e-9) - expected) < 1e-13
+    assert abs(ranks.smallest_singular_value(A, 1e-9) - expected) < 1e-13
     assert abs(ranks.singular_value(A, 5) - expected) < 1e-13
     assert ranks.null_basis(A, 1e-9).shape == (9, 4)
     assert ranks.null_basis(A.T, 1e-9).shape == (7, 2)

@@ -14,7 +14,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
-from srm_mbs.dynamics.constraints.structure import Structure, Walker, analyse
+from srm_mbs.dynamics.constraints.structure import ManifoldSampler, Structure, analyse
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from tests.support.bundled import load
 from tests.support.mechanisms import along_x, floating_ring, rescaled, rod
@@ -544,7 +544,7 @@ def test_rows_are_balanced_where_the_last_pivot_would_be_small_everywhere(
 @pytest.mark.parametrize("name", ["bricard", "delta_robot", "squeezing_mechanism", "n_four_bar_40"])
 def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: str) -> None:
     mechanism = load(name)
-    walker = Walker(mechanism, mechanism.structure.units)
+    walker = ManifoldSampler(mechanism, mechanism.structure.units)
     walker.set_scale(mechanism, np.random.default_rng(0))
     q = next(walker.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
     found = walker.distances(q)

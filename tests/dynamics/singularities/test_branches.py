@@ -91,9 +91,9 @@ def test_each_tangent_leads_to_closed_configurations(case: str) -> None:
     for h in (2e-2, 1e-2):
         worst = 0.0
         for u in (*tangents, *-tangents):
-            aim = geometry.move(singular.q, h * u)
-            closed = srm.assemble(mechanism, aim).q
-            worst = max(worst, float(np.abs(geometry.difference(aim, closed)).max()))
+            set_target_time = geometry.move(singular.q, h * u)
+            closed = srm.assemble(mechanism, set_target_time).q
+            worst = max(worst, float(np.abs(geometry.difference(set_target_time, closed)).max()))
         errors.append(worst)
     assert errors[1] < 1e-3
     assert errors[1] < 1e-12 or errors[0] / errors[1] > 3.5

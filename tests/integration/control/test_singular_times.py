@@ -11,7 +11,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.integration.control.prescribed_times import AHEAD, CLEARANCE, AvoidTimes
 from srm_mbs.integration.control.step_size import FixedStep
-from srm_mbs.integration.methods.base import Memory
+from srm_mbs.integration.methods.base import IntegratorState
 from tests.support.bundled import load
 
 PERIOD = 4.29657624142677449
@@ -93,7 +93,7 @@ def test_any_times_are_avoided_with_few_steps(tableau: str) -> None:
     rng = np.random.default_rng(0)
     scheme = srm.TABLEAUS[tableau]
     done: Any = SimpleNamespace(state=np.zeros(1))
-    memory = Memory(np.zeros(1), 1.0, np.zeros(1))
+    memory = IntegratorState(np.zeros(1), 1.0, np.zeros(1))
     for _ in range(200):
         middle = rng.uniform(0.5, 9.5, 3)
         spread = 10.0 ** rng.uniform(-16, 0, 3)
@@ -105,7 +105,7 @@ def test_any_times_are_avoided_with_few_steps(tableau: str) -> None:
             proposal = control.propose(t[-1], np.inf, memory)
             assert t[-1] < proposal.t_new <= 10.0
             assert proposal.h <= 0.5 * (1 + 1e-9)
-            control.judge(proposal, done)
+            control.decide(proposal, done)
             t.append(proposal.t_new)
             assert len(t) < 400
         nodes = np.array(t)

@@ -75,8 +75,8 @@ def test_no_more_than_a_few_are_kept() -> None:
     system = make_system(fresh())
     taken = [twins.taken(system) for _ in range(2 * twins.KEPT)]
     assert len(set(map(id, taken))) == 2 * twins.KEPT
-    for twin in taken:
-        twins.given_back(system, twin)
+    for kernel_system in taken:
+        twins.given_back(system, kernel_system)
     assert len(idle(system.mechanism)) == twins.KEPT
 
 
@@ -131,15 +131,15 @@ def test_a_run_that_raises_does_not_spoil_the_next() -> None:
 def test_forces_held_in_one_run_do_not_act_in_the_next() -> None:
     mechanism = fresh()
     system = make_system(mechanism)
-    twin = twins.taken(system)
+    kernel_system = twins.taken(system)
     state = np.concatenate([mechanism.q0, mechanism.v0])
-    free = twin.terms(0.0, state)["rate"]
-    twin.hold(0.0, np.full(7, 1.0), True)
-    twin.between(5.0, 6.0)
-    assert not np.array_equal(twin.terms(0.0, state)["rate"], free)
-    twins.given_back(system, twin)
+    free = kernel_system.terms(0.0, state)["rate"]
+    kernel_system.hold(0.0, np.full(7, 1.0), True)
+    kernel_system.between(5.0, 6.0)
+    assert not np.array_equal(kernel_system.terms(0.0, state)["rate"], free)
+    twins.given_back(system, kernel_system)
     again = twins.taken(system)
-    assert again is twin
+    assert again is kernel_system
     assert again.evaluations == 0
     assert np.array_equal(again.terms(0.0, state)["rate"], free)
 

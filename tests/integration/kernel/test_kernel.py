@@ -20,7 +20,7 @@ from srm_mbs.integration.control.step_size import initial_step
 from srm_mbs.integration.dense_output import DenseOutput
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.run import CompiledRun
-from srm_mbs.integration.kernel.system import Evaluator, twin_of
+from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.simulation.runner import absolute_tolerance
 from tests.support.bundled import load
@@ -106,7 +106,7 @@ def random_state(mechanism: srm.Mechanism, rng: np.random.Generator) -> np.ndarr
 def test_the_terms_of_a_stage_agree_anywhere(name: str) -> None:
     mechanism = load(name)
     system = make_system(mechanism)
-    twin = twin_of(system)
+    kernel_system = make_kernel_system(system)
     rng = np.random.default_rng(5)
     for _ in range(20):
         x = random_state(mechanism, rng)
@@ -116,7 +116,7 @@ def test_the_terms_of_a_stage_agree_anywhere(name: str) -> None:
             "multiplier": terms.multiplier(),
             "correction": terms.correction(),
         }
-        found = twin.terms(0.3, x)
+        found = kernel_system.terms(0.3, x)
         assert found["rank"] == terms.rank
         if system.has_constraints:
             assert abs(found["sigma"] - terms.sigma) < 1e-12
@@ -335,6 +335,6 @@ def test_the_first_step_agrees(name: str) -> None:
         state = random_state(mechanism, rng)
         memory = method.start(system, 0.2, state, norm)
         expected = initial_step(system, state, memory, norm, span, 8, 0.2)
-        evaluator = Evaluator(system, twin_of(system))
+        evaluator = Evaluator(system, make_kernel_system(system))
         found = evaluator.first_step(state, memory, norm, span, 8, 0.2)
         assert found == pytest.approx(expected, rel=1e-9 / min(1.0, memory.sigma) ** 2)

@@ -15,7 +15,7 @@ from srm_mbs.dynamics.constraints.row_algebra import LARGE
 from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.kernel import backend as kernel
-from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.kernel.system import make_kernel_system
 from tests.integration.kernel.test_kernel import agree
 from tests.support import reduced
 from tests.support.lockstep import compare
@@ -271,8 +271,8 @@ def test_an_evaluation_leaves_nothing_behind_for_the_next(n: int) -> None:
 
 def test_it_is_chosen_for_chains_of_loops_and_not_for_single_loops() -> None:
     for name, sparse in (("four_bar", False), ("spatial_four_bar", False), ("n_four_bar_2", False)):
-        assert twin_of(ClosedSystem(srm.load(name))).sparse is sparse
-    assert twin_of(ClosedSystem(srm.n_four_bar(10))).sparse
+        assert make_kernel_system(ClosedSystem(srm.load(name))).sparse is sparse
+    assert make_kernel_system(ClosedSystem(srm.n_four_bar(10))).sparse
     system = ClosedSystem(srm.load("four_bar"))
     unknown = system.constants() | {"algebra": "banded"}
     with pytest.raises(ValueError, match="auto, dense or sparse"):

@@ -11,7 +11,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.kernel import backend
-from srm_mbs.integration.kernel.system import twin_of
+from srm_mbs.integration.kernel.system import make_kernel_system
 from tests.support.mechanisms import along_x, rod
 
 pytestmark = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
@@ -84,12 +84,12 @@ def test_terms_are_those_of_the_reference_for_any_kind_of_joint(name: str) -> No
     mechanism = _branching((IN_ONE_PASS | BY_PINOCCHIO)[name])
     model = mechanism.model
     system = make_system(mechanism)
-    twin = twin_of(system)
+    kernel_system = make_kernel_system(system)
     rng = np.random.default_rng(2)
     for _ in range(5):
         q = pin.integrate(model, mechanism.q0, rng.uniform(-1.0, 1.0, model.nv))
         state = np.concatenate([q, rng.uniform(-2.0, 2.0, model.nv)])
-        found = twin.terms(0.0, state)
+        found = kernel_system.terms(0.0, state)
         terms = system.evaluate(0.0, state)
         size = np.abs(terms.rate()).max()
         assert np.abs(found["rate"] - terms.rate()).max() < 1e-13 * size / terms.sigma
@@ -112,7 +112,7 @@ def test_workspaces_of_large_trees_hold_no_second_derivatives() -> None:
         model.appendBodyToJoint(parent, rod(), pin.SE3.Identity())
     system = make_system(srm.Mechanism(model))
     before = _resident()
-    kept = [twin_of(system) for _ in range(6)]
+    kept = [make_kernel_system(system) for _ in range(6)]
     # What one gives back may stay with the process until the next one takes it: once, not six.
     assert _resident() - before < 2.5 * 86.0
     assert np.isfinite(kept[0].terms(0.0, np.zeros(2 * model.nv))["rate"]).all()

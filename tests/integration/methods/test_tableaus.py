@@ -522,12 +522,16 @@ def test_a_tableau_does_not_share_the_arrays_it_was_given() -> None:
 def test_a_copied_or_pickled_tableau_is_equal_and_read_only_as_well(
     name: str, clone: Callable[[ButcherTableau], ButcherTableau]
 ) -> None:
-    tableau, twin = TABLEAUS[name], clone(TABLEAUS[name])
-    assert twin.dense is twin.extensions[twin.dense.name]
-    for ours, theirs in zip(arrays_of(tableau), arrays_of(twin), strict=True):
+    tableau, kernel_system = TABLEAUS[name], clone(TABLEAUS[name])
+    assert kernel_system.dense is kernel_system.extensions[kernel_system.dense.name]
+    for ours, theirs in zip(arrays_of(tableau), arrays_of(kernel_system), strict=True):
         assert ours.tolist() == theirs.tolist()
         assert not theirs.flags.writeable
-    assert (twin.name, twin.order, twin.citation) == (name, tableau.order, tableau.citation)
+    assert (kernel_system.name, kernel_system.order, kernel_system.citation) == (
+        name,
+        tableau.order,
+        tableau.citation,
+    )
     if tableau.exact is not None:
-        assert twin.exact is not None
-        assert twin.exact.A == tableau.exact.A
+        assert kernel_system.exact is not None
+        assert kernel_system.exact.A == tableau.exact.A

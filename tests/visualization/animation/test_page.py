@@ -17,7 +17,12 @@ from srm_mbs.cli.app import app
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.visualization.animation import overlays
 from srm_mbs.visualization.animation import overlays as closure_overlays
-from srm_mbs.visualization.animation.overlays import Wanted, gaps_of, ramp_colours, turns_along
+from srm_mbs.visualization.animation.overlays import (
+    OverlayOptions,
+    gaps_of,
+    ramp_colours,
+    turns_along,
+)
 from srm_mbs.visualization.animation.page import make_page, read_out
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
 from tests.support.browsing import opened
@@ -511,7 +516,7 @@ def test_reactions_and_gaps_of_an_open_chain_and_reactions_of_a_prescribed_motio
 
 def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Solution) -> None:
     far = srm.Anchor("rod", xyz=(9.0, 0.0, 0.0))
-    view = make_picture(slider_crank, 20.0, Wanted([far])).view
+    view = make_picture(slider_crank, 20.0, OverlayOptions([far])).view
     path = np.array([place(slider_crank, t, far) for t in np.linspace(0.0, 8.0, 161)])
     x, y, depth = view.axes @ (path - view.target).T
     slope = np.tan(np.radians(0.5 * FIELD_OF_VIEW)) * (view.distance + depth)
@@ -529,7 +534,7 @@ def flight() -> srm.Solution:
 
 
 def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.Solution) -> None:
-    picture = make_picture(flight, 30.0, Wanted())
+    picture = make_picture(flight, 30.0, OverlayOptions())
     assert picture.along is not None
     assert picture.along[0] == pytest.approx(0.0, abs=1e-12)
     assert 150.0 < np.linalg.norm(picture.along[-1]) < 210.0
@@ -541,8 +546,8 @@ def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.So
 def test_the_picture_stands_still_where_a_joint_holds_to_the_ground_or_little_is_gained(
     slider_crank: srm.Solution,
 ) -> None:
-    assert make_picture(slider_crank, 30.0, Wanted()).along is None
-    assert make_picture(srm.simulate(floating_ring(), 1.0), 30.0, Wanted()).along is None
+    assert make_picture(slider_crank, 30.0, OverlayOptions()).along is None
+    assert make_picture(srm.simulate(floating_ring(), 1.0), 30.0, OverlayOptions()).along is None
 
 
 @pytest.mark.browser

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import srm_mbs as srm
 from srm_mbs.cli.app import app
 from srm_mbs.visualization.animation import video as rendering
-from srm_mbs.visualization.animation.overlays import Wanted
+from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import (
     FIELD_OF_VIEW,
     View,
@@ -255,7 +255,7 @@ def test_the_colour_of_a_closure_is_seen_although_it_lies_within_a_body(tmp_path
     for name, reactions in (("with.png", True), ("without.png", False)):
         solution.export_image(tmp_path / name, t=2.4, reactions=reactions)
         pictures.append(pixels(tmp_path / name))
-    view = make_picture(solution, 60.0, Wanted(reactions=True)).view
+    view = make_picture(solution, 60.0, OverlayOptions(reactions=True)).view
     crank = solution(2.4)[0][0]  # two bars of 2 m, their end on the x axis
     place = np.array([4.0 * math.cos(crank), 0.0, 0.0])
     x, y, depth = view.axes @ (place - view.target)

@@ -235,7 +235,7 @@ class Mechanics(Manifold):
         self._first, self._last = first, last
 
     def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Generalised forces (nv,) of the controller, as :func:`evaluate_controller` returns them."""
+        """Generalised forces (nv,) of the controller; 0 without one."""
         if self._controller is None:
             return np.zeros(self.nv)
         return evaluate_controller(self._controller, t, q, v)

@@ -25,8 +25,9 @@ def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
     held = system.held
     calls = system.calls_forces or (system.controlled and held is None)
     controller = system.called_force if calls else None
-    kernel_system = core.System(system.model, system.constants(), controller)  # type:
-    ignore[union-attr] if held is not None:
+    assembled = system.model, system.constants(), controller
+    kernel_system = core.System(*assembled)  # type: ignore[union-attr]
+    if held is not None:
         for t, force in zip(held.times, held.values):
             kernel_system.hold(t, force, True)
     return kernel_system

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 
 from srm_mbs.dynamics.controllers import Controller, HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
@@ -18,12 +20,11 @@ from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel import driver
 from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.kernel.run import CompiledRun
-from srm_mbs.integration.kernel.system import Evaluator, given_back, taken
+from srm_mbs.integration.kernel.system import Evaluator, workspace
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.singular_endpoints import start
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
     check_avoidable,
@@ -200,17 +201,18 @@ def simulate(
     system = make_system(mechanism, controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
-        mechanism.at_start(f"consistent at {t0!r}", lambda: check_consistent(mechanism, t0))
+        check_consistent(mechanism, t0)
 
     by = "kernel" if on_kernel else "python"
     log_start(mechanism.name, t0, t_end, method, norm, step, by)
     watch = event_watch(events, system, method, state)
     wrappers: Sequence[Placing] = ()
     kernel_system: Any = None
+    workspaces = ExitStack()  # left open by a run that raises, whose workspace is lost
     record: RunRecord
     try:
         if on_kernel:
-            kernel_system = taken(system)
+            kernel_system = workspaces.enter_context(workspace(system))
         evaluator = system if kernel_system is None else Evaluator(system, kernel_system)
         passing = BreakpointHandler(pieces, system, method, norm, evaluator)
         if held is not None and controller is not None:
@@ -271,8 +273,7 @@ def simulate(
                     breakpoints=passing,
                 )
         passing.done()
-        if kernel_system is not None:
-            given_back(system, kernel_system)
+        workspaces.close()
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
         record.status, record.message = "failed", f"Stopped at t = {t0:.6g} s: {error}."

@@ -96,10 +96,9 @@ def _open_chain() -> Item:
 
 def _zero_rows() -> Item:
     mechanism = srm.load("n_four_bar_5")
-    whole = replace(mechanism)  # anew: copies share what follows from the structure
     structure = mechanism.structure
     kept = np.ones_like(structure.kept)
-    whole.__dict__["structure"] = replace(structure, kept=kept)
+    whole = mechanism.with_structure(replace(structure, kept=kept))
     dropped = int((~structure.kept).sum())
     return Item(
         f"{dropped} rows that are always zero",

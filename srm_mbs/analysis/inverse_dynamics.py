@@ -22,10 +22,11 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.constraints.structure import structure_of
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import numbers
 from srm_mbs.simulation.result import Solution
 
@@ -233,7 +234,7 @@ def _check_motion(
     """Refuse positions, rates u and accelerations a, in units, that the closures forbid."""
     g, G = geometry.closure(q)
     # At rest what is left is rounding: it counts against the mechanism's own rate.
-    rate = geometry.mechanism.structure.units.rate
+    rate = structure_of(geometry.mechanism).units.rate
     speed = max(float(np.abs(u).max(initial=0.0)), rate)
     bias = geometry.bias(q, u) * geometry.row_size
     checks = (

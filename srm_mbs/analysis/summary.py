@@ -13,12 +13,12 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import row_angles, turning_coordinates
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.coordinates import position_of
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.result import Solution
 
 JOINT_TYPES = {

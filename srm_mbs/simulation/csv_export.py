@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.analysis.summary import JOINT_TYPES
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import row_dimensions
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.result import Solution
 
 log = logging.getLogger(__name__)

@@ -19,8 +19,8 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.result import Solution
 
 NODES = 8

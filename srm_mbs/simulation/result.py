@@ -20,6 +20,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.reactions import drive_forces_at, reactions_at
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import InputError
 from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read, wound_angles
@@ -30,7 +31,6 @@ from srm_mbs.integration.singular_passages import (
     find_bifurcations,
     find_crossings,
 )
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.joint_motion import AnimationMixin
 
 if TYPE_CHECKING:

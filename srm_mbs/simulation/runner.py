@@ -15,6 +15,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.errors import InputError
@@ -31,7 +32,7 @@ from srm_mbs.integration.messages import drift, passings, restarts, turns
 from srm_mbs.integration.methods.base import ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.forces import LimitSpring
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import per_model, per_start
 from srm_mbs.simulation.options import checked_atol, checked_method, step_size_control
 from srm_mbs.simulation.result import Settings, Solution, Statistics, attempt_array
 
@@ -115,6 +116,7 @@ def bifurcation_sentences(solution: Solution) -> str:
     return "".join(f" {bifurcation}." for bifurcation in found[:TOLD]) + more
 
 
+@per_model
 def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatArray]:
     """Names, indices in q (k,) and limits (2, k) of the one-degree joints that have limits."""
     model = mechanism.model
@@ -134,9 +136,7 @@ def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatA
 
 def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
     """A sentence naming the one-degree joints that left their limits, which do not act."""
-    names, indices, (low, high) = mechanism.derived(
-        "limited_joints", lambda: _limited_joints(mechanism)
-    )
+    names, indices, (low, high) = _limited_joints(mechanism)
     if not names:
         return ""
     q = dense.nodes()[1][:, indices]
@@ -177,6 +177,7 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
     return checked
 
 
+@per_start
 def _units_of_states(mechanism: Mechanism) -> FloatArray:
     """The unit of each tangent component (2 nv,)."""
     units = mechanism.structure.units
@@ -186,9 +187,7 @@ def _units_of_states(mechanism: Mechanism) -> FloatArray:
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
     if atol is None:
-        tolerance: FloatArray = rtol * mechanism.at_start(
-            "units of states", lambda: _units_of_states(mechanism)
-        )
+        tolerance: FloatArray = rtol * _units_of_states(mechanism)
         return tolerance
     nv = mechanism.model.nv
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
@@ -211,16 +210,28 @@ def initial_state(
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
-    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates; True for
-    any other."""
+@per_start
+def _accepted_times(mechanism: Mechanism) -> set[float]:
+    """Times (s) at which the initial state satisfies closures and drives, as far as checked."""
+    return set()
+
+
+def check_consistent(mechanism: Mechanism, t: float = 0.0) -> None:
+    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates."""
+    accepted = _accepted_times(mechanism)
+    if t not in accepted:
+        _check_errors(mechanism, t)
+        accepted.add(t)
+
+
+def _check_errors(mechanism: Mechanism, t: float) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
     if t == 0.0:
         g, c = mechanism.initial_errors
     else:
         g, c = (e[0] for e in constraint_errors(mechanism, np.array([t]), q0[None], v0[None]))
     if not len(g):
-        return True
+        return
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
@@ -235,7 +246,6 @@ def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
             )
-    return True
 
 
 def event_watch(

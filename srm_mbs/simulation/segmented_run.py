@@ -16,13 +16,13 @@ import numpy as np
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.api import simulate
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, EventError, InputError, SimulationError
 from srm_mbs.integration.events import EventFunction, prepare_events, together
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import checked_times, numbers, positive
 from srm_mbs.simulation.result import Request, Solution
 from srm_mbs.simulation.runner import check_consistent
@@ -390,7 +390,7 @@ def _switched(
             remedy="Give a mechanism made from this one, for example with dataclasses.replace",
         )
     new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
-    new.__dict__["drive_curves"] = _curves_from(t, mechanism, new)
+    new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)

@@ -10,6 +10,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
@@ -18,7 +19,6 @@ from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.incremental_run import KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
     check_embedded,

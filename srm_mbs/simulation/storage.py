@@ -26,6 +26,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination
 from srm_mbs.dynamics.constraints.structure import Structure, row_names
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import InputError
@@ -42,7 +43,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Curve, Law
-from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.simulation.result import ATTEMPT, Request, Settings, Solution, Statistics
 from srm_mbs.simulation.segmented_result import SegmentedSolution
 
@@ -281,7 +282,7 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         notes=tuple(entry["notes"]),
     )
     if entry.get("drive_starts"):
-        mechanism.__dict__["drive_curves"] = _drive_curves(mechanism.drives, entry["drive_starts"])
+        return mechanism.with_drive_curves(_drive_curves(mechanism.drives, entry["drive_starts"]))
     return mechanism
 
 
@@ -383,8 +384,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
             )
         mechanism = _mechanism(meta["mechanism"], arrays)
         structure = meta["structure"]
-        # The analysis of the run itself, so that the dense output is the same to the last bit.
-        mechanism.__dict__["structure"] = Structure(
+        analysis = Structure(
             row_names(mechanism),
             arrays["row_scale"],
             arrays["kept"],
@@ -399,6 +399,8 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
                 for row, other, factor in arrays.get("eliminations", np.zeros((0, 3))).tolist()
             ),
         )
+        # The analysis of the run itself, so that the dense output is the same to the last bit.
+        mechanism = mechanism.with_structure(analysis)
         zones = {
             int(index): (
                 float(threshold),

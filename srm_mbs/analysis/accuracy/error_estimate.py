@@ -18,10 +18,10 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import turning_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import positive, tightest_rtol
 from srm_mbs.simulation.rerun import rerun
 from srm_mbs.simulation.result import Solution

@@ -26,10 +26,10 @@ from srm_mbs.analysis.summary import (
     mechanism_rows,
     run_rows,
 )
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.result import Solution
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import NAMED_LOOPS

@@ -11,8 +11,8 @@ from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.simulation.result import Solution
 
 if TYPE_CHECKING:
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.model.closures import LoopClosure
-    from srm_mbs.model.mechanism import Mechanism
     from srm_mbs.visualization.animation.joint_motion import Playable
 
 Spans = tuple[tuple[float, float], ...]

@@ -16,9 +16,9 @@ import pinocchio as pin
 from matplotlib.figure import Figure
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import coordinate_units, joint_turns
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.result import Solution
 from srm_mbs.visualization.plotting.figure import (
     BLACK,

@@ -30,7 +30,11 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.row_algebra import (
+    GRAPH_ORDER_ABOVE,
+    coordinate_parents,
+    graph_order,
+)
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
@@ -387,7 +391,7 @@ def _rows_in_use(mechanism: Mechanism) -> LoopKinematics | DrivenKinematics:
 @per_model
 def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
     """The rows in use along the graph of the loops, if there are many coordinates."""
-    if mechanism.model.nv <= LARGE:  # every pivot order is cheap
+    if mechanism.model.nv <= GRAPH_ORDER_ABOVE:  # every pivot order is cheap
         return ()
     return graph_order(_rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
 

@@ -283,7 +283,7 @@ def simulate(
         rtol,
         tuple(norm.atol.tolist()),
         step,
-        controller is not None or system.calls_forces,
+        controller is not None or system.has_user_forces,
         placement,
         tuple(avoided.tolist()),
         by,

@@ -14,7 +14,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import row_angles, turning_coordinates
+from srm_mbs.dynamics.scaling import angle_coordinates, row_angles
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
@@ -131,7 +131,7 @@ def _turning(mechanism: Mechanism, name: str) -> list[bool]:
     """Which degrees of freedom of the joint ``name`` are angles."""
     joint = mechanism.joint(name)
     own = slice(joint.idx_v, joint.idx_v + joint.nv)
-    turning: list[bool] = turning_coordinates(mechanism.model)[own].tolist()
+    turning: list[bool] = angle_coordinates(mechanism.model)[own].tolist()
     return turning
 
 

@@ -10,6 +10,7 @@ Position limits of joints: which are left, and closing within them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +20,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
 from srm_mbs.dynamics.scaling import coordinate_units, periodic_coordinates, row_angles
@@ -38,6 +40,7 @@ FAR = 0.5
 for."""
 OTHER_STARTS = 8
 SEARCH_STEPS = 200
+POLISHING_EVALUATIONS = 61
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts when the guess itself leads nowhere."""
 
@@ -208,20 +211,17 @@ def _search(
 
 
 def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
-    """Gauss-Newton on the closure rows until they stop improving."""
-    g, G = problem.closure(q)
-    best, error = q, float(np.abs(g).max())
-    for _ in range(60):
-        if error == 0.0:
-            break
-        step = min_norm_solution(G[:, free], g, RANK)
-        q = problem.move(q, -step, free)
+    """Newton's iteration on the closure rows, by shortest steps of the ``free`` coordinates."""
+
+    def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray]]:
         g, G = problem.closure(q)
-        new_error = float(np.abs(g).max())
-        if not new_error < error:
-            break
-        best, error = q, new_error
-    return best
+
+        def step() -> FloatArray:
+            return problem.move(q, -min_norm_solution(G[:, free], g, RANK), free)
+
+        return float(np.abs(g).max()), step
+
+    return newton(q, linearise, POLISHING_EVALUATIONS)[0]
 
 
 def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:

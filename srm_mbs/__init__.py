@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from srm_mbs.errors import __version__
+from srm_mbs.errors import __version__ as __version__
 
 if TYPE_CHECKING:
     from srm_mbs.analysis.accuracy.certificate import Certificate, certify
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.path_following import FollowedPath, follow
     from srm_mbs.api import DaeSolution, Solution, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.errors import (
         AnalysisError,
         AssemblyError,
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
         Wrench,
     )
     from srm_mbs.model.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
-    from srm_mbs.model.mechanism import Mechanism
     from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
     from srm_mbs.simulation.energy_balance import EnergyBalance
     from srm_mbs.simulation.mobility import MobilityMap, mobility_map
@@ -90,7 +90,7 @@ _HOME = {
     "Linearisation": "analysis.linearisation",
     "LiveView": "visualization.animation.live",
     "LoopClosure": "model.closures",
-    "Mechanism": "model.mechanism",
+    "Mechanism": "dynamics.mechanism",
     "MinimumJerk": "model.laws",
     "MobilityMap": "simulation.mobility",
     "PSRM": "integration.methods.psrm",

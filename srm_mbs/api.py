@@ -1,7 +1,7 @@
 """The public entry points that put the layers together: runs, and results with pictures and files.
 
-:func:`simulate` and :func:`solve_dae` hand their options to the one runner (:mod:`srm_mbs.simulation`)
-and choose the classes of the results.  :class:`Solution` is a
+:func:`simulate` and :func:`solve_dae` hand their options to the one runner
+(:mod:`srm_mbs.simulation`) and choose the classes of the results.  :class:`Solution` is a
 :class:`~srm_mbs.simulation.result.SimulationResult` that can be looked at, saved and reported.
 """
 
@@ -154,6 +154,8 @@ class DaeSolution(DaeResult):
         return plot_dae(self, path, kind)
 
 
+_NO_OPTIONS = ("mechanism", "problem", "t_span", "x0")
+"""Parameters of :func:`simulate` and :func:`solve_dae` that are none of their options."""
 SOLUTIONS = ResultTypes(Solution, SegmentedSolution)
 """Classes of the results of :func:`simulate` and :func:`load_solution`."""
 
@@ -261,7 +263,7 @@ def simulate(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    options = {name: value for name, value in locals().items() if name != "mechanism"}
+    options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
     return run(mechanism, RunOptions(**options), SOLUTIONS)
 
 
@@ -349,8 +351,7 @@ def solve_dae(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    excluded = ("problem", "t_span", "x0")
-    options = {name: value for name, value in locals().items() if name not in excluded}
+    options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
     return run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
 
 

@@ -50,7 +50,7 @@ from srm_mbs.model.forces import (
     Wrench,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 
 class Evaluator(Protocol):
@@ -356,7 +356,7 @@ class _UserForceEvaluator:
         raise TypeError("the compiled kernel calls back for it")
 
 
-def friction_time(mechanism: Mechanism) -> float:
+def friction_time(mechanism: MechanismData) -> float:
     """Shortest time (s) in which friction stops a slow joint of the open tree at q0.
 
     1 over the largest eigenvalue of M^-1 diag(F)/v_s; infinite without friction.  Steps of
@@ -388,13 +388,10 @@ _EVALUATORS = {
 }
 
 
-def resolved_forces(mechanism: Mechanism) -> ForceKinematics | None:
+@per_model
+def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
     """The force elements of ``mechanism``, resolved once; None if it has none."""
-    forces: ForceKinematics | None = mechanism.derived(
-        "forces",
-        lambda: ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None,
-    )
-    return forces
+    return ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None
 
 
 class ForceKinematics:

@@ -15,12 +15,13 @@ import pinocchio as pin
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.forces import friction_time
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.formats.toml.description import Description, parse_description
 from srm_mbs.formats.toml.schema import LimitSpringEntry, TorqueEntry, TorsionSpringEntry
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
 from srm_mbs.model.coordinates import set_position, set_rate
-from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.model.validation import check_inertia, undetermined_joint
 
 log = logging.getLogger(__name__)

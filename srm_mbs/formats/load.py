@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.build import assembled, rebuild
 from srm_mbs.formats.generators import n_four_bar as _n_four_bar_texts
@@ -28,7 +29,7 @@ from srm_mbs.formats.toml.description import Description, parse_description
 from srm_mbs.formats.toml.schema import LARGEST
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.model.mechanism import Mechanism, Source
+from srm_mbs.model.mechanism import Source
 
 _GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
 

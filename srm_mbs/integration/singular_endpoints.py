@@ -43,7 +43,7 @@ from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.multiplier_history import WINDOW, MultiplierHistory
 from srm_mbs.integration.methods.near_singular import ZONE_LARGEST
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData
 
 AHEAD = WINDOW - 1
 """Nodes of a block ahead of its start."""
@@ -306,7 +306,7 @@ SHOWN = 4
 """Branches listed in a message."""
 
 
-def _rates(mechanism: Mechanism, v: FloatArray) -> str:
+def _rates(mechanism: MechanismData, v: FloatArray) -> str:
     """``joint rate`` of the joints that move in v (nv,)."""
     parts = []
     for name in mechanism.joint_names:

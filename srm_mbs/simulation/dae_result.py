@@ -156,6 +156,6 @@ class DaeResult(RunOutcome):
 
     def __repr__(self) -> str:
         return (
-            f"{type(self).__name__}(t={self.steps.times[0]:.6g}..{self.steps.times[-1]:.6g}, "
+            f"DaeSolution(t={self.steps.times[0]:.6g}..{self.steps.times[-1]:.6g}, "
             f"{len(self.t)} points, {self.stats.steps} steps, {self.status})"
         )

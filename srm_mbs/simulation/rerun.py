@@ -9,6 +9,7 @@ import numpy as np
 
 from srm_mbs.errors import InputError
 from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.segmented_result import RESULTS
 from srm_mbs.simulation.segmented_run import run
 
 BEYOND = 0.1
@@ -78,4 +79,4 @@ def rerun(
         progress=progress,
         backend=backend,
     )
-    return run(solution.mechanism, options)
+    return run(solution.mechanism, options, RESULTS)

@@ -407,8 +407,9 @@ class SimulationResult(RunOutcome):
         return self.mechanism.mobility.indeterminate_rows
 
     def __repr__(self) -> str:
+        first, last = (self.t[0], self.t[-1]) if len(self.t) else (0.0, 0.0)
         return (
-            f"{type(self).__name__}({self.mechanism.name!r}, t={self.t[0] if len(self.t) else 0:.6g}.."
-            f"{self.t[-1] if len(self.t) else 0:.6g} s, {len(self.t)} points, "
-            f"{self.stats.steps} steps, {self.status}, {self.settings.backend})"
+            f"Solution({self.mechanism.name!r}, t={first:.6g}..{last:.6g} s, "
+            f"{len(self.t)} points, {self.stats.steps} steps, {self.status}, "
+            f"{self.settings.backend})"
         )

@@ -17,6 +17,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
+from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import constraint_units
@@ -239,16 +240,34 @@ def initial_state(
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
-    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates; True for
-    any other."""
+@per_start
+def _accepted_times(mechanism: Mechanism) -> set[float]:
+    """Times (s) at which the initial state satisfies closures and drives, as far as checked."""
+    return set()
+
+
+def check_consistent(mechanism: Mechanism, t: float = 0.0) -> None:
+    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates.
+
+    Raises
+    ------
+    InputError
+        Naming the row that is violated most.
+    """
+    accepted = _accepted_times(mechanism)
+    if t not in accepted:
+        _check_errors(mechanism, t)
+        accepted.add(t)
+
+
+def _check_errors(mechanism: Mechanism, t: float) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
     if t == 0.0:
         g, c = mechanism.initial_errors
     else:
         g, c = (e[0] for e in constraint_errors(mechanism, np.array([t]), q0[None], v0[None]))
     if not len(g):
-        return True
+        return
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
@@ -263,7 +282,6 @@ def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
             )
-    return True
 
 
 # --- assemble the problem -------------------------------------------------------------------------
@@ -500,7 +518,11 @@ def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "")
 
 
 def statistics(
-    system: System, record: RunRecord, data: StepData, placed: int, replaced: int
+    system: OpenSystem | ClosedSystem | DaeSystem,
+    record: RunRecord,
+    data: StepData,
+    placed: int,
+    replaced: int,
 ) -> Statistics:
     """Counts of a run, ``placed`` and ``replaced`` by its step placement."""
     return Statistics(

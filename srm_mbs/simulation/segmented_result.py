@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
@@ -256,8 +256,16 @@ def _joined(parts: Sequence[StepData]) -> StepData:
     )
 
 
-class ResultTypes(NamedTuple):
-    """Classes of the results that a runner makes."""
+R = TypeVar("R", bound=SimulationResult)
 
-    run: type[SimulationResult] = SimulationResult
-    segmented: type[SegmentedResult] = SegmentedResult
+
+@dataclass(frozen=True)
+class ResultTypes(Generic[R]):
+    """Classes of the results that a runner makes: of one segment, and of several."""
+
+    plain: type[R]
+    segmented: Callable[..., R]
+
+
+RESULTS: ResultTypes[SimulationResult] = ResultTypes(SimulationResult, SegmentedResult)
+"""Results without pictures and files."""

@@ -25,7 +25,7 @@ from srm_mbs.model.laws import Curve
 from srm_mbs.simulation.options import RunOptions, numbers, positive
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import check_consistent, checked_options, finished, run_segment
-from srm_mbs.simulation.segmented_result import ResultTypes
+from srm_mbs.simulation.segmented_result import R, ResultTypes
 
 
 class Event:
@@ -213,9 +213,7 @@ class _Sampled:
         return self._last
 
 
-def run(
-    mechanism: Mechanism, options: RunOptions, types: ResultTypes | None = None
-) -> SimulationResult:
+def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
     """Simulate ``mechanism``; see :func:`srm_mbs.simulate`.
 
     Parameters
@@ -232,21 +230,18 @@ def run(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    types = ResultTypes() if types is None else types
     if isinstance(options.events, Iterator):  # they are looked at more than once
         options = replace(options, events=list(options.events))
     checked = checked_options(mechanism, options)
     if acting(options.events):
         result = _run_segments(mechanism, checked, types)
     else:
-        result = run_segment(mechanism, checked, types.run)
+        result = run_segment(mechanism, checked, types.plain)
     result.request = options.repeatable()
     return finished(result, checked)
 
 
-def _run_segments(
-    mechanism: Mechanism, options: RunOptions, types: ResultTypes
-) -> SimulationResult:
+def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
     """The segments between the actions of events, joined."""
     given, t_end = options.events, options.t_end
     events = [given] if callable(given) else list(given)
@@ -264,7 +259,7 @@ def _run_segments(
     counts = [0] * len(events)
     last_times: list[list[float]] = [[] for _ in events]
     floors = [0.0] * len(events)
-    parts: list[SimulationResult] = []
+    parts: list[R] = []
     acted: list[int] = []
     guards: list[float | None] = [None] * len(events)
     t = options.t0
@@ -276,7 +271,7 @@ def _run_segments(
             for i, event in enumerate(events)
         ]
         try:
-            part = run_segment(mechanism, replace(here, events=armed), types.run)
+            part = run_segment(mechanism, replace(here, events=armed), types.plain)
         except InputError as error:
             if not parts:
                 raise

@@ -20,6 +20,7 @@ from srm_mbs.integration.methods.base import ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.simulation.incremental_run import KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
+    RunOptions,
     check_embedded,
     finite,
     positive,
@@ -29,13 +30,16 @@ from srm_mbs.simulation.runner import (
     absolute_tolerance,
     check_consistent,
     check_mechanism,
+    checked_accuracy,
+    mechanism_guard,
     placed_control,
 )
 
 SHORT = 8.0
 """Steps up to this many units of rounding of the time move nothing but the time."""
 LONGER = 1e10
-"""Where a step is longer than its predecessor by this factor, inner steps are chosen forces_jumped."""
+"""Where a step is longer than its predecessor by this factor, its length is chosen
+as at a start."""
 NEAR = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 _NONE = np.zeros(0)

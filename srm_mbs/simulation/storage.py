@@ -43,7 +43,7 @@ from srm_mbs.model.laws import LAW_TYPES, Curve, Law
 from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.simulation.options import REPEATED, RunOptions
 from srm_mbs.simulation.result import ATTEMPT, Settings, SimulationResult, Statistics
-from srm_mbs.simulation.segmented_result import ResultTypes, SegmentedResult
+from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
 _KINDS = {"PSRM": PSRM, "SRM": SRM}
 
@@ -335,7 +335,7 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
         raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 
 
-def load_result(path: Path, types: ResultTypes) -> SimulationResult:
+def load_result(path: Path, types: ResultTypes[R]) -> R:
     """Read a saved run; see :func:`srm_mbs.load_solution`.
 
     Parameters
@@ -349,12 +349,10 @@ def load_result(path: Path, types: ResultTypes) -> SimulationResult:
         If the file is missing, is no saved run, or is of another format.
     """
     segments = load_segments(path, types) if path.is_file() else None
-    return load_plain(path, str(path), types.run) if segments is None else segments
+    return load_plain(path, str(path), types.plain) if segments is None else segments
 
 
-def load_plain(
-    path: Path | IO[bytes], name: str, result_type: type[SimulationResult]
-) -> SimulationResult:
+def load_plain(path: Path | IO[bytes], name: str, result_type: type[R]) -> R:
     """A run without segments from a file name or an open file, which messages call ``name``.
 
     Raises
@@ -477,7 +475,7 @@ def save_segments(solution: SegmentedResult, path: Path) -> None:
             archive.writestr(f"{k}.npz", kept.getvalue())
 
 
-def load_segments(path: Path, types: ResultTypes) -> SimulationResult | None:
+def load_segments(path: Path, types: ResultTypes[R]) -> R | None:
     """The run in ``path``; None if it is no archive of segments.
 
     Raises
@@ -504,7 +502,7 @@ def load_segments(path: Path, types: ResultTypes) -> SimulationResult | None:
             whole = types.segmented(
                 [
                     load_plain(
-                        io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}", types.run
+                        io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}", types.plain
                     )
                     for k in range(contents["count"])
                 ],

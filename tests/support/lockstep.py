@@ -25,7 +25,8 @@ from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
-from srm_mbs.simulation.runner import absolute_tolerance, placed_control
+from srm_mbs.simulation.options import RunOptions
+from srm_mbs.simulation.runner import absolute_tolerance, mechanism_guard, placed_control
 
 
 def control_state(control: Any) -> dict[str, Any]:
@@ -146,9 +147,11 @@ def compare(
     memory = start(system, method, 0.0, x, norm, t_end)
     order = scheme.controller_order or 1
     first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
-    control, _ = placed_control(
-        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0), arrivals
+    options = RunOptions(
+        t_end, method=method, step=step, placement=placement, singular_times=np.zeros(0)
     )
+    guard = mechanism_guard(system)
+    control, _ = placed_control(system, options, lambda: first, guard, arrivals)
     run = CompiledRun(
         kernel_system,
         method,

@@ -24,7 +24,7 @@ from srm_mbs.analysis.report.sections import (
     run_section,
 )
 from srm_mbs.errors import InputError
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.page import filled, write_page
 
 CONTENTS = {
@@ -38,7 +38,7 @@ CONTENTS = {
 
 
 def write_report(
-    solution: Solution,
+    solution: SimulationResult,
     path: str | Path,
     *,
     animation: bool = True,
@@ -80,7 +80,7 @@ def write_report(
 
 
 def report_page(
-    solution: Solution,
+    solution: SimulationResult,
     certificate: Certificate,
     *,
     animation: bool = True,
@@ -134,7 +134,7 @@ def _about() -> str:
     )
 
 
-def _summary(solution: Solution, certificate: Certificate) -> str:
+def _summary(solution: SimulationResult, certificate: Certificate) -> str:
     """What the page says, in a few sentences."""
     mechanism = solution.mechanism
     start, end = solution.span

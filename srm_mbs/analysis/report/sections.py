@@ -26,15 +26,16 @@ from srm_mbs.analysis.summary import (
     mechanism_rows,
     run_rows,
 )
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import NAMED_LOOPS
 from srm_mbs.visualization.animation.playback import page_of
 from srm_mbs.visualization.animation.snapshot import still_picture
+from srm_mbs.visualization.plotting import plot_solution
 from srm_mbs.visualization.plotting.figure import (
     FONT_SIZE,
     line_styles,
@@ -48,13 +49,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srm_mbs.analysis.accuracy.error_estimate import Comparison
-    from srm_mbs.simulation.result import Solution
+    from srm_mbs.simulation.result import SimulationResult
 
 DECADES = 1e-9
 """Least difference that is drawn, over the largest: none at the start would make the axis long."""
 
 
-def draw_errors(solution: Solution, comparison: Comparison) -> Figure:
+def draw_errors(solution: SimulationResult, comparison: Comparison) -> Figure:
     """Largest difference of positions and of rates, in units, over time."""
     size = comparison.size
     lowest = DECADES * comparison.largest
@@ -130,7 +131,7 @@ PICTURES = {
 """Kinds of pictures of a report, each with its caption."""
 
 
-def mechanism_section(solution: Solution) -> str:
+def mechanism_section(solution: SimulationResult) -> str:
     """Picture, provenance, joints, bodies, loops, forces and drives."""
     mechanism = solution.mechanism
     model = mechanism.model
@@ -201,7 +202,7 @@ def mechanism_section(solution: Solution) -> str:
     )
 
 
-def animation_section(solution: Solution) -> str:
+def animation_section(solution: SimulationResult) -> str:
     """The page of the animation in a frame.
 
     Raises
@@ -243,7 +244,7 @@ def freedom_section(mechanism: Mechanism) -> str:
     )
 
 
-def run_section(solution: Solution) -> str:
+def run_section(solution: SimulationResult) -> str:
     """Settings, statistics, singular passages."""
     return section(
         "run",
@@ -257,7 +258,7 @@ def run_section(solution: Solution) -> str:
     )
 
 
-def _settings(solution: Solution) -> list[tuple[str, str]]:
+def _settings(solution: SimulationResult) -> list[tuple[str, str]]:
     settings, start = solution.settings, solution.span[0]
     scheme = TABLEAUS.get(settings.tableau)
     order = "" if scheme is None else f", a Runge-Kutta scheme of order {scheme.order}"
@@ -287,11 +288,11 @@ def _settings(solution: Solution) -> list[tuple[str, str]]:
     return rows
 
 
-def _statistics(solution: Solution) -> list[tuple[str, str, str]]:
+def _statistics(solution: SimulationResult) -> list[tuple[str, str, str]]:
     return [(name, value, RUN[name]) for name, value in run_rows(solution) if name in RUN]
 
 
-def _passages(solution: Solution) -> str:
+def _passages(solution: SimulationResult) -> str:
     crossings = solution.crossings
     shown = crossings[:MOST_PASSAGES]
     loops = len(solution.mechanism.loops)
@@ -341,7 +342,7 @@ def _branch(crossing: Crossing) -> str:
     return f"left on another one ({count} meet)"
 
 
-def _events(solution: Solution) -> str:
+def _events(solution: SimulationResult) -> str:
     if solution.t_events is None:
         return ""
     rows = []
@@ -351,7 +352,7 @@ def _events(solution: Solution) -> str:
     return subsection("Events", table(rows, ("event", "times met", "at t (s)"), numbers=[1]))
 
 
-def pictures_section(solution: Solution, kinds: Sequence[str]) -> str:
+def pictures_section(solution: SimulationResult, kinds: Sequence[str]) -> str:
     """Figures of the run."""
     parts, missing = [], []
     crossings = solution.crossings
@@ -361,7 +362,7 @@ def pictures_section(solution: Solution, kinds: Sequence[str]) -> str:
         if kind == "reactions" and not solution.mechanism.constrained:
             continue
         try:
-            figure = solution.plot(kind=kind)
+            figure = plot_solution(solution, None, kind)
         except InputError as error:
             missing.append(f"{PICTURES[kind]} Not drawn: {error}")
             continue
@@ -397,7 +398,7 @@ MARKS: dict[Grade, str] = {
 """Each grade by a sign and a word, so that it does not need its colour."""
 
 
-def accuracy_section(solution: Solution, certificate: Certificate) -> str:
+def accuracy_section(solution: SimulationResult, certificate: Certificate) -> str:
     """Verdicts, drift, energy, and the estimated errors with what they rest on."""
     estimate = certificate.estimate
     return section(
@@ -543,7 +544,7 @@ def _trials(estimate: ErrorEstimate) -> str:
     )
 
 
-def _over_time(solution: Solution, estimate: ErrorEstimate) -> str:
+def _over_time(solution: SimulationResult, estimate: ErrorEstimate) -> str:
     pass
 
     units = solution.mechanism.structure.units

@@ -22,7 +22,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.trajectory import parts_of
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def read_out(solution: Playable, times: FloatArray, *, panel: bool = True) -> di
     """
     about: dict[str, Any] = {"start": float(times[0]), "panel": panel, "times": []}
     about |= {"values": [], "passages": []}
-    if not (panel and isinstance(solution, Solution)):
+    if not (panel and isinstance(solution, SimulationResult)):
         return about
     crossings = solution.crossings
     few = len(solution.mechanism.loops) <= NAMED_LOOPS and len(crossings) <= NAMED_PASSAGES
@@ -104,7 +104,7 @@ def _passage(crossing: Crossing, *, named: bool) -> str:
     return f"{text}: {crossing.participants.names}" if named else text
 
 
-def sigma_at(solution: Solution, times: FloatArray) -> FloatArray:
+def sigma_at(solution: SimulationResult, times: FloatArray) -> FloatArray:
     """sigma (relative) at ``times`` (n,) s.
 
     Straight lines between the stages of the run, where it was recorded, as in the plot of the run,

@@ -21,10 +21,10 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.xml import parse_urdf
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.trajectory import Spans
 
 log = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.overlays import OverlayOptions, springs_of
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
 from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Shape
@@ -49,7 +49,7 @@ AMBIENT = 0.45
 BACKGROUND = (1.0, 1.0, 1.0)
 
 
-def still_picture(solution: Solution, t: float) -> bytes:
+def still_picture(solution: SimulationResult, t: float) -> bytes:
     """The bodies and springs at ``t`` (s) as a PNG.
 
     Raises

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 if TYPE_CHECKING:
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.model.closures import LoopClosure
-    from srm_mbs.model.mechanism import Mechanism
     from srm_mbs.visualization.animation.joint_motion import Playable
 
 Spans = tuple[tuple[float, float], ...]
@@ -22,7 +22,7 @@ Thing = TypeVar("Thing")
 
 def parts_of(solution: Playable) -> list[tuple[Mechanism, tuple[float, float]]]:
     """The mechanisms of a run in order, each with its interval of time (s)."""
-    segments = solution.segments if isinstance(solution, Solution) else (solution,)
+    segments = solution.segments if isinstance(solution, SimulationResult) else (solution,)
     return [(segment.mechanism, segment.span) for segment in segments]
 
 

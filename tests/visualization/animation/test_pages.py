@@ -300,9 +300,11 @@ def test_the_pictures_of_a_page_can_be_drawn_again(
 def test_the_roles_of_docstrings_become_links_and_formulae_code() -> None:
     roles = pytest.importorskip("tools.docstring_roles", reason="needs the extra docs")
     text = roles.without_roles(
-        r"See :class:`~srm_mbs.model.mechanism.Mechanism`, :math:`\dot G v`."
+        r"See :class:`~srm_mbs.dynamics.mechanism.Mechanism`, :math:`\dot G v`."
     )
-    link = '<autoref optional identifier="srm_mbs.model.mechanism.Mechanism">`Mechanism`</autoref>'
+    link = (
+        '<autoref optional identifier="srm_mbs.dynamics.mechanism.Mechanism">`Mechanism`</autoref>'
+    )
     assert text == rf"See {link}, `\dot G v`."
 
 

@@ -32,7 +32,7 @@ class AnimationMixin:
 
         play(self, **options)  # type: ignore[arg-type]
 
-    def show_in_notebook(self, **options: Any) -> Embedded:
+    def show(self, **options: Any) -> Embedded:
         """What a notebook shows as the animation; see
         :func:`srm_mbs.visualization.animation.playback.show_in_notebook`."""
         from srm_mbs.visualization.animation.playback import show_in_notebook

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from srm_mbs.simulation.result import Solution
 
 
+__version__ = "0.1.0"
+"""Version of the package."""
+
 CHECK_WRITING = "Check the folder, its permissions and the space on the disk"
 """Remedy for a file that cannot be written."""
 

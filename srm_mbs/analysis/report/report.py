@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import srm_mbs
 from srm_mbs.analysis.accuracy.certificate import Certificate, certify
 from srm_mbs.analysis.report.html import paragraph, text
 from srm_mbs.analysis.report.sections import (
@@ -23,7 +22,7 @@ from srm_mbs.analysis.report.sections import (
     pictures_section,
     run_section,
 )
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, __version__
 from srm_mbs.simulation.result import Solution
 from srm_mbs.visualization.animation.page import filled, write_page
 
@@ -128,7 +127,7 @@ def check_pictures(kinds: Sequence[str]) -> None:
 
 def _about() -> str:
     today = datetime.date.today().isoformat()
-    words = f"Written on {today} by srm_mbs {srm_mbs.__version__}, which simulates mechanisms with"
+    words = f"Written on {today} by srm_mbs {__version__}, which simulates mechanisms with"
     return paragraph(
         f"{words} closed kinematic loops. Units are SI; angles are in radians.", "about"
     )

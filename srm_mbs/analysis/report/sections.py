@@ -34,7 +34,7 @@ from srm_mbs.simulation.result import Solution
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import NAMED_LOOPS
 from srm_mbs.visualization.animation.playback import page_of
-from srm_mbs.visualization.animation.snapshot import still_picture
+from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from srm_mbs.visualization.plotting.figure import (
     FONT_SIZE,
     line_styles,
@@ -147,7 +147,7 @@ def mechanism_section(solution: Solution) -> str:
     start = solution.span[0]
     still = ""
     try:
-        data = still_picture(solution, start)
+        data = draw_snapshot(solution, start)
         caption = f"The mechanism at the start of the run, t = {start:.6g} s."
         words = f"Drawing of the bodies of {mechanism.name} at the start of the run"
         still = picture(data, "image/png", words, caption)

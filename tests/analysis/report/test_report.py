@@ -24,7 +24,7 @@ from srm_mbs.cli.app import app
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.visualization.animation.shapes import ANCHOR_COLOUR
-from srm_mbs.visualization.animation.snapshot import still_picture
+from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import LARGE, opened
 from tests.support.bundled import load
 
@@ -243,9 +243,9 @@ def test_tables_of_nothing_are_left_out() -> None:
 # --- the still picture ---------------------------------------------------------------------------
 
 
-def test_the_still_picture_shows_a_sphere_as_large_as_the_camera_sees_it(tmp_path: Path) -> None:
+def test_the_draw_snapshot_shows_a_sphere_as_large_as_the_camera_sees_it(tmp_path: Path) -> None:
     run = srm.simulate(load("simple_pendulum"), 0.1)
-    picture = Image.open(io.BytesIO(still_picture(run, 0.0))).convert("RGB")
+    picture = Image.open(io.BytesIO(draw_snapshot(run, 0.0))).convert("RGB")
     pixels = np.asarray(picture, dtype=float)
     assert picture.width == 900
     drawn = (pixels < 250.0).any(axis=2)
@@ -282,7 +282,7 @@ def two_shapes(folder: Path, *visuals: str) -> srm.Solution:
 
 def seen(run: srm.Solution, t: float = 0.0) -> Any:
     """Pixels (height, width, 3) of the still picture, 0 to 255."""
-    picture = Image.open(io.BytesIO(still_picture(run, t))).convert("RGB")
+    picture = Image.open(io.BytesIO(draw_snapshot(run, t))).convert("RGB")
     return np.asarray(picture, dtype=float)
 
 
@@ -342,7 +342,7 @@ def test_a_spring_around_a_rod_is_the_coil_of_the_page_and_leaves_the_rod_in_sig
     assert 0.5 * without.sum() < around.sum() < 0.95 * without.sum()
 
 
-def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_still_picture() -> None:
+def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_draw_snapshot() -> None:
     pendulum = load("simple_pendulum").model
     model = pin.Model()
     track = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "track")
@@ -355,7 +355,7 @@ def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_still_picture() -
 
 
 @pytest.mark.parametrize("t", [0.0, 0.5])
-def test_the_bob_stands_in_the_still_picture_where_kinematics_puts_it(t: float) -> None:
+def test_the_bob_stands_in_the_draw_snapshot_where_kinematics_puts_it(t: float) -> None:
     run = srm.simulate(load("simple_pendulum"), 1.0)
     _, columns = np.nonzero(coloured(seen(run, t), (0.902, 0.624, 0.0)))
     angle = run(t)[0][0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import time
@@ -23,7 +24,6 @@ from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays
 from srm_mbs.visualization.animation.page import (
     DRIFT,
     ENERGY,
-    as_json,
     drift_unit,
     make_page,
     page_data,
@@ -189,7 +189,7 @@ class LiveView:
         picture = make_picture(solution, 60.0, OverlayOptions(**drawn))
         data = page_data(solution, picture)
         with answered(self.visualizer.window, REPLY_TIME, SERVER_GONE_REMEDY):
-            self.visualizer["/about"].set_property("about", as_json(data))
+            self.visualizer["/about"].set_property("about", json.dumps(data, allow_nan=False))
             draw_picture(self._meshcat, self.visualizer, picture)
 
     def wait(self) -> None:

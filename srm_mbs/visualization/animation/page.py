@@ -7,11 +7,9 @@
 from __future__ import annotations
 
 import base64
-import html
-import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,38 +161,35 @@ def make_page(
         that it comes from.
     """
     root = Path(meshcat.servers.zmqserver.VIEWER_ROOT)
-    parts = {
-        "title": html.escape(title),
-        "viewer": (root / "main.min.js").read_text(encoding="utf-8"),
-        "commands": json.dumps(None if commands is None else _packed(commands)),
-        # Names are the user's: they must not end the script.
-        "about": as_json(data).replace("<", "\\u003c"),
-        "script": (FOLDER / "page.js").read_text(encoding="utf-8"),
-    }
-    return filled("page.html", parts)
+    return render(
+        FOLDER,
+        "page.html.j2",
+        title=title,
+        viewer=(root / "main.min.js").read_text(encoding="utf-8"),
+        commands=None if commands is None else _packed(commands),
+        data=data,
+        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
+    )
 
 
-def filled(template: str, parts: Mapping[str, str]) -> str:
-    """A file of the folder ``page`` with each mark ``@name@`` replaced by what it stands for.
+def render(folder: Path, template: str, **values: Any) -> str:
+    """A Jinja2 template of ``folder``, filled with ``values``.
 
-    Parameters
-    ----------
-    template
-        Name of the file.
-    parts
-        What is put in, in the order of the marks.
+    Values are escaped as HTML, or as JavaScript by the filter ``tojson``: names in them are the
+    user's.
     """
-    page = (FOLDER / template).read_text(encoding="utf-8")
-    # The last first: what is put in may itself hold marks.
-    for name in reversed(list(parts)):
-        before, after = page.split(f"@{name}@", 1)
-        page = before + parts[name] + after
-    return page
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-
-def as_json(data: dict[str, Any]) -> str:
-    """``data`` of :func:`make_page` as text."""
-    return json.dumps(data, allow_nan=False)
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
+    return environment.get_template(template).render(values)
 
 
 def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:

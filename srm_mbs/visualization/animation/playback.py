@@ -7,7 +7,6 @@ so that the browser plays the motion in real time and its time slider scrubs thr
 from __future__ import annotations
 
 import atexit
-import html
 import logging
 import math
 import sys
@@ -23,7 +22,13 @@ from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
 from srm_mbs.visualization.animation.overlays import OverlayOptions
-from srm_mbs.visualization.animation.page import make_page, page_data, write_page
+from srm_mbs.visualization.animation.page import (
+    FOLDER,
+    make_page,
+    page_data,
+    render,
+    write_page,
+)
 from srm_mbs.visualization.animation.scene import Picture, make_picture
 from srm_mbs.visualization.animation.server import SERVERLESS, start_server
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
@@ -313,10 +318,7 @@ class Embedded:
     height: int
 
     def _repr_html_(self) -> str:
-        return (
-            f'<iframe srcdoc="{html.escape(self.page)}" title="animation" width="100%" '
-            f'height="{self.height}" style="border: 0"></iframe>'
-        )
+        return render(FOLDER, "notebook.html.j2", page=self.page, height=self.height)
 
 
 def show_in_notebook(

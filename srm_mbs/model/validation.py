@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dpotrf
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import finite_numbers
+from srm_mbs.model.numbers import finite_array, finite_numbers
 
 NO_INERTIA = 1e-13
 """An articulated inertia below this fraction of the composite one is the rounding of zero."""
@@ -201,26 +201,23 @@ def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, Float
     InputError
         If a shape does not fit, a number is not finite, or a quaternion is not of unit length.
     """
-    q0 = _frozen_array(q0, (model.nq,), "q0")
+    q0 = _frozen_array(q0, model.nq, "q0")
     if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
         raise InputError(
             "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
             element="q0",
             remedy="Use pinocchio.normalize(model, q0)",
         )
-    return q0, _frozen_array(v0, (model.nv,), "v0")
+    return q0, _frozen_array(v0, model.nv, "v0")
 
 
-def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if array.shape != shape or not np.isfinite(array).all():
+def _frozen_array(values: Any, size: int, name: str) -> FloatArray:
+    array = finite_array(values, (size,))
+    if array is None:
         raise InputError(
-            f"{what} has shape {array.shape} or does not consist of finite numbers",
-            element=what,
-            remedy=f"Give {shape[0]} finite numbers",
+            f"{name} does not consist of {size} finite numbers",
+            element=name,
+            remedy=f"Give {size} finite numbers",
         )
     array.setflags(write=False)
     return array

@@ -15,7 +15,7 @@ import json
 import logging
 import zipfile
 from contextlib import nullcontext
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -37,12 +37,12 @@ from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.srm import SRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
-from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
-from srm_mbs.model.forces import FORCE_TYPES, ForceElement
-from srm_mbs.model.laws import LAW_TYPES, Curve, Law
+from srm_mbs.model.forces import FORCE_TYPES
+from srm_mbs.model.laws import Curve
 from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.model.serialisation import force_from_plain, force_to_plain, from_plain, to_plain
 from srm_mbs.simulation.result import ATTEMPT, Request, Settings, Solution, Statistics
 from srm_mbs.simulation.segmented_result import SegmentedSolution
 
@@ -149,11 +149,9 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
             "name": mechanism.name,
             "source": None if mechanism.source is None else asdict(mechanism.source),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
-            "loops": [asdict(loop) for loop in mechanism.loops],
-            "forces": [
-                {"type": f.type} | _values(f) for f in mechanism.forces if f.type in FORCE_TYPES
-            ],
-            "drives": [_values(drive) for drive in mechanism.drives],
+            "loops": [to_plain(loop) for loop in mechanism.loops],
+            "forces": [force_to_plain(f) for f in mechanism.forces if f.type in FORCE_TYPES],
+            "drives": [to_plain(drive) for drive in mechanism.drives],
             "drive_starts": _drive_starts(solution),
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
@@ -206,40 +204,6 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
         log.info("written: %s", path)
 
 
-def _loop(entry: dict[str, Any]) -> LoopClosure:
-    anchors = {side: Anchor(**entry[side]) for side in "ab" if entry[side] is not None}
-    return LoopClosure(**entry | anchors)
-
-
-def _entry(value: Any) -> Any:
-    """A description of laws, anchors and numbers as JSON has it; laws with their type."""
-    if isinstance(value, Law):
-        return {"type": value.type} | asdict(value)  # type: ignore[call-overload]
-    if isinstance(value, Anchor):
-        return asdict(value)
-    return [_entry(part) for part in value] if isinstance(value, tuple) else value
-
-
-def _from_entry(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(_from_entry(part) for part in value)
-    if not isinstance(value, dict):
-        return value
-    if "type" not in value:
-        return Anchor(**value)
-    values = dict(value)
-    return LAW_TYPES[values.pop("type")](**values)
-
-
-def _values(element: Any) -> dict[str, Any]:
-    return {key.name: _entry(getattr(element, key.name)) for key in fields(element)}
-
-
-def _force(entry: dict[str, Any]) -> ForceElement:
-    values = {key: _from_entry(value) for key, value in entry.items() if key != "type"}
-    return FORCE_TYPES[entry["type"]](**values)
-
-
 def _drive_starts(solution: Solution) -> dict[str, float] | None:
     """The driven coordinates at t = 0 of a run that starts later: its q0 does not have them."""
     if solution.span[0] == 0.0:
@@ -255,10 +219,6 @@ def _drive_curves(drives: tuple[Drive, ...], starts: dict[str, float]) -> dict[s
     return curves
 
 
-def _drive(entry: dict[str, Any]) -> Drive:
-    return Drive(**{key: _from_entry(value) for key, value in entry.items()})
-
-
 def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:
     if entry["source"] is not None:
         source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
@@ -269,11 +229,11 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         model.loadFromString(entry["model"])
     mechanism = Mechanism(
         model,
-        tuple(_loop(loop) for loop in entry["loops"]),
+        tuple(from_plain(LoopClosure, loop) for loop in entry["loops"]),
         q0=arrays["q0"],
         v0=arrays["v0"],
-        forces=tuple(_force(force) for force in entry["forces"]),
-        drives=tuple(_drive(drive) for drive in entry["drives"]),
+        forces=tuple(force_from_plain(force) for force in entry["forces"]),
+        drives=tuple(from_plain(Drive, drive) for drive in entry["drives"]),
         friction_speed=entry["friction_speed"],
         name=entry["name"],
         source=source,

@@ -111,7 +111,9 @@ class UserForce(ForceElement):
             )
 
 
-def quantity(unit: str, default: Any, *, lowest: float = -np.inf, count: int = 0) -> Any:
+def quantity(
+    unit: str, default: Any, *, lowest: float = -np.inf, count: int = 0, needed: bool = False
+) -> Any:
     """A numerical field of a force element; :func:`take_quantities` checks and stores it.
 
     Parameters
@@ -124,8 +126,11 @@ def quantity(unit: str, default: Any, *, lowest: float = -np.inf, count: int = 0
         The least value.
     count
         Length of a list of numbers; 0: one number.
+    needed
+        Whether a description must give it, because the element refuses the default.
     """
-    return field(default=default, metadata={"unit": unit, "lowest": lowest, "count": count})
+    facts = {"unit": unit, "lowest": lowest, "count": count, "needed": needed}
+    return field(default=default, metadata=facts)
 
 
 def fault(force: ForceElement, problem: str, remedy: str) -> InputError:
@@ -506,7 +511,7 @@ class LimitSpring(ForceElement):
     type: ClassVar[str] = "limit_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = quantity("N m/rad, N/m", 0.0, lowest=0.0)
+    stiffness: float = quantity("N m/rad, N/m", 0.0, lowest=0.0, needed=True)
     damping: float = quantity("N m s/rad, N s/m", 0.0, lowest=0.0)
     lower: float | None = quantity("rad, m", None)
     upper: float | None = quantity("rad, m", None)

@@ -9,6 +9,9 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
+LARGEST_MAGNITUDE = 1e30
+"""Of a number in a file, in SI units: the squares of larger ones may overflow in sums."""
+
 
 def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> FloatArray | None:
     """``values`` as a new array; None unless it is real, finite and of that shape.

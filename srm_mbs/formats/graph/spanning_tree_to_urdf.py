@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import pinocchio as pin
@@ -108,8 +108,8 @@ def _joint(robot: Element, joint: Joint, child: str) -> None:
         SubElement(node, "dynamics", acting)
 
 
-def urdf_text(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> str:
-    """Text of a URDF.
+def urdf_tree(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> Element:
+    """Root element of a URDF.
 
     A link keeps the frame that the file gave it.  Where the joint that carries it is elsewhere,
     a massless link stands at the joint, and the link is fixed to that.
@@ -144,8 +144,7 @@ def urdf_text(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> str
             _joint(robot, joint, frame)
             held = Joint(frame + "::fixed", "fixed", frame, joint.child, back)
             _joint(robot, held, joint.child)
-    indent(robot)
-    return tostring(robot, encoding="unicode") + "\n"
+    return robot
 
 
 CLOSURE_OF = {
@@ -348,9 +347,9 @@ class GraphTranslator:
             entries["loop"] = loops
         if forces:
             entries["force"] = forces
-        self._tell(tree)
-        urdf = urdf_text(self.name, self.bodies.values(), tree.joints)
-        return Translation(urdf, entries, tuple(self.notes))
+        self._add_notes(tree)
+        urdf = urdf_tree(self.name, self.bodies.values(), tree.joints)
+        return Translation(urdf, entries=entries, notes=tuple(self.notes))
 
     def _rooted(self) -> tuple[str, str]:
         """Base and root body; bodies that hang on nothing get a floating joint to the ground."""
@@ -442,7 +441,7 @@ class GraphTranslator:
             }
         ]
 
-    def _tell(self, tree: SpanningTree) -> None:
+    def _add_notes(self, tree: SpanningTree) -> None:
         if tree.cut:
             names = ", ".join(repr(joint.name) for joint in tree.cut)
             self.notes.append(f"the joints {names} close loops: they are cut and became closures")

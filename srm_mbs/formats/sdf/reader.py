@@ -7,7 +7,7 @@ file form a graph; :mod:`srm_mbs.formats.graph.joint_graph` says which of them a
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -16,6 +16,7 @@ from xml.etree.ElementTree import Element
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.sdf.joints import JointReader
@@ -30,7 +31,7 @@ from srm_mbs.formats.sdf.links import (
     read_link,
 )
 from srm_mbs.formats.translation import Options, Translation
-from srm_mbs.formats.xml import XmlValues, parse_urdf
+from srm_mbs.formats.xml import XmlValues, parse_xml
 from srm_mbs.model.anchors import WORLD
 
 OLDEST, NEWEST = (1, 3), (1, 12)
@@ -232,7 +233,7 @@ class SdfReader:
         if scope.depth >= DEEPEST:
             raise values.fault(where, f"more than {DEEPEST} files include each other", "Break it")
         path, text = self._included(uri, scope.file, where)
-        root = self.parsed(text, str(path))
+        root = self.checked(parse_xml(text, str(path)), str(path))
         model = root.find("model")
         if model is None:
             raise values.fault(where, f"{str(path)!r} holds no <model>", "Include a model")
@@ -283,9 +284,8 @@ class SdfReader:
 
     # Files ----------------------------------------------------------------------------------
 
-    def parsed(self, text: str, file: str) -> Element:
-        """Root element of an SDF file."""
-        root = parse_urdf(text, file)
+    def checked(self, root: Element, file: str) -> Element:
+        """The root element of an SDF file."""
         self.values.check_depth(root)
         if root.tag != "sdf":
             raise InputError(
@@ -307,10 +307,10 @@ class SdfReader:
             )
         return found
 
-    def read(self, text: str) -> tuple[str, str, dict[str, Any]]:
+    def read(self, root: Element) -> tuple[str, str, dict[str, Any]]:
         """Read the whole file: its name, the root link, and entries that are no loops."""
         file = self.values.file
-        root = self.parsed(text, file)
+        self.checked(root, file)
         version = self.version(root, file)
         self.values.attributes(root, "<sdf>", ("version",))
         self.values.children(root, "<sdf>", ("model", "world"), ("actor", "light"))
@@ -370,13 +370,13 @@ def _of_folder(folder: Path) -> Path:
     return folder / "model.sdf"
 
 
-def translate(text: str, file: str, options: Options) -> Translation:
+def translate(document: Document, options: Options) -> Translation:
     """Translate an SDF file.
 
     Parameters
     ----------
-    text, file
-        The file and its path, for messages and for what it includes.
+    document
+        The file; its path is also where the files that it includes are searched.
     options
         The joints to cut; none: chosen by :mod:`srm_mbs.formats.graph.joint_graph`.
 
@@ -385,8 +385,9 @@ def translate(text: str, file: str, options: Options) -> Translation:
     InputError
         Naming the file, the element and the remedy.
     """
+    file = document.file
     reader = SdfReader(file)
-    name, root, entries = reader.read(text)
+    name, root, entries = reader.read(document.xml)
     couplings = reader.reader.couplings()
     reader.static()
     where = {link: reader.frames.placement(link, f"link {link!r}") for link in reader.bodies}
@@ -396,4 +397,4 @@ def translate(text: str, file: str, options: Options) -> Translation:
     entries |= made.entries
     if couplings:
         entries["loop"] = [*entries.get("loop", ()), *couplings]
-    return Translation(made.urdf, entries, (*made.notes, *reader.values.notes()))
+    return replace(made, entries=entries, notes=(*made.notes, *reader.values.notes()))

@@ -20,18 +20,17 @@ URDF does not say the type: the origins are joined, with a note.
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf import loop_elements
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
 from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
-from srm_mbs.formats.xml import parse_urdf
 
 CLOSING = re.compile(r"(closing_.+)_1\Z")
 
@@ -81,16 +80,16 @@ def closing_frames(
     return loops, notes
 
 
-def translate(text: str, file: str, options: Options) -> Translation:
-    """The URDF ``text`` without its loops, and these as entries of a description.
+def translate(document: Document, options: Options) -> Translation:
+    """A URDF without its loops, and these as entries of a description.
 
     Raises
     ------
     InputError
         Naming the element that cannot be read.
     """
-    root = parse_urdf(text, file)
-    elements = LoopElements(file, Graph(root))
+    root = document.xml
+    elements = LoopElements(document.file, Graph(root))
     notes: list[str] = []
     found = _cut_second_parents(root, elements, options, notes)
     elements.graph = graph = Graph(root)
@@ -106,11 +105,9 @@ def translate(text: str, file: str, options: Options) -> Translation:
     if elements.forces:
         entries["force"] = _named(elements.forces, options.own.get("force", ()))
     if found:
-        # Otherwise the check of the tree counts the same again.
+        elements.named(root, "joint")
         notes += elements.ignored_notes()
-        ET.indent(root)
-        text = ET.tostring(root, encoding="unicode") + "\n"
-    return Translation(text, entries, tuple(notes))
+    return Translation(root, "" if found else document.text, entries, tuple(notes))
 
 
 def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
@@ -140,7 +137,7 @@ def _cut_second_parents(
     """Take the joints out that close loops, their closures into ``reader``; whether there were
     any."""
     by_child: dict[str, list[Element]] = {}
-    for joint in reader.named(root, "joint").values():
+    for joint in reader.named(root, "joint", count=False).values():
         child = link_of(joint, "child")
         if child and link_of(joint, "parent"):
             by_child.setdefault(child, []).append(joint)

@@ -19,7 +19,6 @@ import pinocchio as pin
 from srm_mbs.errors import InputError
 from srm_mbs.formats.urdf.joint_types import take_extended, with_joints
 from srm_mbs.formats.urdf.validation import UrdfChecker
-from srm_mbs.formats.xml import parse_urdf
 
 log = logging.getLogger(__name__)
 
@@ -48,20 +47,21 @@ ROOT_JOINTS: dict[str, Callable[[], Any] | None] = {
 
 
 def build_urdf(
-    text: str,
+    root: Element,
     file: str,
     base: str,
     locked: Sequence[str] = (),
     counting_turns: Collection[str] = (),
 ) -> UrdfModel:
-    """Check ``text`` and build its tree on a fixed, floating or planar base.
+    """Check a URDF and build its tree on a fixed, floating or planar base.
 
     Inertias are checked by :func:`~srm_mbs.model.validation.check_inertia`, after locking.
 
     Parameters
     ----------
-    text, file
-        The URDF and its name for messages.
+    root, file
+        Root element of the URDF, which is reduced to what Pinocchio is to read, and the name of the
+        file for messages.
     base
         ``fixed``, ``floating`` (root joint ``root_joint``, a free flyer) or ``planar`` (motion in
         the x-y plane of the world).
@@ -77,7 +77,6 @@ def build_urdf(
         Naming the file, the element and the remedy.
     """
     checker = UrdfChecker(file)
-    root = parse_urdf(text, file)
     checker.check(root, base, locked)
     unlimited = _without_limits(root, set(counting_turns) - set(locked))
     armature = _armature(root)

@@ -1,15 +1,9 @@
-"""What a URDF says, checked before Pinocchio reads it.
+"""Check of a URDF before Pinocchio reads it.
 
-Pinocchio's parser drops what it does not know without a word: unknown elements, a second joint
-with the same child, a whole <inertial> whose numbers are separated by a newline.
-Everything that would change the mechanism is therefore checked on the XML, and what is left of it
-holds nothing but what was checked, with the numbers written afresh.
-
-Elements and attributes of URDF: what is read, what is ignored knowingly, what is refused.
-
-Elements, attributes and numbers of a URDF: the unknown is refused, the ignored is counted.
-
-The joints of a URDF, one by one: type, axes, limits, damping and friction.
+Pinocchio's parser drops unknown content without a message: unknown elements, a second joint with
+the same child, a whole <inertial> whose numbers are separated by a newline.  Everything that would
+change the mechanism is therefore checked on the XML.  Unknown elements and attributes are refused,
+ignored ones are counted and removed; what remains has its numbers written afresh.
 """
 
 from __future__ import annotations
@@ -22,11 +16,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from srm_mbs.errors import InputError, SrmWarning
-from srm_mbs.formats.toml.schema import LARGEST
+from srm_mbs.errors import SrmWarning
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import NUMBER
+from srm_mbs.formats.xml import XmlFile
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
 IGNORED = {
@@ -84,42 +78,27 @@ DRAWN_ONLY = ("material", "visual", "collision")
 """Elements whose loss needs no note: they do not act."""
 
 
-class ElementChecker:
-    """What every check of elements and attributes needs; faults are :class:`InputError`."""
+class ElementChecker(XmlFile):
+    """Checks of elements and attributes of a URDF; faults are :class:`InputError`."""
 
     def __init__(self, file: str) -> None:
-        self.file = file
+        super().__init__(file)
         self.notes: list[str] = []
-        self.ignored: dict[str, int] = {}
-
-    def fault(self, element: str, problem: str, remedy: str) -> InputError:
-        return InputError(problem, file=self.file, element=element, remedy=remedy)
 
     def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
         """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
-        text = node.get(key)
-        parts = (text or "").split()
-        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
         # Limits do not act, and exporters write the largest double there.
-        largest = sys.float_info.max if node.tag == "limit" else LARGEST
-        if len(values) != count or not all(abs(value) <= largest for value in values):
-            tag = node.tag.rsplit("}", 1)[-1]
-            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
-            raise self.fault(
-                where,
-                f"<{tag}> has no {key!r}"
-                if text is None
-                else f"<{tag} {key}={text!r}> is not {wanted}",
-                f"Write {wanted}",
-            )
-        node.set(key, " ".join(map(repr, values)))
-        return values
+        largest = sys.float_info.max if node.tag == "limit" else LARGEST_MAGNITUDE
+        return self.attribute_numbers(node, key, count, where, largest)
 
-    def attributes(self, node: Element, where: str) -> None:
+    def attributes(self, node: Element, where: str, count: bool = True) -> None:
+        """Refuse unknown attributes; count and remove those that are ignored, or leave them."""
         known = ATTRIBUTES.get(node.tag)
         ignored = INFORMATIVE.get(node.tag, ())
         for key in list(node.attrib):
             if key in ignored:
+                if not count:
+                    continue
                 self.ignore(f"<{node.tag} {key}> attribute")
                 del node.attrib[key]
             elif known is not None and key not in known:
@@ -128,15 +107,6 @@ class ElementChecker:
                     f"<{node.tag}> has an unknown attribute {key!r}",
                     f"Known: {', '.join(known)}",
                 )
-
-    def ignore(self, what: str) -> None:
-        self.ignored[what] = self.ignored.get(what, 0) + 1
-
-    def ignored_notes(self) -> tuple[str, ...]:
-        """What was ignored, one sentence for each kind."""
-        return tuple(
-            f"{count} {what}(s) do not act and are ignored" for what, count in self.ignored.items()
-        )
 
     def children(self, node: Element, where: str) -> None:
         """Refuse unknown elements of ``node``; count and remove those that are ignored."""
@@ -202,10 +172,11 @@ class ElementChecker:
                     "Put <mass> and <inertia> into the <inertial> of the link",
                 )
 
-    def named(self, root: Element, tag: str) -> dict[str, Element]:
+    def named(self, root: Element, tag: str, count: bool = True) -> dict[str, Element]:
+        """The elements of that tag by name; ``count`` as for :meth:`attributes`."""
         found: dict[str, Element] = {}
         for node in root.findall(tag):
-            self.attributes(node, f"<{tag}>")
+            self.attributes(node, f"<{tag}>", count)
             name = node.get("name")
             if not name:
                 raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')

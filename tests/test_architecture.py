@@ -54,6 +54,7 @@ LAYERS = (
     ("cli_output",),
     ("cli_analysis", "cli_playback", "cli_plots", "cli_report"),
     ("cli",),
+    ("__main__",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(

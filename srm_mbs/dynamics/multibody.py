@@ -30,7 +30,11 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.row_algebra import (
+    GRAPH_ORDER_ABOVE,
+    coordinate_parents,
+    graph_order,
+)
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
@@ -369,7 +373,7 @@ class ClosedSystem(Mechanics):
 
     def _graph_order(self) -> tuple[int, ...]:
         """The rows in use along the graph of the loops, if there are many coordinates."""
-        if self.nv <= LARGE:  # not worth asking for
+        if self.nv <= GRAPH_ORDER_ABOVE:  # not worth asking for
             return ()
         return graph_order(self.loops.pattern(), coordinate_parents(self.model))
 

@@ -67,7 +67,7 @@ def _description(n: int) -> str:
         "# Benchmark A02 of the IFToMM Library of Computational Benchmark Problems. It starts with",
         "# upright cranks, the first crank tip at 1 m/s in +x.",
         f"# Singular when the cranks are horizontal: then {n + 1} degrees of freedom, not 1.",
-        "# Written by srm_mbs.formats.generators.n_four_bar.",
+        "# Written by srm_mbs.n_four_bar.",
         "format = 1",
         f'name = "n_four_bar_{n}"',
         f'urdf = "../urdf/n_four_bar_{n}.urdf"',
@@ -102,7 +102,7 @@ def _urdf(n: int) -> str:
     lines = [
         '<?xml version="1.0"?>',
         f"<!-- N-four-bar, N = {n} (IFToMM A02); models/n_four_bar_{n}.toml closes its loops.",
-        "     Written by srm_mbs.formats.generators.n_four_bar. -->",
+        "     Written by srm_mbs.n_four_bar. -->",
         f'<robot name="n_four_bar_{n}">',
     ]
     for material, rgba in MATERIALS:

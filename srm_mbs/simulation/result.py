@@ -526,5 +526,5 @@ class Solution(RunOutcome, AnimationMixin):
         return (
             f"Solution({self.mechanism.name!r}, t={self.t[0] if len(self.t) else 0:.6g}.."
             f"{self.t[-1] if len(self.t) else 0:.6g} s, {len(self.t)} points, "
-            f"{self.stats.steps} steps, {self.status})"
+            f"{self.stats.steps} steps, {self.status}, {self.settings.backend})"
         )

@@ -326,8 +326,9 @@ def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]
+    chosen += ["--backend", srm.backend()]
     run = subprocess.run(
-        [sys.executable, "-m", "srm_mbs.cli.app", "benchmark", *arguments, *chosen],
+        [sys.executable, "-m", "srm_mbs.cli", "benchmark", *arguments, *chosen],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -40,7 +40,7 @@ def run(*args: object, status: int = 0) -> str:
 
 
 def command(*args: object) -> list[str]:
-    return [sys.executable, "-m", "srm_mbs.cli.app", *map(str, args)]
+    return [sys.executable, "-m", "srm_mbs.cli", *map(str, args)]
 
 
 def run_apart(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -143,7 +143,7 @@ def test_help_loads_nothing_heavy() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
     loaded = set(done.stdout.split())
-    assert "srm_mbs.cli.app" in loaded
+    assert "srm_mbs.cli" in loaded
     assert not loaded & {"numpy", "scipy", "pinocchio", "matplotlib", "meshcat", "pydantic"}
 
 

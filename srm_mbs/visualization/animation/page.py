@@ -127,7 +127,7 @@ def _rounded(value: float) -> float | None:
 
 log = logging.getLogger(__name__)
 
-FOLDER = Path(__file__).with_name("page")
+FOLDER = Path(__file__).with_name("web")
 
 
 def make_page(

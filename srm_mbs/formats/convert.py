@@ -1,4 +1,4 @@
-"""``convert``: a file of any format as our description with its URDF beside it."""
+"""``convert``: a file of any format as a TOML description with its URDF."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def convert(
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
 
-    What is written is the translation that :func:`srm_mbs.load` makes, not the assembled state.
+    The files contain the translation that :func:`srm_mbs.load` makes, not the assembled state.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from srm_mbs.formats.xml import parse_xml, root_tag
 
 
 class Document:
-    """Text of a file, and what it parses to.
+    """Text of a file, and the results of parsing it.
 
     Parameters
     ----------

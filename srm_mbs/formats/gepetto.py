@@ -171,7 +171,7 @@ def _urdf_beside(path: Path) -> Path:
 
 
 def _retype(joint: Element, name: str, kind: str, file: str) -> bool:
-    """Give ``joint`` the type that the YAML says; whether it is to be held instead."""
+    """Give ``joint`` the type in the YAML file; True if it is to be locked instead."""
     old = joint.get("type")
     if old not in REPLACEABLE:
         raise _fault(

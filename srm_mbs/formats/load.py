@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Overrides:
-    """Arguments of :func:`load` that replace what the file says; None: the file's."""
+    """Arguments of :func:`load` that replace values of the file; None: the file's."""
 
     gravity: Sequence[float] | None = None
     base: str | None = None
@@ -207,8 +207,8 @@ def load(
     ----------
     path
         Name of a bundled mechanism (:func:`bundled_models`; ``n_four_bar_<N>`` for any N), or a
-        file: a ``.toml`` description, or one of the formats of ``docs/formats.md``, which is
-        found out by its content.
+        file: a ``.toml`` description, or one of the formats of ``docs/formats.md``, recognised by
+        its content.
     gravity : (3,) m/s^2
         Instead of the file's.
     base

@@ -32,7 +32,7 @@ ACTING = (
     "tendon",
 )
 """Words in the names of other tools' elements that act, such as ``drake:rotor_inertia``."""
-DEEPEST = 300
+LARGEST_NESTING = 300
 """Largest depth of nested elements."""
 NAMESPACED = re.compile(r"\{[^}]*\}")
 
@@ -113,7 +113,7 @@ class XmlValues(XmlFile):
         self._remarks: dict[str, list[str]] = {}
 
     def remark(self, what: str, where: str) -> None:
-        """Note what was assumed or approximated at ``where``; one sentence lists the places."""
+        """Note an assumption or approximation at ``where``; one sentence lists all places."""
         self._remarks.setdefault(what, []).append(where)
 
     def notes(self) -> tuple[str, ...]:
@@ -167,10 +167,10 @@ class XmlValues(XmlFile):
         """Refuse elements in each other deeper than the readers, which recurse, can follow."""
         level, depth = [root], 0
         while level:
-            if depth > DEEPEST:
+            if depth > LARGEST_NESTING:
                 raise self.fault(
                     f"<{level[0].tag}>",
-                    f"more than {DEEPEST} elements are nested",
+                    f"more than {LARGEST_NESTING} elements are nested",
                     "Write such a long chain as a URDF, which is flat",
                 )
             level = [child for node in level for child in node]

@@ -15,7 +15,7 @@ A new type made of these is one more entry of :data:`CLOSURE_TYPES`; its Jacobia
 :math:`\dot G v`, its reactions and its assembly follow from the kinds of row.
 
 The fields of :class:`LoopClosure` are the one list of the keys of a closure: descriptions
-(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.model.serialisation`) read them.
+(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class ClosureType:
     rows
         Its rows.
     summary
-        What it is, in a few words.
+        A short description.
     """
 
     name: str
@@ -434,7 +434,7 @@ class LoopClosure:
 
     @property
     def kind(self) -> ClosureType:
-        """Its type: what it needs, and its rows."""
+        """Its type."""
         return self.type if isinstance(self.type, ClosureType) else CLOSURE_TYPES[self.type]
 
     @property
@@ -517,7 +517,7 @@ class LoopClosure:
                 )
 
     def measured(self, model: pin.Model, q: FloatArray) -> LoopClosure:
-        """The same closure with a length that was not given taken from the configuration q (nq,).
+        """The same closure, with a length that is not given measured at the configuration q (nq,).
 
         Raises
         ------

@@ -5,7 +5,7 @@ The functions at the top collect the laws over time of a mechanism: until when t
 where they are not smooth.
 
 The fields of :class:`Drive` are the one list of the keys of a drive: descriptions
-(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.model.serialisation`) read them.
+(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def knots_between(laws: Sequence[NamedLaw], t0: float, t_end: float) -> tuple[fl
     return tuple(sorted(knot for knot in times if t0 < knot < t_end))
 
 
-HAS_VALUES = (Table, Polynomial, Sine)
+LAWS_WITH_VALUES = (Table, Polynomial, Sine)
 """Laws with a value s(0) of their own, which can prescribe positions."""
 
-NOMINAL = 1e-9
+NOMINAL_LENGTH = 1e-9
 """Length (m) of the closure of a driven distance, which the rows of the drive subtract again."""
 
 
@@ -129,7 +129,7 @@ class Drive:
                 "what is driven is not determined",
                 "Give axis = [x, y, z] or distance = true with a and b, and neither with a joint",
             )
-        if self.absolute and not isinstance(self.law, HAS_VALUES):
+        if self.absolute and not isinstance(self.law, LAWS_WITH_VALUES):
             raise self._fault(
                 f"the law {self.law.type!r} starts from the initial value in any case",
                 "Remove absolute",
@@ -146,7 +146,7 @@ class Drive:
         if self.a is None or self.b is None:
             return None
         if self.distance:
-            return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL)
+            return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL_LENGTH)
         x, y, z = self.axis or ()
         return LoopClosure("point_on_plane", self.a, self.b, (x, y, z), self.name)
 

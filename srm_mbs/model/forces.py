@@ -4,7 +4,7 @@
 Torques and wrenches may follow a law over time (:mod:`srm_mbs.model.laws`).
 
 The fields of these classes are the one list of the keys of a force: descriptions
-(:mod:`srm_mbs.formats.toml.schema`), saved runs (:mod:`srm_mbs.model.serialisation`) and tables
+(:mod:`srm_mbs.formats.toml.schema`), saved runs (:mod:`srm_mbs.simulation.storage`) and tables
 read them, with the units, lengths and bounds that :func:`quantity` gives them.
 """
 
@@ -228,7 +228,7 @@ def take_law(force: ForceElement, count: int) -> bool:
     return True
 
 
-OPEN = 1e30
+OPEN_LIMIT = 1e30
 """Joint limits (rad, m) beyond this are open; Pinocchio writes the largest double there."""
 
 
@@ -531,7 +531,9 @@ class LimitSpring(ForceElement):
         joint = moving_joint(self, model, self.joint)
         low = float(model.lowerPositionLimit[joint.idx_q]) if self.lower is None else self.lower
         high = float(model.upperPositionLimit[joint.idx_q]) if self.upper is None else self.upper
-        low, high = (x if abs(x) < OPEN else float(np.copysign(np.inf, x)) for x in (low, high))
+        low, high = (
+            x if abs(x) < OPEN_LIMIT else float(np.copysign(np.inf, x)) for x in (low, high)
+        )
         width = min(high - low, 1.0)
         return low, high, 0.01 * width if self.depth is None else self.depth
 

@@ -8,7 +8,7 @@ so that both backends evaluate the same numbers.  All laws are twice continuousl
 Times at which s''' jumps are called knots; steps end there, so that schemes keep their order.
 
 The fields of these classes are the one list of the keys of a law: descriptions
-(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.model.serialisation`) read them.
+(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
 """
 
 from __future__ import annotations

@@ -14,10 +14,11 @@ import io
 import json
 import logging
 import zipfile
+from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -37,12 +38,12 @@ from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.srm import SRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
-from srm_mbs.model.forces import FORCE_TYPES
-from srm_mbs.model.laws import Curve
+from srm_mbs.model.forces import FORCE_TYPES, ForceElement
+from srm_mbs.model.laws import LAW_TYPES, Curve, Law
 from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
-from srm_mbs.model.serialisation import force_from_plain, force_to_plain, from_plain, to_plain
 from srm_mbs.simulation.result import ATTEMPT, Request, Settings, Solution, Statistics
 from srm_mbs.simulation.segmented_result import SegmentedSolution
 
@@ -202,6 +203,52 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
         np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
     if isinstance(path, Path):
         log.info("written: %s", path)
+
+
+# -- closures, forces and drives: the fields of their classes ---------------------------------
+# An anchor is an object without "type", a law one with its "type"; tuples are lists.
+
+Element = TypeVar("Element")
+
+
+def to_plain(element: Any) -> dict[str, Any]:
+    """The fields of a closure, force or drive as JSON has them."""
+    return {key.name: _plain(getattr(element, key.name)) for key in fields(element)}
+
+
+def force_to_plain(force: ForceElement) -> dict[str, Any]:
+    """:func:`to_plain` of a force, with its type."""
+    return {"type": force.type} | to_plain(force)
+
+
+def from_plain(kind: type[Element], values: Mapping[str, Any]) -> Element:
+    """The element of the class ``kind`` from what :func:`to_plain` made of it."""
+    return kind(**{key: _value(value) for key, value in values.items()})
+
+
+def force_from_plain(values: Mapping[str, Any]) -> ForceElement:
+    """The force from what :func:`force_to_plain` made of it."""
+    rest = {key: _value(value) for key, value in values.items() if key != "type"}
+    return FORCE_TYPES[values["type"]](**rest)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Law):
+        return {"type": value.type} | asdict(value)  # type: ignore[call-overload]
+    if isinstance(value, Anchor):
+        return asdict(value)
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+
+
+def _value(plain: Any) -> Any:
+    if isinstance(plain, list):
+        return tuple(map(_value, plain))
+    if not isinstance(plain, Mapping):
+        return plain
+    if "type" not in plain:
+        return Anchor(**plain)
+    values = dict(plain)
+    return LAW_TYPES[values.pop("type")](**values)
 
 
 def _drive_starts(solution: Solution) -> dict[str, float] | None:

@@ -1009,7 +1009,7 @@ JUSTIFIED = {
     "mimic": re.compile(r"joint '.+', <mimic>: there is no joint '.+'"),  # names without prefix
     "inertia": re.compile(r"link '.+': a principal moment of inertia is negative"),
     "empty": re.compile(r"<robot>: it has no name"),  # an empty file by a failed xacro run
-    "massless": re.compile(r"neither '.+' nor anything behind it has inertia"),
+    "massless": re.compile(r"neither '.+' nor anything that it carries has inertia"),
     "rigid": re.compile(r"nothing in this mechanism can move"),
 }
 

@@ -27,22 +27,24 @@ from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.xml import parse_xml
 
 GRAVITY = "0 0 -9.81"
-DEEPEST = 20
-"""Most files included in each other."""
+LARGEST_INCLUDE_DEPTH = 20
+"""Largest number of files that include each other."""
 FORCES_OFF = ("passive", "spring", "damper", "frictionloss", "constraint")
-"""Flags that would switch off what acts here."""
+"""Flags that would disable forces that this package applies."""
 
 
 def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -> None:
-    """Put the contents of included files in the place of each ``<include>``."""
+    """Replace each ``<include>`` by the contents of its file."""
     for i, child in reversed(list(enumerate(node))):
         if child.tag != "include":
             _expanded(values, child, folder, depth)
             continue
         name = child.get("file", "")
         where = f"<include> {name!r}"
-        if depth >= DEEPEST:
-            raise values.fault(where, f"more than {DEEPEST} files include each other", "Break it")
+        if depth >= LARGEST_INCLUDE_DEPTH:
+            raise values.fault(
+                where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
+            )
         try:
             text = (folder / name).read_text(encoding="utf-8-sig")
         except (OSError, ValueError) as error:
@@ -136,7 +138,7 @@ def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
 
 
 def _mesh_axes(values: MjcfValues, given: dict[str, str], scale: FloatArray, where: str) -> pin.SE3:
-    """Where the axes of a mesh file lie in those of the mesh.
+    """Placement of the axes of a mesh file in those of the mesh.
 
     MuJoCo makes S R^T (x - p) of a vertex x, with the scale S, ``refpos`` p and ``refquat`` R.
     """

@@ -1,7 +1,7 @@
 """SDF (``http://sdformat.org``) to a URDF tree and closures.
 
-Read are models with their links, joints, frames and nested or included models.  The joints of a
-file form a graph; :mod:`srm_mbs.formats.graph.joint_graph` says which of them are cut.
+Models are read with their links, joints, frames and nested or included models.  The joints of a
+file form a graph; :mod:`srm_mbs.formats.graph.joint_graph` chooses those that are cut.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ WORLD_IGNORED = (
 MANY = ("link", "joint", "frame", "model", "include")
 GRAVITY = "0 0 -9.8"
 """SDF's default in a ``<world>``."""
-DEEPEST = 20
-"""Most files included in each other."""
+LARGEST_INCLUDE_DEPTH = 20
+"""Largest number of files that include each other."""
 
 
 @dataclass(frozen=True)
 class _Scope:
-    """Where an element stands: the names around it, its file, and that file's version."""
+    """Context of an element: prefix of its names, its file, and that file's version."""
 
     prefix: str
     file: str
@@ -85,7 +85,7 @@ class SdfReader:
         self.frames = Frames(file)
         self.bodies: dict[str, Body] = {}
         self.fixed: list[str] = []
-        self._has_model = True  # not a world around several
+        self._has_model = True  # and not a world with several
         self.reader = JointReader(self.values, self.frames)
         self._joint_nodes: list[tuple[Element, _Scope]] = []
 
@@ -108,7 +108,7 @@ class SdfReader:
         return placement, child.get("frame" if older else "relative_to", "").strip()
 
     def own_place(self, scope: _Scope) -> PlaceOf:
-        """Reads poses that are relative to what they stand in, and to nothing else."""
+        """A reader of poses that are relative to the enclosing element only."""
 
         def place_of(node: Element, where: str) -> pin.SE3:
             placement, relative_to = self.place(node, where, scope)
@@ -137,7 +137,7 @@ class SdfReader:
     ) -> str:
         """Read a model whose names begin with ``scope.prefix``; returns its canonical link.
 
-        ``around`` is the prefix of what it stands in; ``placed`` the pose of an ``<include>``.
+        ``around`` is the prefix of the enclosing model; ``placed`` the pose of an ``<include>``.
         """
         where = f"model {scope.prefix.removesuffix(SEPARATOR) or node.get('name', '')!r}"
         values = self.values
@@ -176,7 +176,7 @@ class SdfReader:
         return canonical
 
     def nested(self, node: Element, scope: _Scope) -> str:
-        """A model inside a model; its name stands for its own frame outside."""
+        """A model inside a model; outside, its name means its own frame."""
         name = self.name(node, scope)
         inner = _Scope(name + SEPARATOR, scope.file, scope.version, scope.depth)
         canonical = self.model(node, inner, scope.prefix)
@@ -230,8 +230,10 @@ class SdfReader:
         for what in ("merge", "placement_frame"):
             if node.get(what) is not None or node.find(what) is not None:
                 raise values.fault(where, f"{what} is not read by this version", "Remove it")
-        if scope.depth >= DEEPEST:
-            raise values.fault(where, f"more than {DEEPEST} files include each other", "Break it")
+        if scope.depth >= LARGEST_INCLUDE_DEPTH:
+            raise values.fault(
+                where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
+            )
         path, text = self._included(uri, scope.file, where)
         root = self.checked(parse_xml(text, str(path)), str(path))
         model = root.find("model")
@@ -257,7 +259,7 @@ class SdfReader:
         return canonical
 
     def _included(self, uri: str, file: str, where: str) -> tuple[Path, str]:
-        """Path and text of an included file; a folder stands for the model that is in it."""
+        """Path and text of an included file; a folder means the model in it."""
         parts = urlsplit(uri)
         if parts.scheme not in ("", "model", "file") or not uri:
             raise self.values.fault(
@@ -330,7 +332,7 @@ class SdfReader:
         return name, canonical, entries
 
     def world(self, node: Element, scope: _Scope) -> tuple[str, dict[str, Any]]:
-        """A world with models, whose names stand before those of their links."""
+        """A world with models, whose names are prefixes of those of their links."""
         self.values.children(node, "<world>", WORLD_READ, WORLD_IGNORED, MANY)
         self._has_model = False
         models = [self.nested(model, scope) for model in node.findall("model")]
@@ -361,7 +363,7 @@ class SdfReader:
 
 
 def _of_folder(folder: Path) -> Path:
-    """The SDF file of a model's folder: what ``model.config`` names, or ``model.sdf``."""
+    """The SDF file of a model's folder: the one that ``model.config`` names, or ``model.sdf``."""
     config = folder / "model.config"
     if config.is_file():
         found = re.findall(r"<sdf[^>]*>\s*([^<\s]+)\s*</sdf>", config.read_text(encoding="utf-8"))

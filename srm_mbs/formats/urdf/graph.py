@@ -1,4 +1,4 @@
-"""Links and joints of a URDF as a graph: which joint moves which link, and where at q = 0."""
+"""Links and joints of a URDF as a graph, with the placements of the links at q = 0."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def link_of(joint: Element, side: str) -> str:
 
 
 class Graph:
-    """The joints of a URDF; names that are missing or wrong are left to the check of the tree.
+    """The joints of a URDF; the check of the tree refuses missing and wrong names later.
 
     Attributes
     ----------

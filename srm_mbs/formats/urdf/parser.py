@@ -1,8 +1,7 @@
-"""URDF to Pinocchio: the checked tree on its base, and joints that are locked.
+"""From a URDF to a Pinocchio model: the checked tree on its base, and locked joints.
 
-Pinocchio gets a copy of the file that holds nothing but what
-:class:`~srm_mbs.formats.urdf.validation.UrdfChecker` has checked; what is dropped knowingly is
-listed in the notes.
+Pinocchio gets a URDF that contains only what
+:class:`~srm_mbs.formats.urdf.validation.UrdfChecker` has checked; the notes list what was removed.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class UrdfModel:
     model
         Pinocchio's model, with joint damping from the file.
     notes
-        Sentences about what the file holds and this version does not use.
+        Sentences about the contents of the file that are ignored.
     """
 
     model: pin.Model
@@ -110,7 +109,7 @@ def build_urdf(
 
 
 def _armature(root: Element) -> dict[str, float]:
-    """Inertias of motors by joint: an attribute of <dynamics> that URDF does not have."""
+    """Inertias of motors by joint, from ``armature`` of <dynamics>, which URDF does not have."""
     found = {}
     for joint in root.findall("joint"):
         dynamics = joint.find("dynamics")
@@ -146,8 +145,8 @@ def _without_limits(root: Element, names: Collection[str]) -> dict[str, bool]:
 def lock_joints(model: pin.Model, names: list[str], q: Any) -> pin.Model:
     """``model`` without the joints ``names``, frozen at the configuration ``q`` (nq,).
 
-    Pinocchio finds joints by frame name there, and URDF models give links and joints the same
-    names; link frames are renamed while it works.
+    ``pin.buildReducedModel`` finds joints by the names of frames, and in URDF models links and
+    joints may have the same names; link frames are renamed meanwhile.
     """
     working = model.copy()
     mark = "\0link"

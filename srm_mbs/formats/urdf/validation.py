@@ -75,7 +75,7 @@ INFORMATIVE = {
 }
 """Attributes of other tools found in published files: ignored, with a note."""
 DRAWN_ONLY = ("material", "visual", "collision")
-"""Elements whose loss needs no note: they do not act."""
+"""Elements that are removed without a note: they do not act."""
 
 
 class ElementChecker(XmlFile):
@@ -204,8 +204,8 @@ UNIVERSE = "universe"
 """Pinocchio's name for the ground."""
 ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
-PARALLEL = 1e-6
-"""Axes of a universal joint at a smaller angle (rad) are parallel."""
+PARALLEL_AXES_TOLERANCE = 1e-6
+"""Axes of a universal joint at an angle (rad) below this are parallel."""
 
 
 class JointChecker(ElementChecker):
@@ -280,7 +280,7 @@ class JointChecker(ElementChecker):
             axis = joint.find("axis")
             first = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
             second = self.direction(node, where)
-            if np.linalg.norm(np.cross(first, second)) < PARALLEL:
+            if np.linalg.norm(np.cross(first, second)) < PARALLEL_AXES_TOLERANCE:
                 raise self.fault(
                     where, "<axis> and <axis2> are parallel", "Give them different directions"
                 )
@@ -337,17 +337,18 @@ class JointChecker(ElementChecker):
             joint.remove(dynamics)
 
 
-DEEPEST = 1000
-"""Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""
-POINT_LIKE = 1e-18
-"""m^2: a radius of gyration below a nanometre is the rounding of zero."""
+LARGEST_TREE_DEPTH = 1000
+"""Largest number of links between the root and a leaf: Pinocchio's recursive parser overflows the
+stack in deeper trees."""
+POINT_MASS_GYRATION_SQUARED = 1e-18
+"""Square of the radius of gyration (m^2) below which it is rounding: a nanometre."""
 
 
 class UrdfChecker(JointChecker):
     """Walks a URDF once; raises :class:`InputError` at the first fault."""
 
     def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
-        """The whole file; leaves in ``root`` what Pinocchio is to read."""
+        """Check the whole file; ``root`` keeps what Pinocchio is to read."""
         self.root(root)
         for block in root.findall("gazebo"):
             for joint in block.iter("joint"):
@@ -419,7 +420,7 @@ class UrdfChecker(JointChecker):
             self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
         )
         principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_LIKE * value
+        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
         if principal[0] < -rounding:
             raise self.fault(
                 where,
@@ -477,10 +478,10 @@ class UrdfChecker(JointChecker):
             children.setdefault(parent, []).append(child)
         level, depth, loose = roots, 0, set(links)
         while level:
-            if depth > DEEPEST:
+            if depth > LARGEST_TREE_DEPTH:
                 raise self.fault(
                     f"link {level[0]!r}",
-                    f"more than {DEEPEST} joints lie between it and the root link",
+                    f"more than {LARGEST_TREE_DEPTH} joints lie between it and the root link",
                     "Split the chain: Pinocchio cannot read such a deep one",
                 )
             loose -= set(level)

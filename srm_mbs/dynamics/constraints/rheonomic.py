@@ -84,8 +84,10 @@ class DrivenKinematics:
             (
                 first + k,
                 1.0 / float(scale[total - len(ordered) + k]),
-                # The row of a distance is |p| - NOMINAL.
-                curves[drive.name].shifted(-NOMINAL_LENGTH) if drive.distance else curves[drive.name],
+                # The row of a distance is |p| - NOMINAL_LENGTH.
+                curves[drive.name].shifted(-NOMINAL_LENGTH)
+                if drive.distance
+                else curves[drive.name],
             )
             for k, drive in enumerate(ordered)
             if curves is not None

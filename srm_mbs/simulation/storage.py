@@ -11,10 +11,11 @@ import io
 import json
 import logging
 import zipfile
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -145,11 +146,9 @@ def save_solution(solution: SimulationResult, path: Path | IO[bytes]) -> None:
             "name": mechanism.name,
             "source": None if mechanism.source is None else asdict(mechanism.source),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
-            "loops": [asdict(loop) for loop in mechanism.loops],
-            "forces": [
-                {"type": f.type} | _values(f) for f in mechanism.forces if f.type in FORCE_TYPES
-            ],
-            "drives": [_values(drive) for drive in mechanism.drives],
+            "loops": [to_plain(loop) for loop in mechanism.loops],
+            "forces": [force_to_plain(f) for f in mechanism.forces if f.type in FORCE_TYPES],
+            "drives": [to_plain(drive) for drive in mechanism.drives],
             "drive_starts": _drive_starts(solution),
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
@@ -202,38 +201,50 @@ def save_solution(solution: SimulationResult, path: Path | IO[bytes]) -> None:
         log.info("written: %s", path)
 
 
-def _loop(entry: dict[str, Any]) -> LoopClosure:
-    anchors = {side: Anchor(**entry[side]) for side in "ab" if entry[side] is not None}
-    return LoopClosure(**entry | anchors)
+# -- closures, forces and drives: the fields of their classes ---------------------------------
+# An anchor is an object without "type", a law one with its "type"; tuples are lists.
+
+Element = TypeVar("Element")
 
 
-def _entry(value: Any) -> Any:
-    """A description of laws, anchors and numbers as JSON has it; laws with their type."""
+def to_plain(element: Any) -> dict[str, Any]:
+    """The fields of a closure, force or drive as JSON has them."""
+    return {key.name: _plain(getattr(element, key.name)) for key in fields(element)}
+
+
+def force_to_plain(force: ForceElement) -> dict[str, Any]:
+    """:func:`to_plain` of a force, with its type."""
+    return {"type": force.type} | to_plain(force)
+
+
+def from_plain(kind: type[Element], values: Mapping[str, Any]) -> Element:
+    """The element of the class ``kind`` from what :func:`to_plain` made of it."""
+    return kind(**{key: _value(value) for key, value in values.items()})
+
+
+def force_from_plain(values: Mapping[str, Any]) -> ForceElement:
+    """The force from what :func:`force_to_plain` made of it."""
+    rest = {key: _value(value) for key, value in values.items() if key != "type"}
+    return FORCE_TYPES[values["type"]](**rest)
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, Law):
         return {"type": value.type} | asdict(value)  # type: ignore[call-overload]
     if isinstance(value, Anchor):
         return asdict(value)
-    return [_entry(part) for part in value] if isinstance(value, tuple) else value
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
 
 
-def _from_entry(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(_from_entry(part) for part in value)
-    if not isinstance(value, dict):
-        return value
-    if "type" not in value:
-        return Anchor(**value)
-    values = dict(value)
+def _value(plain: Any) -> Any:
+    if isinstance(plain, list):
+        return tuple(map(_value, plain))
+    if not isinstance(plain, Mapping):
+        return plain
+    if "type" not in plain:
+        return Anchor(**plain)
+    values = dict(plain)
     return LAW_TYPES[values.pop("type")](**values)
-
-
-def _values(element: Any) -> dict[str, Any]:
-    return {key.name: _entry(getattr(element, key.name)) for key in fields(element)}
-
-
-def _force(entry: dict[str, Any]) -> ForceElement:
-    values = {key: _from_entry(value) for key, value in entry.items() if key != "type"}
-    return FORCE_TYPES[entry["type"]](**values)
 
 
 def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
@@ -251,10 +262,6 @@ def _drive_curves(drives: tuple[Drive, ...], starts: dict[str, float]) -> dict[s
     return curves
 
 
-def _drive(entry: dict[str, Any]) -> Drive:
-    return Drive(**{key: _from_entry(value) for key, value in entry.items()})
-
-
 def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:
     if entry["source"] is not None:
         source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
@@ -265,11 +272,11 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         model.loadFromString(entry["model"])
     mechanism = Mechanism(
         model,
-        tuple(_loop(loop) for loop in entry["loops"]),
+        tuple(from_plain(LoopClosure, loop) for loop in entry["loops"]),
         q0=arrays["q0"],
         v0=arrays["v0"],
-        forces=tuple(_force(force) for force in entry["forces"]),
-        drives=tuple(_drive(drive) for drive in entry["drives"]),
+        forces=tuple(force_from_plain(force) for force in entry["forces"]),
+        drives=tuple(from_plain(Drive, drive) for drive in entry["drives"]),
         friction_speed=entry["friction_speed"],
         name=entry["name"],
         source=source,

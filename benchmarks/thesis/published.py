@@ -63,7 +63,7 @@ class PublishedSRM:
     ) -> IntegratorState:
         """All sweeps at ``state`` with multiplier 0."""
         terms = system.evaluate(t, state)
-        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
         node = SweepNode(state, np.zeros(system.multiplier_size), None, 0.0, None)
         memory.sweeps = (node,) * self.iterations
         return memory
@@ -94,12 +94,12 @@ class PublishedSRM:
             runs.append(sweep_over(system, scheme, t, h, node.state, answer, start))
             previous = multipliers_between(system, scheme, how, t, h, runs[-1], answer)
         last = runs[-1]
-        magnitude = np.maximum(np.abs(memory.sweeps[-1].state), np.abs(last.state))
+        state_scale = np.maximum(np.abs(memory.sweeps[-1].state), np.abs(last.state))
         error_ratio = 0.0
         if scheme.error is not None and self.iterations > 1:
             lower = runs[-2]
             embedded = lower.state - h * (scheme.error @ lower.rates[: s + 1])
-            error_ratio = norm(last.state - embedded, norm.weights(magnitude))
+            error_ratio = norm(last.state - embedded, norm.weights(state_scale))
         return StepResult(
             t=t,
             h=h,
@@ -113,7 +113,7 @@ class PublishedSRM:
             zone=None,
             history=None,
             multiplier=None,
-            magnitude=magnitude,
+            state_scale=state_scale,
             sweeps=tuple(
                 SweepNode(
                     run.state,
@@ -135,7 +135,7 @@ class PublishedSRM:
         """Move ``memory`` to the end of an accepted step."""
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
-        memory.magnitude = result.magnitude
+        memory.state_scale = result.state_scale
         memory.sweeps = result.sweeps
 
 

@@ -48,7 +48,7 @@ class OpenTerms:
 
     sigma = np.inf
     rank = 0
-    weak = False
+    rank_deficient = False
     held = False
 
     def __init__(self, nv: int) -> None:
@@ -67,7 +67,7 @@ class OpenTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return np.zeros(self._nv)
 
-    def gap(self) -> float:
+    def constraint_residual(self) -> float:
         return 0.0
 
     def correction(self) -> FloatArray:
@@ -87,16 +87,16 @@ class ClosedTerms:
         self,
         projection: Projection,
         loops: LoopKinematics | DrivenKinematics,
-        gap_scale: FloatArray,
+        residual_scale: FloatArray,
     ) -> None:
         self._p = projection
         self._loops = loops
         self._pushed = loops.pushed if isinstance(loops, DrivenKinematics) else None
-        self._gap_scale = gap_scale
+        self._residual_scale = residual_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
         self.sigma = projection.sigma
-        self.weak = projection.weak
+        self.rank_deficient = projection.rank_deficient
 
     @property
     def rank(self) -> int:
@@ -146,9 +146,9 @@ class ClosedTerms:
         white = p.white_project(w)
         return white if self._pushed is None else white - s * p.normal(self._pushed[p.order])
 
-    def gap(self) -> float:
-        gaps = self._loops.g * self._gap_scale
-        return abs(float(gaps.item(_largest(gaps))))
+    def constraint_residual(self) -> float:
+        residuals = self._loops.g * self._residual_scale
+        return abs(float(residuals.item(_largest(residuals))))
 
     def correction(self) -> FloatArray:
         p = self._p
@@ -330,7 +330,7 @@ class OpenSystem(Mechanics):
         self._zero = np.zeros(self.nv)
         self._terms = OpenTerms(self.nv)
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """0: there is no closure."""
         return 0.0
 
@@ -363,7 +363,9 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
-        self._gap_scale: FloatArray = mechanism.at_start("gap_scale", self._gap_scales)
+        self._residual_scale: FloatArray = mechanism.at_start(
+            "residual scale", self._inverse_row_units
+        )
         self._order: tuple[int, ...] = mechanism.derived("order", self._graph_order)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
 
@@ -378,7 +380,7 @@ class ClosedSystem(Mechanics):
         scale, kept = structure.row_scale, structure.kept
         return LoopKinematics(self.model, mechanism.loops, scale, kept, structure.eliminations)
 
-    def _gap_scales(self) -> FloatArray:
+    def _inverse_row_units(self) -> FloatArray:
         structure = self.structure
         unit = constraint_units(self.mechanism, structure.units)
         scale: FloatArray = (structure.row_scale / unit)[structure.kept]
@@ -417,7 +419,7 @@ class ClosedSystem(Mechanics):
 
     @cached_property
     def _terms(self) -> ClosedTerms:
-        return ClosedTerms(self.projection, self.loops, self._gap_scale)
+        return ClosedTerms(self.projection, self.loops, self._residual_scale)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
@@ -426,7 +428,7 @@ class ClosedSystem(Mechanics):
 
     def constants_of_start(self) -> dict[str, Any]:
         """As for open mechanisms, and the scales of the closures."""
-        return super().constants_of_start() | {"gap_scale": self._gap_scale}
+        return super().constants_of_start() | {"gap_scale": self._residual_scale}
 
     def _constants(self) -> dict[str, Any]:
         own = {
@@ -475,9 +477,9 @@ class ClosedSystem(Mechanics):
         terms = self._terms
         terms.v = v
         terms.sigma = projection.sigma
-        terms.weak = projection.weak
+        terms.rank_deficient = projection.rank_deficient
         terms.predicted = None
-        if projection.weak and zone is not None:
+        if projection.rank_deficient and zone is not None:
             terms.predicted = zone.predict(t)
             if terms.predicted is None:
                 if zone.normals is None:
@@ -491,10 +493,10 @@ class ClosedSystem(Mechanics):
                 projection.hold(zone.normals)
         return terms
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""
         g, _ = self.residuals(state, t)
-        return float(np.max(np.abs(g) * self._gap_scale))
+        return float(np.max(np.abs(g) * self._residual_scale))
 
     def _update(self, t: float, q: FloatArray, with_bias: bool = True) -> None:
         """The rows at t and q, for which ``data`` has the kinematics."""

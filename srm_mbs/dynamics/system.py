@@ -54,8 +54,8 @@ class Terms(Protocol):
         """Number of independent closure rows in use at this stage."""
 
     @property
-    def weak(self) -> bool:
-        """Whether rows were dropped here and the predicted multiplier took their place."""
+    def rank_deficient(self) -> bool:
+        """Whether rows were dropped at this stage, whose part of the multiplier is predicted."""
 
     @property
     def held(self) -> bool:
@@ -74,7 +74,7 @@ class Terms(Protocol):
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nv,): the M-orthogonal projection of w on the constraint normals."""
 
-    def gap(self) -> float:
+    def constraint_residual(self) -> float:
         """Largest |g|, of all rows, in row units; 0 where there are none."""
 
     def correction(self) -> FloatArray:
@@ -142,13 +142,13 @@ class System(Protocol):
         """Change of the tangent rate that follows from moving the state by ``delta`` alone, the
         accelerations kept: (dv, 0) for a mechanism, whose q' is v."""
 
-    def size(self, delta: FloatArray) -> float:
+    def position_norm(self, delta: FloatArray) -> float:
         """Largest motion of the positions in ``delta``, in units (rad, scene diagonals)."""
 
-    def magnitudes(self, state: FloatArray) -> FloatArray:
+    def state_scale(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """Largest closure error at ``state``, in row units (scene diagonals, rad); 0 if open."""
 
     def step_limit(self, state: FloatArray) -> float:
@@ -177,6 +177,6 @@ def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
     for _ in range(ROUNDS):
         correction = system.evaluate(t, state).correction()
         state = system.retract(state, -correction)
-        if system.size(correction) < CLOSED:
+        if system.position_norm(correction) < CLOSED:
             return state
     raise EvaluationError("no configuration that closes the loops was found near the one given")

@@ -113,7 +113,7 @@ def direct_from(memory: IntegratorState, norm: ErrorNorm, span: float, nv: int) 
     error = np.zeros(2 * nv)
     turning = 3.0 * memory.sigma_slope**2 * norm.one[:nv]
     error[nv:] = span * ROUNDING * (np.abs(memory.rate[nv:]) + turning)
-    weighed = norm(error, norm.weights(memory.magnitude))
+    weighed = norm(error, norm.weights(memory.state_scale))
     return min(ZONE_LARGEST, float(np.sqrt(weighed / ALLOWED)))
 
 

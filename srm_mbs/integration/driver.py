@@ -293,24 +293,31 @@ class Closures:
     def trouble(self, result: StepResult) -> str:
         """What is wrong with the closures at the end of a step; empty if nothing is."""
         # Far from everything singular, a step within the tolerance has a correction to match.
-        if result.quiet and 0.0 < result.error_ratio <= 1.0 and result.gap <= self._seen:
+        if (
+            result.quiet
+            and 0.0 < result.error_ratio <= 1.0
+            and result.constraint_residual <= self._seen
+        ):
             return ""
         if not result.correction.size:
             return ""
-        large = not (np.abs(result.correction) < self._large).all() or not result.gap < LOST
+        large = (
+            not (np.abs(result.correction) < self._large).all()
+            or not result.constraint_residual < LOST
+        )
         # With every structural row in use the correction closes all rows, or the rank is wrong.
-        unused = result.zone is None and result.gap > 2.0 * self._seen
+        unused = result.zone is None and result.constraint_residual > 2.0 * self._seen
         if not (large or unused):
             return ""
-        gap = self._system.closure_gap(result.t + result.h, result.state)
-        if not gap < LOST:
+        residual = self._system.constraint_residual(result.t + result.h, result.state)
+        if not residual < LOST:
             return "the step is so long that the loops come apart"
-        if unused and gap > 0.5 * result.gap:
+        if unused and residual > 0.5 * result.constraint_residual:
             return (
                 "closures that seemed to follow from the others open: no motion was found that "
                 "keeps all loops closed and follows all drives, the mechanism is locked there"
             )
-        self._seen = max(self._seen, result.gap)
+        self._seen = max(self._seen, result.constraint_residual)
         return ""
 
 

@@ -148,7 +148,7 @@ def block_of(
                 history = MultiplierHistory(times[nodes], solved)
             # Known everywhere: every stage takes the interpolated multiplier.
             known = replace(history, known_until=np.inf, known_below=np.inf)
-            memory = IntegratorState(here.rate, here.sigma, system.magnitudes(here.state), known)
+            memory = IntegratorState(here.rate, here.sigma, system.state_scale(here.state), known)
             result = method.step(system, t, t_next - t, here.state, memory, norm)
             point = _solved(system, geometry, t_next, result.state, direct)
             if point is None:
@@ -289,7 +289,7 @@ def _error(
     for a, b in ((0, 1), (-2, -1)):
         between = 0.5 * float(history.times[a] + history.times[b])
         error[nv:] = np.maximum(error[nv:], span * history.uncertainty(between))
-    return norm(error, norm.weights(memory.magnitude))
+    return norm(error, norm.weights(memory.state_scale))
 
 
 LOOK = 0.05

@@ -80,7 +80,7 @@ def _absolute_tolerance(atol: Any, rtol: float, nx: int) -> FloatArray:
 
 
 def _check_start(system: DaeSystem, method: Method, t0: float, x0: FloatArray) -> None:
-    gap = system.closure_gap(t0, x0)
+    gap = system.constraint_residual(t0, x0)
     if not gap <= CONSISTENT:
         raise InputError(
             f"x0 violates g(t0, x0) = 0 by {gap:.1e} (relative error of x)",

@@ -394,7 +394,7 @@ def _switched(
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)
-    if system.size(system.difference(given, x)) > SNAPS:
+    if system.position_norm(system.difference(given, x)) > SNAPS:
         check_consistent(new, t)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

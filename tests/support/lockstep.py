@@ -196,7 +196,7 @@ def compare(
             out.verdicts.append((t, verdict, twin_verdict))
         if result is not None:
             twin_result = run.last()
-            size = np.maximum(one, memory.magnitude)
+            size = np.maximum(one, memory.state_scale)
             rates = np.abs(result.rates).max(axis=0)
             change = system.difference(result.state, twin_result.state)
             # Next to a singular configuration the algebra magnifies rounding by 1 / sigma^2.
@@ -224,7 +224,7 @@ def compare(
                 change = np.abs(twin_result.correction - result.correction)
                 out.correction = max(out.correction, float(np.max(change / scale)))
             # An error estimate is a difference of rates: its rounding is theirs.
-            rounding = norm(proposal.h * rates, norm.weights(memory.magnitude))
+            rounding = norm(proposal.h * rates, norm.weights(memory.state_scale))
             change = abs(twin_result.error_ratio - result.error_ratio)
             bound = (rounding + result.error_ratio) / lowest**2
             out.error = max(out.error, float(change / bound))

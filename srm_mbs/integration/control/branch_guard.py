@@ -50,7 +50,7 @@ closures, and velocities that change afterwards have not turned."""
 
 def jumped(system: System, before: FloatArray, after: FloatArray) -> bool:
     """Whether the velocity in the tangent rate ``after`` (n,) is another one than ``before``."""
-    jump, *sizes = (system.size(rate) for rate in (after - before, before, after))
+    jump, *sizes = (system.position_norm(rate) for rate in (after - before, before, after))
     return jump > TURNED * max(sizes)
 
 
@@ -126,7 +126,7 @@ def turned(system: System, result: StepResult) -> bool:
     halfway = 0.5 * result.h * (start[k:] + end[k:])
     still = np.zeros(k)
     jump, *sizes = (
-        system.size(np.concatenate([v, still]))
+        system.position_norm(np.concatenate([v, still]))
         for v in (end[:k] - start[:k] - halfway, start[:k], end[:k], halfway)
     )
     return jump > TURNED * max(sizes)

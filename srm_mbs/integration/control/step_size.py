@@ -212,9 +212,9 @@ def initial_step(
     With d0 = ||unit of x||, d1 = ||x'|| and d2 = ||x''|| (an Euler step of 0.01 d0/d1), and the
     time tau = d1/d2: h = min(d0/d1, tau (0.01 / (tau d1))^(1/k)).
     """
-    weights = norm.weights(memory.magnitude)
+    weights = norm.weights(memory.state_scale)
     # |x| itself may vanish; atol over rtol is the size that the tolerances call "one".
-    d0 = norm(np.maximum(memory.magnitude, norm.one), weights)
+    d0 = norm(np.maximum(memory.state_scale, norm.one), weights)
     if not np.abs(memory.rate).max() < OVERFLOW:
         raise EvaluationError("the rates at the start overflow: an input is far too large")
     with np.errstate(over="ignore"):

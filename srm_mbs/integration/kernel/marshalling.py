@@ -37,7 +37,7 @@ CONSTANTS = {
     "hit": near_singular.HIT,
     "projections": near_singular.PROJECTIONS,
     "fewest": near_singular.FEWEST,
-    "gap_every": split_step.GAP_EVERY,
+    "gap_every": split_step.RESIDUAL_EVERY,
     "safety": step_size.SAFETY,
     "min_factor": step_size.MIN_FACTOR,
     "max_factor": step_size.MAX_FACTOR,
@@ -117,7 +117,7 @@ def memory_data(memory: IntegratorState) -> dict[str, Any]:
     """``memory`` as the kernel reads it."""
     return {
         "rate": np.ascontiguousarray(memory.rate),
-        "magnitude": np.ascontiguousarray(memory.magnitude),
+        "magnitude": np.ascontiguousarray(memory.state_scale),
         "sigma": memory.sigma,
         "sigma_slope": memory.sigma_slope,
         "steps": memory.steps,

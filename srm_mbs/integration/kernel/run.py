@@ -134,6 +134,8 @@ class CompiledRun:
         """The step made last."""
         data = dict(self._run.last())
         threshold, history = data.pop("zone_threshold"), data.pop("history")
+        data["state_scale"] = data.pop("magnitude")
+        data["constraint_residual"] = data.pop("gap")
         known = None if history is None else history_from(history)
         near = None if known is None else Zone(threshold, known.predict_near, known.normals)
         return StepResult(zone=near, history=known, multiplier=None, **data)

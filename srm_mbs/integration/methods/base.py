@@ -46,9 +46,9 @@ class ErrorNorm:
         """What the tolerances call "one" (n,), a unit for each component."""
         return self.atol / self.rtol
 
-    def weights(self, magnitude: FloatArray) -> FloatArray:
+    def weights(self, state_scale: FloatArray) -> FloatArray:
         """atol + rtol |x| (n,)."""
-        return self.atol + self.rtol * magnitude
+        return self.atol + self.rtol * state_scale
 
     def __call__(self, error: FloatArray, weights: FloatArray) -> float:
         """The norm of ``error`` (n,) for ``weights`` (n,)."""
@@ -101,7 +101,7 @@ class IntegratorState:
         Tangent rate at the current state: the first stage of the next step.
     sigma
         sigma there.
-    magnitude : (n,)
+    state_scale : (n,)
         |x| of the error weights there.
     history
         Multipliers at recent step ends outside the zone; None without closures.
@@ -115,7 +115,7 @@ class IntegratorState:
 
     rate: FloatArray
     sigma: float
-    magnitude: FloatArray
+    state_scale: FloatArray
     history: MultiplierHistory | None = None
     sigma_slope: float = 0.0
     steps: int = 0
@@ -149,7 +149,7 @@ class StepResult:
         The multiplier history behind that zone, else None.
     multiplier : (m,) or None
         yhat at the end point; None if the end point lies in the zone.
-    magnitude : (n,)
+    state_scale : (n,)
         |x| of the error weights at the end.
     sweeps
         For methods with sweeps: where each one stands at the end.
@@ -169,7 +169,7 @@ class StepResult:
         Whether the whole step is so far from singular configurations that nothing needs a look.
     slope
         Of a quiet step: |d sigma / dt| (1/s), the largest over the step and to its middle stage.
-    gap
+    constraint_residual
         Largest closure error before a full correction, in row units, rows that are not in use
         included; 0 if the correction is partial.
     held
@@ -190,7 +190,7 @@ class StepResult:
     zone: Zone | None
     history: MultiplierHistory | None
     multiplier: FloatArray | None
-    magnitude: FloatArray
+    state_scale: FloatArray
     sweeps: tuple[SweepNode, ...] = ()
     drift_ratio: float = 0.0
     off: float = 0.0
@@ -199,7 +199,7 @@ class StepResult:
     placement: str = ""
     quiet: bool = False
     slope: float = 0.0
-    gap: float = 0.0
+    constraint_residual: float = 0.0
     held: bool = False
     normals: FloatArray | None = None
 

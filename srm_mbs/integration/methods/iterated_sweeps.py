@@ -221,7 +221,7 @@ class IteratedSweeps:
     ) -> IntegratorState:
         """All sweeps at ``state``; own histories with multiplier 0, as in the thesis."""
         terms = system.evaluate(t, state)
-        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
         multiplier = np.zeros(system.multiplier_size)
         if self.first is not First.ZERO and system.predicts:
             multiplier = terms.prediction().copy()
@@ -254,7 +254,7 @@ class IteratedSweeps:
         change = h * memory.sigma_slope
         gathered, restarted = self._gathered(system, memory, change)
         kept = memory.sweeps[-1].history
-        weights = norm.weights(memory.magnitude)
+        weights = norm.weights(memory.state_scale)
         stages = BranchStages(system, gathered, norm, weights, h, change, kept, t + h, eps)
         if can_hand_over(system, self.scheme, norm) and (
             memory.sweeps[-1].passing or unresolved(stages)
@@ -266,13 +266,13 @@ class IteratedSweeps:
         last = runs[-1]
         self._check_closures(system, t + h, last.state, h, eps)
 
-        magnitude = system.magnitudes(last.state)
-        error_ratio, drift_ratio = self._estimate(t, h, eps, magnitude, stages, last)
+        state_scale = system.state_scale(last.state)
+        error_ratio, drift_ratio = self._estimate(t, h, eps, state_scale, stages, last)
         ends = runs if self.own_history else runs[-1:]
         sweeps = tuple(
             self._end(system, node, run, t + h, eps) for node, run in zip(memory.sweeps, ends)
         )
-        weak = any(run.weak for run in runs)
+        weak = any(run.rank_deficient for run in runs)
         return StepResult(
             t=t,
             h=h,
@@ -286,7 +286,7 @@ class IteratedSweeps:
             zone=stages.zone if weak else None,
             history=kept if weak else None,
             multiplier=None,
-            magnitude=magnitude,
+            state_scale=state_scale,
             sweeps=sweeps,
             drift_ratio=drift_ratio,
             off=max(node.off for node in sweeps),
@@ -298,7 +298,7 @@ class IteratedSweeps:
         t: float,
         h: float,
         eps: float,
-        magnitude: FloatArray,
+        state_scale: FloatArray,
         stages: BranchStages,
         last: Sweep,
     ) -> tuple[float, float]:
@@ -307,11 +307,11 @@ class IteratedSweeps:
         if scheme.error is None:
             return 0.0, 0.0
         system, norm, memory, history = stages.system, stages.norm, stages.memory, stages.history
-        weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+        weights = norm.weights(np.maximum(memory.state_scale, state_scale))
         weights = stages.widened(weights, scheme, last.sigmas)
         error = h * np.abs(scheme.error @ last.rates[: s + 1])
         if history is not None and stages.sigma_change > COUNT_UNCERTAINTY_ABOVE:
-            for j in last.weak:
+            for j in last.rank_deficient:
                 if j < s:
                     uncertainty = history.uncertainty(t + scheme.c[j] * h)
                     part = system.multiplier_part
@@ -334,7 +334,7 @@ class IteratedSweeps:
         """Move ``memory`` to the end of an accepted step."""
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
-        memory.magnitude = result.magnitude
+        memory.state_scale = result.state_scale
         memory.sweeps = result.sweeps
 
     def resume(
@@ -382,7 +382,9 @@ class IteratedSweeps:
                 rate = answer(terms, 0)[0]
                 if near is not None:
                     terms, rate, *_ = near(terms, t, 1.0, node.state, 0, answer)
-                start = Start(rate.copy(), node.multiplier, terms.sigma, terms.rank, terms.weak)
+                start = Start(
+                    rate.copy(), node.multiplier, terms.sigma, terms.rank, terms.rank_deficient
+                )
             final = k + 1 == len(memory.sweeps)
             run = sweep_over(
                 system,
@@ -426,14 +428,16 @@ class IteratedSweeps:
         if exact:
             multiplier = terms.prediction().copy()
             starts.append(
-                Start(terms.rate().copy(), multiplier, terms.sigma, terms.rank, terms.weak)
+                Start(
+                    terms.rate().copy(), multiplier, terms.sigma, terms.rank, terms.rank_deficient
+                )
             )
         off_before = terms.correction() + (0.0 if moved is None else moved)
         previous = np.tile(multiplier, (len(nodes_of(self.scheme).c), 1))
         for _ in range(self.iterations):
             rate, multiplier = (part.copy() for part in terms.sweep(multiplier, eps))
             rate, multiplier = OnBranch(stages, eps).with_own_terms(rate, multiplier, moved)
-            starts.append(Start(rate, multiplier, terms.sigma, terms.rank, terms.weak))
+            starts.append(Start(rate, multiplier, terms.sigma, terms.rank, terms.rank_deficient))
         runs: list[Sweep] = []
         for k, start in enumerate(starts):
             predictor, final = exact and k == 0, k + 1 == len(starts)
@@ -483,7 +487,7 @@ class IteratedSweeps:
         history = node.history
         if history is not None and run.exact is not None:
             history = history.extended(t, run.exact)
-        off = 0.0 if run.off is None else system.size(run.off)
+        off = 0.0 if run.off is None else system.position_norm(run.off)
         rate = run.end_rate if self.own_history else None
         return SweepNode(run.state, multiplier, rate, eps, history, off, node.given)
 
@@ -499,7 +503,7 @@ class IteratedSweeps:
         """
         if not system.has_constraints:
             return
-        if np.isfinite(state).all() and system.closure_gap(t, state) < APART:
+        if np.isfinite(state).all() and system.constraint_residual(t, state) < APART:
             return
         limit = real_stability_limit(self.scheme)
         reason = (

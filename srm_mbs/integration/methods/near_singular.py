@@ -182,10 +182,10 @@ class BranchStages:
         change = max(self.sigma_change, abs(terms.sigma - self.memory.sigma) / c)
         for _ in range(PROJECTIONS):
             sigma = terms.sigma
-            if terms.weak or not sigma > 0.0:
+            if terms.rank_deficient or not sigma > 0.0:
                 break
             error = terms.correction()
-            if self.system.size(error) > AMBIGUOUS * sigma:
+            if self.system.position_norm(error) > AMBIGUOUS * sigma:
                 break
             effect = self.norm(self._turning(error, sigma, change), self.weights)
             if effect <= self.norm.negligible:
@@ -262,7 +262,7 @@ class BranchStages:
         if not part.start or self.memory.history is None or self.memory.history.normals is None:
             return False
         v, a = self.memory.rate[: part.start], self.memory.rate[part]
-        speed = self.system.size(np.concatenate([v, a]))
+        speed = self.system.position_norm(np.concatenate([v, a]))
         error = np.zeros_like(self.weights)
         error[part] = self.h * (threshold * np.abs(a) + speed * np.abs(v))
         return self.norm(error, self.weights) < HELD

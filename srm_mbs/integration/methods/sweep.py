@@ -112,7 +112,7 @@ class Start:
         Tangent rate.
     multiplier : (k,)
         The sweep's multiplier.
-    sigma, rank, weak
+    sigma, rank, rank_deficient
         Of the evaluation.
     """
 
@@ -120,7 +120,7 @@ class Start:
     multiplier: FloatArray
     sigma: float
     rank: int
-    weak: bool = False
+    rank_deficient: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class Sweep:
     sigmas : (s + 1,)
     rank
         The smallest of any node.
-    weak
+    rank_deficient
         Nodes with dropped rows.
     exact
         yhat by the exact prediction at the end point if it was asked for, else None.
@@ -159,7 +159,7 @@ class Sweep:
     end_rate: FloatArray
     sigmas: FloatArray
     rank: int
-    weak: tuple[int, ...]
+    rank_deficient: tuple[int, ...]
     exact: FloatArray | None
     off: FloatArray | None
     off_before: FloatArray | None = None
@@ -243,13 +243,13 @@ def sweep_over(
     if start is None:
         terms = system.evaluate(t, state, zone)
         rate, multiplier = answer(terms, 0)
-        start = Start(rate, multiplier, terms.sigma, terms.rank, terms.weak)
+        start = Start(rate, multiplier, terms.sigma, terms.rank, terms.rank_deficient)
     rates = np.empty((n, system.tangent_size))
     multipliers = np.empty((n, start.multiplier.size))
     sigmas = np.empty(s + 1)
     rates[0], multipliers[0], sigmas[0] = start.rate, start.multiplier, start.sigma
     rank = start.rank
-    weak = [0] if start.weak else []
+    weak = [0] if start.rank_deficient else []
     end_state, end_rate = state, start.rate
     end_exact: FloatArray | None = None
     end_off: FloatArray | None = None
@@ -267,11 +267,11 @@ def sweep_over(
             rate, multipliers[j] = answer(terms, j)
         rates[j] = system.chart_rate(delta, rate)
         rank = min(rank, terms.rank)
-        if terms.weak:
+        if terms.rank_deficient:
             weak.append(j)
         if j == s:
             end_state, end_rate = x, rate.copy()
-            if exact and not terms.weak:
+            if exact and not terms.rank_deficient:
                 end_exact = terms.multiplier().copy()
             if off:
                 end_off = terms.correction() + (0.0 if moved is None else moved)

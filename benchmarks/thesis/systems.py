@@ -188,6 +188,7 @@ class CartesianPendulum:
     """
 
     has_constraints = True
+    singularities = None
     carries_yhat = False
     predicts = True
     tangent_size = 4

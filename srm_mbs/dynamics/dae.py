@@ -246,6 +246,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    singularities = None
 
     def __init__(
         self,

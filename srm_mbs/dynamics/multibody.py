@@ -19,7 +19,7 @@ The forces tau are those of the controller, joint damping and friction, and forc
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from scipy.linalg import blas
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
@@ -36,7 +37,7 @@ from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_control
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.scaling import constraint_units
-from srm_mbs.dynamics.system import Terms, Zone
+from srm_mbs.dynamics.system import SingularityAnalysis, Terms, Zone
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.mechanism import Mechanism
 
@@ -324,6 +325,7 @@ class OpenSystem(Mechanics):
 
     has_constraints = False
     factorisations = 0
+    singularities = None
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
@@ -443,6 +445,19 @@ class ClosedSystem(Mechanics):
         """Count what the compiled kernel did for this system."""
         super().count(evaluations, factorisations)
         self.projection.factorisations += factorisations
+
+    @cached_property
+    def singularities(self) -> SingularityAnalysis:
+        """Data for the analysis of singular configurations."""
+        mechanism, structure = self.mechanism, self.structure
+        return SingularityAnalysis(
+            mechanism.q0,
+            structure.rank,
+            structure.sigma_ref,
+            structure.units.coordinate,
+            structure.units.rate,
+            partial(geometry_of, mechanism),
+        )
 
     @property
     def factorisations(self) -> int:

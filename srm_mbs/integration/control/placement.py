@@ -121,7 +121,7 @@ TOO_CLOSE = 0.05
 CLEARANCE = 0.6
 """Distance of the zero from the abscissae that is good enough, over half the widest gap."""
 MAX_REDONE = 3
-BESIDE = 5e-3
+SINGULAR_END_SIGMA = 5e-3
 """A run, or its piece, ends beside a singular configuration if sigma is smaller there: rounding in
 direct solves nearer than that exceeds the tightest tolerances."""
 ARRIVAL = 0.2
@@ -270,7 +270,7 @@ class SingularityPlacement:
             return self._arrival is Arrival.DUE
         if self._zero is None or not self._zero > t:
             return False
-        if not abs(self._zero - self._t_end) * self._slope < BESIDE:
+        if not abs(self._zero - self._t_end) * self._slope < SINGULAR_END_SIGMA:
             return False
         return proposal.t_new >= self._t_end or (self._t_end - t) * self._slope <= ARRIVAL
 
@@ -313,7 +313,7 @@ class SingularityPlacement:
             h = proposal.h
             slope = sigma_slope(self._inverse, result.sigmas, h)
             last = proposal.t_new >= self._t_end
-            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < BESIDE:
+            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < SINGULAR_END_SIGMA:
                 self._arrival, self._redo = Arrival.DUE, h
                 self.replaced += 1
                 return StepDecision.REPLACED

@@ -51,7 +51,7 @@ CONSTANTS = {
     "clearance": placement.CLEARANCE,
     "ahead": kinks.AHEAD,
     "max_redone": placement.MAX_REDONE,
-    "beside": placement.BESIDE,
+    "beside": placement.SINGULAR_END_SIGMA,
     "arrival_change": placement.ARRIVAL,
     "turned": branch_guard.TURNED,
     "guard_max_redone": branch_guard.MAX_REDONE,
@@ -61,7 +61,7 @@ CONSTANTS = {
     "open": driver.OPEN,
     "lost": driver.LOST,
     "watched_steps": driver.WATCHED_STEPS,
-    "look": singular_endpoints.LOOK,
+    "look": singular_endpoints.NEAR_SINGULAR_SIGMA,
     "closer": breakpoints.CLOSER,
     "allowed": breakpoints.ALLOWED,
 }

@@ -189,7 +189,7 @@ class CompiledRun:
                 "memory": memory_data(memory),
                 "control": fresh,
                 "seen": driver.OPEN,
-                "near": singular_endpoints.LOOK,
+                "near": singular_endpoints.NEAR_SINGULAR_SIGMA,
             }
         )
 

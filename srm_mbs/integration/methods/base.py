@@ -6,7 +6,7 @@ step stands is for step-size control to judge, and only :meth:`Method.accept` mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -120,6 +120,24 @@ class IntegratorState:
     sigma_slope: float = 0.0
     steps: int = 0
     sweeps: tuple[SweepNode, ...] = ()
+
+    def set_first_stage(
+        self, rate: FloatArray, multiplier: FloatArray, history: MultiplierHistory
+    ) -> None:
+        """Replace the first stage of a step next to a singular configuration, where the direct
+        solve is inaccurate, by ``rate`` (n,) and ``multiplier`` (nv,), with the ``history`` of
+        known multipliers."""
+        self.rate = rate
+        if self.history is not None:
+            self.history = history
+        self.sweeps = tuple(
+            replace(
+                node,
+                multiplier=multiplier if np.any(node.multiplier) else node.multiplier,
+                history=None if node.history is None else history,
+            )
+            for node in self.sweeps
+        )
 
 
 @dataclass(slots=True)

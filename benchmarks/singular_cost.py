@@ -136,7 +136,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(api, "placed_control", control),
         patch.object(api, "start", start),
         patch.object(api, "bifurcations_told", lambda _: ""),
-        patch.object(Closures, "trouble", lambda *_: ""),
+        patch.object(Closures, "failure", lambda *_: None),
     ):
         yield
 

@@ -13,7 +13,7 @@ from srm_mbs.errors import ControllerError, EvaluationError, InputError, Simulat
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.prescribed_times import Placing
 from srm_mbs.integration.control.step_size import initial_step
-from srm_mbs.integration.driver import RunRecord, Tick, integrate
+from srm_mbs.integration.driver import RunRecord, RunStatus, Tick, integrate
 from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel import driver
 from srm_mbs.integration.kernel.backend import uses_kernel
@@ -275,7 +275,7 @@ def simulate(
             given_back(system, kernel_system)
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
-        record.status, record.message = "failed", f"Stopped at t = {t0:.6g} s: {error}."
+        record.status, record.message = RunStatus.FAILED, f"Stopped at t = {t0:.6g} s: {error}."
     settings = Settings(
         type(method).__name__,
         method.scheme.name,

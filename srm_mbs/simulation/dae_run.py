@@ -13,11 +13,12 @@ from srm_mbs.integration.control.branch_guard import RateGuard
 from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
 from srm_mbs.integration.control.step_size import StepDecision, initial_step
 from srm_mbs.integration.dense_output import step_data
-from srm_mbs.integration.driver import DAE, RunRecord, Tick, integrate
+from srm_mbs.integration.driver import DAE, RunRecord, RunStatus, Tick, integrate
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import drift, instability, passings, restarts, turns
+from srm_mbs.integration.messages import branch_changes
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method, SweepNode
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.thesis.messages import drift, instability, passings, restarts
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.simulation.dae_result import DaeSolution
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
@@ -253,11 +254,11 @@ def solve_dae(
             )
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
-        record.status, record.message = "failed", f"Stopped at t = {t0:.6g}: {error}."
+        record.status, record.message = RunStatus.FAILED, f"Stopped at t = {t0:.6g}: {error}."
     carried += [result.sweeps[-1].multiplier for result in record.steps if result.sweeps]
     turned = suspected(wrappers)
     unstable = ""
-    if record.status == "failed" and with_sweeps and not system.carries_yhat:
+    if record.status is RunStatus.FAILED and with_sweeps and not system.carries_yhat:
         eps = getattr(method, "regularisation", None)
         unstable = instability(system, method.scheme, record, begun, eps)
     if unstable:
@@ -266,11 +267,11 @@ def solve_dae(
             record.message = f"Stopped at t = {end:.6g}: x' turned. Everything up to there is kept."
         record.message += unstable
     elif with_sweeps and turned:
-        if record.status != "failed":  # within the passage
-            record.status = "failed"
+        if record.status is not RunStatus.FAILED:  # within the passage
+            record.status = RunStatus.FAILED
             record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
         record.message += " " + (MENDED if system.carries_yhat else CARRIED)
-    elif record.status == "failed" and with_sweeps and not system.carries_yhat:
+    elif record.status is RunStatus.FAILED and with_sweeps and not system.carries_yhat:
         record.message += UNSTABLE
     data = step_data(
         t0, state, record.times, record.steps, method.scheme, system.tangent_size, record.stop
@@ -305,7 +306,7 @@ def solve_dae(
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message
-        + ("" if with_sweeps else turns(turned, "x' turned", MENDED))
+        + ("" if with_sweeps else branch_changes(turned, "x' turned", MENDED))
         + restarts(record.steps)
         + passings(record.steps)
         + drift(record.steps, norm),

@@ -22,14 +22,15 @@ from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
 from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
 from srm_mbs.integration.dense_output import DenseOutput
-from srm_mbs.integration.driver import RunRecord
+from srm_mbs.integration.driver import RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.system import shared
-from srm_mbs.integration.messages import drift, passings, restarts, turns
+from srm_mbs.integration.messages import branch_changes
 from srm_mbs.integration.methods.base import ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.thesis.messages import drift, passings, restarts
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import checked_atol, checked_method, step_size_control
@@ -89,7 +90,7 @@ def assemble_result(
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message
-        + turns(suspects, "the velocity turned", MENDED)
+        + branch_changes(suspects, "the velocity turned", MENDED)
         + restarts(record.steps)
         + passings(record.steps)
         + drift(record.steps, norm)
@@ -102,7 +103,7 @@ def assemble_result(
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     """What else may be the cause where a driven mechanism cannot go on."""
-    if record.status != "failed" or not mechanism.drives:
+    if record.status is not RunStatus.FAILED or not mechanism.drives:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)
     return f" A drive ({names}) may lead where the mechanism cannot follow."

@@ -188,7 +188,7 @@ class CompiledRun:
                 "state": np.ascontiguousarray(state),
                 "memory": memory_data(memory),
                 "control": fresh,
-                "seen": driver.OPEN,
+                "seen": driver.RESIDUAL_EXAMINED,
                 "near": singular_endpoints.NEAR_SINGULAR_SIGMA,
             }
         )

@@ -14,6 +14,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
 from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.simulation.result import RunOutcome, Settings, Statistics
 
@@ -70,7 +71,7 @@ class DaeSolution(RunOutcome):
         self.scheme = method.scheme
         self.attempts = attempts
         self.settings = settings
-        self.status = status
+        self.status = RunStatus(status)
         self.message = message
         self.t_events: list[FloatArray] | None = None
         self.x_events: list[FloatArray] | None = None

@@ -23,6 +23,7 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import InputError
 from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read, wound_angles
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
@@ -142,12 +143,12 @@ class RunOutcome:
 
     steps: StepData
     attempts: NDArray[np.void]
-    status: str
+    status: RunStatus
 
     @property
     def success(self) -> bool:
         """Whether the end, or a terminal event, was reached."""
-        return self.status in ("finished", "event")
+        return self.status in (RunStatus.FINISHED, RunStatus.EVENT)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -218,7 +219,7 @@ class Solution(RunOutcome, AnimationMixin):
         self.steps = steps
         self.scheme = scheme
         self.attempts = attempts
-        self.status = status
+        self.status = RunStatus(status)
         self.message = message
         self.stats = stats
         self.settings = settings
@@ -340,7 +341,7 @@ class Solution(RunOutcome, AnimationMixin):
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:
         """Singular configurations that the run reached without the momentum to choose a branch."""
-        failed = self.status == "failed"
+        failed = self.status is RunStatus.FAILED
         return find_bifurcations(self._system, self.steps, self._dense, self.settings.rtol, failed)
 
     @cached_property

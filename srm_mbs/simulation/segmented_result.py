@@ -13,6 +13,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.integration.dense_output import StepData, check_within, times_to_read
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
 from srm_mbs.simulation.result import Solution, Statistics
 
@@ -46,7 +47,7 @@ class SegmentedSolution(Solution):
         first = self.segments[0]
         self.mechanism = first.mechanism
         self.scheme, self.settings = first.scheme, first.settings
-        self.status, self.message = status, message
+        self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
         self.stats = _added([segment.stats for segment in self.segments])

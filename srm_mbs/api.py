@@ -11,8 +11,7 @@ from srm_mbs.dynamics.controllers import Controller, HeldForce
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
-from srm_mbs.integration.control.prescribed_times import Placing
-from srm_mbs.integration.control.step_size import initial_step
+from srm_mbs.integration.control.step_size import ControlWrapper, initial_step
 from srm_mbs.integration.driver import RunRecord, RunStatus, Tick, integrate
 from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel import driver
@@ -205,7 +204,7 @@ def simulate(
     by = "kernel" if on_kernel else "python"
     log_start(mechanism.name, t0, t_end, method, norm, step, by)
     watch = event_watch(events, system, method, state)
-    wrappers: Sequence[Placing] = ()
+    wrappers: Sequence[ControlWrapper] = ()
     kernel_system: Any = None
     record: RunRecord
     try:

@@ -182,7 +182,7 @@ class BreakpointHandler:
     sample
         Called with (t, state) at the marked breakpoints, before anything is evaluated there.
     arrivals
-        Whether :meth:`arrive` can do anything.
+        Whether :meth:`singular_arrival` can do anything.
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class BreakpointHandler:
             self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
         )
 
-    def arrive(
+    def singular_arrival(
         self, t: float, state: FloatArray, memory: IntegratorState, index: int | None = None
     ) -> IntegratorState:
         """``memory`` with the multipliers known up to the end of the piece, which lies beside a

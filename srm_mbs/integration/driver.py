@@ -222,8 +222,8 @@ def integrate(
                 memory = breakpoints.next(t, x, memory)
                 control.set_target_time(breakpoints.end)
             proposal = control.propose(t, min(max_step, system.step_limit(x)), memory)
-            if proposal.arriving and breakpoints is not None:
-                memory = breakpoints.arrive(t, x, memory)
+            if proposal.singular_arrival and breakpoints is not None:
+                memory = breakpoints.singular_arrival(t, x, memory)
                 continue
             h = proposal.h
             failure = _no_further_step(record, t, h, t_end, unevaluated, words)

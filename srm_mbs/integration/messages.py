@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
+
 NEAR_SINGULAR_SIGMA = 0.05
 """sigma below which the message of a failure names the singular configuration."""
 TIMES_LISTED = 5
@@ -114,3 +116,9 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
         f" Next to singular configurations, up to t = {listed} s, {what} and no shorter step "
         f"mended it: the motion may have changed its branch. {remedy}"
     )
+
+
+def method_messages(method: Method, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+    """Sentences of ``method`` about its limits that the accepted ``steps`` of a run met."""
+    own = getattr(method, "run_messages", None)
+    return "" if own is None else str(own(steps, norm))

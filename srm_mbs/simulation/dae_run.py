@@ -9,16 +9,17 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
-from srm_mbs.integration.control.branch_guard import RateGuard
-from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import StepDecision, initial_step
+from srm_mbs.integration.control.prescribed_times import placed, suspected
+from srm_mbs.integration.control.step_size import ControlWrapper, StepDecision, initial_step
 from srm_mbs.integration.dense_output import step_data
 from srm_mbs.integration.driver import DAE, RunRecord, RunStatus, Tick, integrate
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import branch_changes
-from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method, SweepNode
+from srm_mbs.integration.messages import branch_changes, method_messages
+from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.thesis.messages import drift, instability, passings, restarts
+from srm_mbs.integration.methods.thesis.dae_stability import instability
+from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
+from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.simulation.dae_result import DaeSolution
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
@@ -208,10 +209,9 @@ def solve_dae(
     if events is not None:
         prepared = prepare_events(events, lambda event: event)
         watch = EventWatch(system, method.scheme, prepared, state.size)
-    wrappers: tuple[Placing, ...] = ()
+    wrappers: tuple[ControlWrapper, ...] = ()
     begun: tuple[SweepNode, ...] = ()
     with_sweeps = False
-    carried: list[FloatArray] = []
     try:
         memory = method.start(system, t0, state, norm)
         if memory.sigma < SINGULAR_START:
@@ -220,10 +220,8 @@ def solve_dae(
                 element="x0",
                 remedy="Start beside that point",
             )
-        begun = memory.sweeps
+        begun = sweep_nodes(memory)
         with_sweeps = bool(begun)
-        if with_sweeps:
-            carried.append(begun[-1].multiplier)
 
         def chosen_first_step() -> float:
             if first_step is not None:
@@ -234,8 +232,7 @@ def solve_dae(
         control = step_size_control(method.scheme, t0, t_end, step, chosen_first_step)
         control, wrappers = placed(control, method.scheme, placement, avoided, t_end, step)
         if placement == "automatic":
-            unbounded = with_sweeps and not system.carries_yhat
-            guard = RateGuard(control, system, stops=with_sweeps, unbounded=unbounded)
+            guard = branch_guard(control, system, method)
             control, wrappers = guard, (*wrappers, guard)
         with progress_of(progress, system, t_end) as tick:
             record = integrate(
@@ -255,7 +252,7 @@ def solve_dae(
     except (EvaluationError, ControllerError) as error:
         record = RunRecord(t0, state.copy())
         record.status, record.message = RunStatus.FAILED, f"Stopped at t = {t0:.6g}: {error}."
-    carried += [result.sweeps[-1].multiplier for result in record.steps if result.sweeps]
+    carried = carried_multipliers(begun, record.steps)
     turned = suspected(wrappers)
     unstable = ""
     if record.status is RunStatus.FAILED and with_sweeps and not system.carries_yhat:
@@ -307,9 +304,7 @@ def solve_dae(
         status=record.status,
         message=record.message
         + ("" if with_sweeps else branch_changes(turned, "x' turned", MENDED))
-        + restarts(record.steps)
-        + passings(record.steps)
-        + drift(record.steps, norm),
+        + method_messages(method, record.steps, norm),
         stats=stats,
     )
     log_end("DAE", solution)

@@ -16,8 +16,12 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import SingularProximity, beside_singular, smooth_intervals
-from srm_mbs.integration.control.prescribed_times import Placing
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl, initial_step
+from srm_mbs.integration.control.step_size import (
+    ControlWrapper,
+    StepDecision,
+    StepSizeControl,
+    initial_step,
+)
 from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
@@ -230,7 +234,7 @@ class ReferenceRun(_Live):
         self._make_control = make_control
         self._max_step = max_step
         self._control: StepSizeControl
-        self._wrappers: tuple[Placing, ...] = ()
+        self._wrappers: tuple[ControlWrapper, ...] = ()
         self._memory: IntegratorState
         self._nearness = SingularProximity()
         self._counted = np.zeros(5, dtype=int)

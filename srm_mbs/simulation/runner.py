@@ -18,19 +18,18 @@ from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_control
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.errors import InputError
-from srm_mbs.integration.control.branch_guard import BranchGuard
-from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
+from srm_mbs.integration.control.prescribed_times import placed, suspected
+from srm_mbs.integration.control.step_size import ControlWrapper, StepDecision, StepSizeControl
 from srm_mbs.integration.dense_output import DenseOutput
 from srm_mbs.integration.driver import RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.system import shared
-from srm_mbs.integration.messages import branch_changes
+from srm_mbs.integration.messages import branch_changes, method_messages
 from srm_mbs.integration.methods.base import ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.thesis.messages import drift, passings, restarts
+from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import checked_atol, checked_method, step_size_control
@@ -49,7 +48,7 @@ def assemble_result(
     system: OpenSystem | ClosedSystem,
     method: Method,
     record: RunRecord,
-    wrappers: Sequence[Placing],
+    wrappers: Sequence[ControlWrapper],
     watch: EventWatch | None,
     t_eval: FloatArray | None,
     settings: Settings,
@@ -91,9 +90,7 @@ def assemble_result(
         status=record.status,
         message=record.message
         + branch_changes(suspects, "the velocity turned", MENDED)
-        + restarts(record.steps)
-        + passings(record.steps)
-        + drift(record.steps, norm)
+        + method_messages(method, record.steps, norm)
         + _limits_left(mechanism, dense)
         + _driven_too_far(mechanism, record),
         stats=stats,
@@ -275,7 +272,7 @@ def placed_control(
     placement: str,
     singular_times: FloatArray,
     arrivals: bool = False,
-) -> tuple[StepSizeControl, Sequence[Placing]]:
+) -> tuple[StepSizeControl, Sequence[ControlWrapper]]:
     """The step-size control of a run, and the wrappers in it that count what they did.
 
     ``arrivals``: the driver prepares for ends beside singular configurations.
@@ -293,6 +290,6 @@ def placed_control(
         arrivals,
     )
     if system.has_constraints and placement == "automatic":
-        guard = BranchGuard(control, system)
+        guard = branch_guard(control, system, method)
         return guard, (*wrappers, guard)
     return control, wrappers

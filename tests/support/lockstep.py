@@ -18,8 +18,7 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.branch_guard import BranchGuard
-from srm_mbs.integration.control.placement import SingularityPlacement
-from srm_mbs.integration.control.prescribed_times import SlopeOfSigma
+from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
 from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
 from srm_mbs.integration.kernel.system import make_kernel_system
@@ -180,9 +179,9 @@ def compare(
         # Before the reference proposes: its proposal writes the slope into the memory.
         stop, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
         proposal = control.propose(t, limit, memory)
-        assert proposal.arriving == (stop == ARRIVAL)
-        if proposal.arriving:
-            memory = passing.arrive(t, x, memory)
+        assert proposal.singular_arrival == (stop == ARRIVAL)
+        if proposal.singular_arrival:
+            memory = passing.singular_arrival(t, x, memory)
             out.arrivals += 1
             continue
         try:

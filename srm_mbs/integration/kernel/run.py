@@ -169,7 +169,7 @@ class CompiledRun:
     def arrive(self, passing: BreakpointHandler) -> None:
         """Prepare for the end beside a singular configuration before which the kernel stopped."""
         run = self._run
-        self.remember(passing.arrive(run.t, run.state, self.memory(), run.piece))
+        self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.piece))
 
     def remember(self, memory: IntegratorState) -> None:
         """Carry ``memory`` to the next step."""

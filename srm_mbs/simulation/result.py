@@ -22,7 +22,12 @@ from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import InputError
-from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read, wound_angles
+from srm_mbs.integration.dense_output import (
+    DenseOutput,
+    StepData,
+    checked_output_times,
+    unwrapped_angles,
+)
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
@@ -269,7 +274,7 @@ class Solution(RunOutcome, AnimationMixin):
         InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         states = self._dense(np.atleast_1d(times))
         nq = self.mechanism.model.nq
         q, v = states[:, :nq], states[:, nq:]
@@ -288,7 +293,7 @@ class Solution(RunOutcome, AnimationMixin):
         InputError
             If a time lies outside the run, or ``t`` has not one dimension.
         """
-        times = times_to_read(t)
+        times = checked_output_times(t)
         self._dense.check(times)
         run = Solution(
             self.mechanism,
@@ -331,7 +336,7 @@ class Solution(RunOutcome, AnimationMixin):
             return self.q[:, joint.idx_q], rate
         states = np.hstack([self.q, self.v])
         nq = self.mechanism.model.nq
-        return wound_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
+        return unwrapped_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
 
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:

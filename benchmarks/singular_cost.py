@@ -52,7 +52,7 @@ KERNEL_REPEATS = 10
 def plain_start(system: System, t: float, state: FloatArray) -> IntegratorState:
     """First stage; no multiplier history."""
     terms = system.evaluate(t, state)
-    return IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    return IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
 
 
 def plain_step(
@@ -79,11 +79,11 @@ def plain_step(
         sigmas.append(terms.sigma)
         rate = terms.rate()
         rates[j] = system.chart_rate(delta, rate)
-    magnitude = system.magnitudes(x)
+    state_scale = system.state_scale(x)
     correction = terms.correction()
     if theta != 1.0:
         correction = theta * correction
-    weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+    weights = norm.weights(np.maximum(memory.state_scale, state_scale))
     return StepResult(
         t=t,
         h=h,
@@ -97,7 +97,7 @@ def plain_step(
         zone=None,
         history=None,
         multiplier=None,
-        magnitude=magnitude,
+        state_scale=state_scale,
     )
 
 
@@ -106,7 +106,7 @@ def plain_accept(memory: IntegratorState, result: StepResult) -> None:
     memory.steps += 1
     memory.rate = result.end_rate
     memory.sigma = float(result.sigmas[-1])
-    memory.magnitude = result.magnitude
+    memory.state_scale = result.state_scale
 
 
 @contextmanager
@@ -129,7 +129,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(runner, "placed_control", control),
         patch.object(runner, "start", start),
         patch.object(runner, "bifurcation_sentences", lambda _: ""),
-        patch.object(Closures, "trouble", lambda *_: ""),
+        patch.object(Closures, "failure", lambda *_: None),
     ):
         yield
 

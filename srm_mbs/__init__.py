@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from srm_mbs.integration.kernel.backend import backend
     from srm_mbs.integration.methods.butcher import ButcherTableau
     from srm_mbs.integration.methods.psrm import PSRM
-    from srm_mbs.integration.methods.srm import SRM
     from srm_mbs.integration.methods.tableaus import TABLEAUS
+    from srm_mbs.integration.methods.thesis.srm import SRM
     from srm_mbs.model.anchors import Anchor
     from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
     from srm_mbs.model.dae import SemiExplicitDAE
@@ -95,7 +95,7 @@ _HOME = {
     "MobilityMap": "simulation.mobility",
     "PSRM": "integration.methods.psrm",
     "Polynomial": "model.laws",
-    "SRM": "integration.methods.srm",
+    "SRM": "integration.methods.thesis.srm",
     "SemiExplicitDAE": "model.dae",
     "SimulationError": "errors",
     "Simulator": "simulation.simulator",

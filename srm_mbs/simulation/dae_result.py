@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
-from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read
+from srm_mbs.integration.dense_output import DenseOutput, StepData, checked_output_times
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.simulation.result import RunOutcome, Settings, Statistics
@@ -68,7 +69,7 @@ class DaeResult(RunOutcome):
         self.scheme = method.scheme
         self.attempts = attempts
         self.settings = settings
-        self.status = status
+        self.status = RunStatus(status)
         self.message = message
         self.t_events: list[FloatArray] | None = None
         self.x_events: list[FloatArray] | None = None
@@ -106,7 +107,7 @@ class DaeResult(RunOutcome):
         InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         x, y = self._at(np.atleast_1d(times))
         return (x[0], y[0]) if times.ndim == 0 else (x, y)
 

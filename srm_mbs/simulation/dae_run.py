@@ -11,13 +11,15 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.errors import ControllerError, EvaluationError, InputError
-from srm_mbs.integration.control.branch_guard import RateGuard
-from srm_mbs.integration.control.prescribed_times import Placing, suspected
+from srm_mbs.integration.control.prescribed_times import suspected
+from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.dense_output import step_data
-from srm_mbs.integration.driver import DAE, RunRecord
+from srm_mbs.integration.driver import DAE, RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import drift, instability, passings, restarts, turns
-from srm_mbs.integration.methods.base import ErrorNorm, Method, SweepNode
+from srm_mbs.integration.messages import branch_changes, method_messages
+from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.methods.thesis.dae_stability import instability
+from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
@@ -87,7 +89,7 @@ def _absolute_tolerance(atol: Any, rtol: float, nx: int) -> FloatArray:
 
 
 def _check_start(system: DaeSystem, method: Method, t0: float, x0: FloatArray) -> None:
-    gap = system.closure_gap(t0, x0)
+    gap = system.constraint_residual(t0, x0)
     if not gap <= CONSISTENT:
         raise InputError(
             f"x0 violates g(t0, x0) = 0 by {gap:.1e} (relative error of x)",
@@ -161,7 +163,7 @@ class _DaeRun:
 
     record: RunRecord
     watch: EventWatch | None
-    wrappers: Sequence[Placing] = ()
+    wrappers: Sequence[ControlWrapper] = ()
     first_sweeps: tuple[SweepNode, ...] = ()
 
 
@@ -182,14 +184,11 @@ def _integrate(
                 element="x0",
                 remedy="Start beside that point",
             )
-        run.first_sweeps = memory.sweeps
-        sweeps = bool(memory.sweeps)
-        unbounded = sweeps and not system.carries_yhat
+        run.first_sweeps = sweep_nodes(memory)
         control, run.wrappers = placed_control(
             system,
             options,
             lambda: chosen_first_step(system, norm, options, memory, state),
-            lambda inner: RateGuard(inner, system, stops=sweeps, unbounded=unbounded),
         )
         with progress_of(options.progress, system, options.t_end) as tick:
             run.record = integrate_steps(
@@ -206,7 +205,7 @@ def _add_sweep_failure(
     """Mark and explain in the record that sweeps were unstable, or took another branch of g = 0."""
     record, unstable = run.record, ""
     carries_y = not system.carries_yhat
-    if record.status == "failed" and carries_y:
+    if record.status is RunStatus.FAILED and carries_y:
         eps = getattr(options.method, "regularisation", None)
         unstable = instability(system, options.method.scheme, record, run.first_sweeps, eps)
     if unstable:
@@ -215,11 +214,11 @@ def _add_sweep_failure(
             record.message = f"Stopped at t = {end:.6g}: x' turned. Everything up to there is kept."
         record.message += unstable
     elif turned:
-        if record.status != "failed":  # within the passage
-            record.status = "failed"
+        if record.status is not RunStatus.FAILED:  # within the passage
+            record.status = RunStatus.FAILED
             record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
         record.message += " " + (CARRIED if carries_y else MENDED)
-    elif record.status == "failed" and carries_y:
+    elif record.status is RunStatus.FAILED and carries_y:
         record.message += UNSTABLE
 
 
@@ -236,7 +235,6 @@ def _collect(
     turned = suspected(run.wrappers)
     if sweeps:
         _add_sweep_failure(system, options, run, turned)
-    ends = [*run.first_sweeps[-1:], *(step.sweeps[-1] for step in record.steps if step.sweeps)]
     data = step_data(
         options.t0,
         state,
@@ -252,16 +250,14 @@ def _collect(
         system,
         method,
         data,
-        [sweep.multiplier for sweep in ends],
+        carried_multipliers(run.first_sweeps, record.steps),
         t_eval=options.t_eval,
         attempts=attempt_array(record.attempts),
         settings=settings(options, norm, False, "python"),
         events=None if run.watch is None else run.watch.found(),
         status=record.status,
         message=record.message
-        + ("" if sweeps else turns(turned, "x' turned", MENDED))
-        + restarts(record.steps)
-        + passings(record.steps)
-        + drift(record.steps, norm),
+        + ("" if sweeps else branch_changes(turned, "x' turned", MENDED))
+        + method_messages(method, record.steps, norm),
         stats=statistics(system, record, data, placed, replaced),
     )

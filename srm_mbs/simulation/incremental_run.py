@@ -16,9 +16,13 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import SingularProximity, beside_singular, smooth_intervals
-from srm_mbs.integration.control.prescribed_times import Placing
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl, initial_step
-from srm_mbs.integration.driver import integrate
+from srm_mbs.integration.control.step_size import (
+    ControlWrapper,
+    StepDecision,
+    StepSizeControl,
+    initial_step,
+)
+from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
@@ -173,10 +177,8 @@ class KernelRun(_IncrementalRun):
         if reason == FINISHED:
             return ""
         run = self._run
-        why = why_stopped(reason, self.system, run) or (
-            "the error estimate stays above the tolerance however small the step"
-        )
-        return f"Stopped at t = {run.t:.6g} s with step {run.h:.1e} s: {why}. {LAST_GOOD}."
+        why = why_stopped(reason, self.system, run)
+        return f"Stopped at t = {run.t:.6g} s with step {run.h:.1e} s: {why.sentence}. {LAST_GOOD}."
 
     def snapshot(self) -> Any:
         """Everything that the next step depends on."""
@@ -228,7 +230,7 @@ class ReferenceRun(_IncrementalRun):
         super().__init__(system, held, norm, options, system)
         self._make_control = make_control
         self._control: StepSizeControl
-        self._wrappers: tuple[Placing, ...] = ()
+        self._wrappers: tuple[ControlWrapper, ...] = ()
         self._memory: IntegratorState
         self._nearness = SingularProximity()
         self._counted = np.zeros(5, dtype=int)
@@ -287,9 +289,9 @@ class ReferenceRun(_IncrementalRun):
         rejected = sum(a.verdict is StepDecision.REJECTED for a in record.attempts)
         zones = sum(step.zone is not None for step in record.steps)
         self._counted += [len(record.times), rejected, 0, 0, zones]
-        if record.status == "interrupted":
+        if record.status is RunStatus.INTERRUPTED:
             raise KeyboardInterrupt
-        return "" if record.status == "finished" else record.message
+        return "" if record.status is RunStatus.FINISHED else record.message
 
     def snapshot(self) -> Any:
         """See :meth:`KernelRun.snapshot`."""

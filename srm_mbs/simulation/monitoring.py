@@ -132,7 +132,7 @@ def progress_bar(system: System, t_end: float) -> Iterator[Tick | None]:
             last = now
             detail = f"h = {h:.2e} s"
             if system.has_constraints:
-                detail += f"  drift = {system.closure_gap(t, state):.1e}"
+                detail += f"  drift = {system.constraint_residual(t, state):.1e}"
             draw(t, detail)
 
         yield tick

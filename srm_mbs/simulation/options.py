@@ -21,7 +21,7 @@ from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepSize
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.integration.methods.srm import SRM
+from srm_mbs.integration.methods.thesis.srm import SRM
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""

@@ -17,7 +17,13 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import InputError
-from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read, wound_angles
+from srm_mbs.integration.dense_output import (
+    DenseOutput,
+    StepData,
+    checked_output_times,
+    unwrapped_angles,
+)
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
@@ -102,7 +108,7 @@ class RunOutcome:
 
     steps: StepData
     attempts: NDArray[np.void]
-    status: str
+    status: RunStatus
     message: str
     stats: Statistics
     settings: Settings
@@ -110,7 +116,7 @@ class RunOutcome:
     @property
     def success(self) -> bool:
         """Whether the end, or a terminal event, was reached."""
-        return self.status in ("finished", "event")
+        return self.status in (RunStatus.FINISHED, RunStatus.EVENT)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -181,7 +187,7 @@ class SimulationResult(RunOutcome):
         self.steps = steps
         self.scheme = scheme
         self.attempts = attempts
-        self.status = status
+        self.status = RunStatus(status)
         self.message = message
         self.stats = stats
         self.settings = settings
@@ -231,7 +237,7 @@ class SimulationResult(RunOutcome):
         InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         states = self._dense(np.atleast_1d(times))
         nq = self.mechanism.model.nq
         q, v = states[:, :nq], states[:, nq:]
@@ -250,7 +256,7 @@ class SimulationResult(RunOutcome):
         InputError
             If a time lies outside the run, or ``t`` has not one dimension.
         """
-        times = times_to_read(t)
+        times = checked_output_times(t)
         self._dense.check(times)
         run = type(self)(
             self.mechanism,
@@ -293,7 +299,7 @@ class SimulationResult(RunOutcome):
             return self.q[:, joint.idx_q], rate
         states = np.hstack([self.q, self.v])
         nq = self.mechanism.model.nq
-        return wound_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
+        return unwrapped_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
 
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
@@ -303,7 +309,7 @@ class SimulationResult(RunOutcome):
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:
         """Singular configurations that the run reached without the momentum to choose a branch."""
-        failed = self.status == "failed"
+        failed = self.status is RunStatus.FAILED
         return find_bifurcations(self._system, self.steps, self._dense, self.settings.rtol, failed)
 
     @cached_property

@@ -25,11 +25,15 @@ from srm_mbs.dynamics.system import System
 from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals, smooth_intervals
-from srm_mbs.integration.control.branch_guard import BranchGuard, RateGuard
-from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl, initial_step
+from srm_mbs.integration.control.prescribed_times import placed, suspected
+from srm_mbs.integration.control.step_size import (
+    ControlWrapper,
+    StepDecision,
+    StepSizeControl,
+    initial_step,
+)
 from srm_mbs.integration.dense_output import DenseOutput, StepData
-from srm_mbs.integration.driver import RunRecord, Tick
+from srm_mbs.integration.driver import RunRecord, RunStatus, Tick
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import uses_kernel
@@ -37,9 +41,15 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.run import CompiledRun
 from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
-from srm_mbs.integration.messages import drift, passings, restarts, turns
+from srm_mbs.integration.messages import (
+    MECHANISM,
+    ProblemVocabulary,
+    branch_changes,
+    method_messages,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.mechanism import per_model, per_start
@@ -76,7 +86,6 @@ SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
 
 Result = TypeVar("Result", bound=SimulationResult)
 Outcome = TypeVar("Outcome", bound=RunOutcome)
-Guard = BranchGuard | RateGuard
 
 
 @dataclass(eq=False)
@@ -345,17 +354,14 @@ def placed_control(
     system: System,
     options: RunOptions,
     first_step: Callable[[], float],
-    guard: Callable[[StepSizeControl], Guard] | None = None,
     arrivals: bool = False,
-) -> tuple[StepSizeControl, Sequence[Placing]]:
+) -> tuple[StepSizeControl, Sequence[ControlWrapper]]:
     """The step-size control of a run, and the wrappers in it that count what they did.
 
     Parameters
     ----------
     first_step
         Length (s) of the first step, asked for if the control needs it.
-    guard
-        Wraps a control to keep the run on its branch.
     arrivals
         Whether the driver prepares for ends beside singular configurations.
     """
@@ -364,16 +370,16 @@ def placed_control(
     placement = options.placement if system.has_constraints else None
     times = options.singular_times
     control, wrappers = placed(control, scheme, placement, times, t_end, options.step, arrivals)
-    if guard is None or placement != "automatic":
+    if placement != "automatic":
         return control, wrappers
-    guarded = guard(control)
-    return guarded, (*wrappers, guarded)
+    guard = branch_guard(control, system, options.method)
+    return guard, (*wrappers, guard)
 
 
 # --- integrate ------------------------------------------------------------------------------------
 
 
-def integrate_problem(problem: Problem) -> tuple[RunRecord, Sequence[Placing], Any]:
+def integrate_problem(problem: Problem) -> tuple[RunRecord, Sequence[ControlWrapper], Any]:
     """The record of the run, the wrappers of its control, and the kernel's system if there is one.
 
     Whatever happens on the way ends in the record: a start that cannot be evaluated, too.
@@ -399,14 +405,12 @@ def integrate_problem(problem: Problem) -> tuple[RunRecord, Sequence[Placing], A
         with progress_of(options.progress, system, options.t_end) as tick:
             if kernel_system is not None:
                 run = kernel_run(problem, kernel_system, memory, handler.arrivals, first_step)
-                wrappers: Sequence[Placing] = ()
+                wrappers: Sequence[ControlWrapper] = ()
                 record: RunRecord = kernel_driver.integrate(
                     system, run, tick=tick, events=problem.watch, passing=handler
                 )
             else:
-                control, wrappers = placed_control(
-                    system, options, first_step, mechanism_guard(system), handler.arrivals
-                )
+                control, wrappers = placed_control(system, options, first_step, handler.arrivals)
                 record = integrate_steps(
                     system,
                     options,
@@ -435,7 +439,7 @@ def integrate_steps(
     tick: Tick | None,
     watch: EventWatch | None,
     handler: BreakpointHandler | None = None,
-    words: driver.ProblemVocabulary = driver.MECHANISM,
+    words: ProblemVocabulary = MECHANISM,
 ) -> RunRecord:
     """The run with the Python reference; see :func:`srm_mbs.integration.driver.integrate`."""
     return driver.integrate(
@@ -481,15 +485,6 @@ def kernel_run(
     )
 
 
-def mechanism_guard(
-    system: OpenSystem | ClosedSystem,
-) -> Callable[[StepSizeControl], Guard] | None:
-    """The guard of a mechanism's branch; None without closures."""
-    if not system.has_constraints:
-        return None
-    return lambda control: BranchGuard(control, system)
-
-
 def chosen_first_step(
     evaluator: Any,
     norm: ErrorNorm,
@@ -510,7 +505,8 @@ def chosen_first_step(
 def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "") -> RunRecord:
     """The record of a run that could not make its first step."""
     record = RunRecord(t0, state.copy())
-    record.status, record.message = "failed", f"Stopped at t = {t0:.6g}{unit}: {error}."
+    record.status = RunStatus.FAILED
+    record.message = f"Stopped at t = {t0:.6g}{unit}: {error}."
     return record
 
 
@@ -555,7 +551,7 @@ def settings(options: RunOptions, norm: ErrorNorm, controlled: bool, backend: st
 def assemble_result(
     problem: Problem,
     record: RunRecord,
-    wrappers: Sequence[Placing],
+    wrappers: Sequence[ControlWrapper],
     kernel_system: Any,
     result_type: type[Result],
 ) -> Result:
@@ -585,10 +581,8 @@ def assemble_result(
         events=None if problem.watch is None else problem.watch.found(),
         status=record.status,
         message=record.message
-        + turns(suspects, "the velocity turned", SMALLER_STEPS)
-        + restarts(record.steps)
-        + passings(record.steps)
-        + drift(record.steps, problem.norm)
+        + branch_changes(suspects, "the velocity turned", SMALLER_STEPS)
+        + method_messages(options.method, record.steps, problem.norm)
         + _limits_left(mechanism, dense)
         + _driven_too_far(mechanism, record),
         stats=statistics(system, record, data, placed, replaced),
@@ -598,7 +592,7 @@ def assemble_result(
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     """What else may be the cause where a driven mechanism cannot go on."""
-    if record.status != "failed" or not mechanism.drives:
+    if record.status is not RunStatus.FAILED or not mechanism.drives:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)
     return f" A drive ({names}) may lead where the mechanism cannot follow."

@@ -11,7 +11,8 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
-from srm_mbs.integration.dense_output import StepData, check_within, times_to_read
+from srm_mbs.integration.dense_output import StepData, check_within, checked_output_times
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
 from srm_mbs.simulation.energy_balance import EnergyBalance, joined_balance
 from srm_mbs.simulation.result import SimulationResult, Statistics
@@ -43,7 +44,7 @@ class SegmentedResult(SimulationResult):
         first = self.segments[0]
         self.mechanism = first.mechanism
         self.scheme, self.settings = first.scheme, first.settings
-        self.status, self.message = status, message
+        self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
         self.stats = _added([segment.stats for segment in self.segments])
@@ -88,13 +89,13 @@ class SegmentedResult(SimulationResult):
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output, right-continuous; see :class:`~srm_mbs.Solution`."""
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         found = self.at(np.atleast_1d(times))
         return (found.q[0], found.v[0]) if times.ndim == 0 else (found.q, found.v)
 
     def at(self, t: Any) -> Self:
         """The same run read at other times; see :meth:`~srm_mbs.Solution.at`."""
-        times = times_to_read(t)
+        times = checked_output_times(t)
         start, end = self.span
         check_within(times, start, end)
         run = type(self)(

@@ -31,7 +31,6 @@ from srm_mbs.simulation.runner import (
     check_consistent,
     check_mechanism,
     checked_accuracy,
-    mechanism_guard,
     placed_control,
 )
 
@@ -122,9 +121,7 @@ class Simulator:
                 held,
                 norm,
                 options,
-                lambda first: placed_control(
-                    system, options, lambda: first, mechanism_guard(system)
-                ),
+                lambda first: placed_control(system, options, lambda: first),
             )
         self._nq = mechanism.model.nq
         self._wall_time = 0.0

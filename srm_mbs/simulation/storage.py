@@ -34,8 +34,8 @@ from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel.dense_output import dense_output
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.integration.methods.srm import SRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
+from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive

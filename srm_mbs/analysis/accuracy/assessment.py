@@ -16,7 +16,7 @@ from srm_mbs.analysis.accuracy.error_estimate import (
     ErrorEstimate,
     Trial,
 )
-from srm_mbs.integration.methods.regularisation import parse_eps
+from srm_mbs.integration.methods.thesis.regularisation import parse_eps
 from srm_mbs.simulation.result import SimulationResult
 
 Grade = Literal["good", "fair", "poor", "unknown"]

@@ -28,7 +28,7 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.simulation.options import numbers
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 TOLERANCE = 1e-6
 """Default of ``tolerance``."""
@@ -89,7 +89,7 @@ def _motion(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """t (n,), q (n, nq), v (n, nv), a (n, nv) of what was given."""
     nq, nv = mechanism.model.nq, mechanism.model.nv
-    if isinstance(motion, Solution):
+    if isinstance(motion, SimulationResult):
         if (motion.mechanism.model.nq, motion.mechanism.model.nv) != (nq, nv):
             raise InputError(
                 "the run is one of another mechanism",
@@ -144,7 +144,7 @@ def inverse_dynamics(
     mechanism
         Its gravity, force elements, damping and friction act as well.
     motion
-        A run (:class:`~srm_mbs.simulation.result.Solution`; its controller is part of what is to be
+        A run (:class:`~srm_mbs.api.Solution`; its controller is part of what is to be
         found), arrays (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t
         that returns q, v, a.
     actuated

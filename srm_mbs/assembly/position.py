@@ -26,7 +26,7 @@ from srm_mbs.dynamics.constraints.rows import support, world_jacobian
 from srm_mbs.dynamics.scaling import coordinate_units, periodic_coordinates, row_angles
 from srm_mbs.dynamics.singularities.local_analysis import refine_singular_point
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.forces import OPEN, LimitSpring
+from srm_mbs.model.forces import OPEN_LIMIT, LimitSpring
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 CLOSED = 1e-12
@@ -365,7 +365,7 @@ def limit_springs(mechanism: MechanismData) -> tuple[LimitSpring, ...]:
     for name, _, j, low, high in _limited(mechanism):
         moved = max(float(inertia[j]), SMALLEST_INERTIA * float(inertia.max()))
         stiffness = moved * (CONTACT * rate) ** 2
-        if name not in there and min(abs(low), abs(high)) < OPEN:
+        if name not in there and min(abs(low), abs(high)) < OPEN_LIMIT:
             damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * moved))
             out.append(LimitSpring(name, stiffness, damping, name=f"limit_{name}"))
     return tuple(out)

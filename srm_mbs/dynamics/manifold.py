@@ -283,11 +283,11 @@ class Manifold:
         out[..., : self.nv] = delta[..., self.nv :]
         return out
 
-    def size(self, delta: FloatArray) -> float:
+    def position_norm(self, delta: FloatArray) -> float:
         """max |dq| over units; see :class:`~srm_mbs.dynamics.system.System`."""
         return float((np.abs(delta[: self.nv]) / self._unit).max())
 
-    def magnitudes(self, state: FloatArray) -> FloatArray:
+    def state_scale(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
 
         Angles are capped at 1 rad so that the accuracy does not decay with winding.

@@ -19,7 +19,7 @@ The forces tau are those of the controller, joint damping and friction, and forc
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from scipy.linalg import blas
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import (
@@ -41,7 +42,7 @@ from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
-from srm_mbs.dynamics.system import Terms, Zone
+from srm_mbs.dynamics.system import SingularityAnalysis, Terms, Zone
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.mechanism import per_model, per_start
 
@@ -53,7 +54,7 @@ class OpenTerms:
 
     sigma = np.inf
     rank = 0
-    weak = False
+    rank_deficient = False
     held = False
 
     def __init__(self, nv: int) -> None:
@@ -72,7 +73,7 @@ class OpenTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return np.zeros(self._nv)
 
-    def gap(self) -> float:
+    def constraint_residual(self) -> float:
         return 0.0
 
     def correction(self) -> FloatArray:
@@ -92,16 +93,16 @@ class ClosedTerms:
         self,
         projection: Projection,
         loops: LoopKinematics | DrivenKinematics,
-        gap_scale: FloatArray,
+        residual_scale: FloatArray,
     ) -> None:
         self._p = projection
         self._loops = loops
         self._target_rate = loops.target_rate if isinstance(loops, DrivenKinematics) else None
-        self._gap_scale = gap_scale
+        self._residual_scale = residual_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
         self.sigma = projection.sigma
-        self.weak = projection.weak
+        self.rank_deficient = projection.rank_deficient
 
     @property
     def rank(self) -> int:
@@ -153,9 +154,9 @@ class ClosedTerms:
             white if self._target_rate is None else white - s * p.normal(self._target_rate[p.order])
         )
 
-    def gap(self) -> float:
-        gaps = self._loops.g * self._gap_scale
-        return abs(float(gaps.item(_largest(gaps))))
+    def constraint_residual(self) -> float:
+        residuals = self._loops.g * self._residual_scale
+        return abs(float(residuals.item(_largest(residuals))))
 
     def correction(self) -> FloatArray:
         p = self._p
@@ -330,13 +331,14 @@ class OpenSystem(Mechanics):
 
     has_constraints = False
     factorisations = 0
+    singularities = None
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self._zero = np.zeros(self.nv)
         self._terms = OpenTerms(self.nv)
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """0: there is no closure."""
         return 0.0
 
@@ -399,7 +401,7 @@ def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
 
 
 @per_start
-def _gap_scale(mechanism: Mechanism) -> FloatArray:
+def _residual_scale(mechanism: Mechanism) -> FloatArray:
     """Factor (m,) from each scaled row in use to row units."""
     structure = mechanism.structure
     unit = constraint_units(mechanism, structure.units)
@@ -414,7 +416,7 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
-        self._gap_scale = _gap_scale(mechanism)
+        self._residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
 
@@ -435,7 +437,7 @@ class ClosedSystem(Mechanics):
 
     @cached_property
     def _terms(self) -> ClosedTerms:
-        return ClosedTerms(self.projection, self.loops, self._gap_scale)
+        return ClosedTerms(self.projection, self.loops, self._residual_scale)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
@@ -444,7 +446,7 @@ class ClosedSystem(Mechanics):
 
     def constants_of_start(self) -> dict[str, Any]:
         """As for open mechanisms, and the scales of the closures."""
-        return super().constants_of_start() | {"gap_scale": self._gap_scale}
+        return super().constants_of_start() | {"gap_scale": self._residual_scale}
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""
@@ -460,6 +462,19 @@ class ClosedSystem(Mechanics):
         """Count what the compiled kernel did for this system."""
         super().count(evaluations, factorisations)
         self.projection.factorisations += factorisations
+
+    @cached_property
+    def singularities(self) -> SingularityAnalysis:
+        """Data for the analysis of singular configurations."""
+        mechanism, structure = self.mechanism, self.structure
+        return SingularityAnalysis(
+            mechanism.q0,
+            structure.rank,
+            structure.sigma_ref,
+            structure.units.coordinate,
+            structure.units.rate,
+            partial(geometry_of, mechanism),
+        )
 
     @property
     def factorisations(self) -> int:
@@ -494,9 +509,9 @@ class ClosedSystem(Mechanics):
         terms = self._terms
         terms.v = v
         terms.sigma = projection.sigma
-        terms.weak = projection.weak
+        terms.rank_deficient = projection.rank_deficient
         terms.predicted = None
-        if projection.weak and zone is not None:
+        if projection.rank_deficient and zone is not None:
             terms.predicted = zone.predict(t)
             if terms.predicted is None:
                 if zone.normals is None:
@@ -510,10 +525,10 @@ class ClosedSystem(Mechanics):
                 projection.hold(zone.normals)
         return terms
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""
         g, _ = self.residuals(state, t)
-        return float(np.max(np.abs(g) * self._gap_scale))
+        return float(np.max(np.abs(g) * self._residual_scale))
 
     def _update(self, t: float, q: FloatArray, with_bias: bool = True) -> None:
         """The rows at t and q, for which ``data`` has the kinematics."""

@@ -34,16 +34,16 @@ _KNOWN = (
 
 @dataclass(frozen=True)
 class PinocchioConstraints:
-    """Result of :meth:`srm_mbs.Mechanism.to_pinocchio`.
+    """Closures of a mechanism in Pinocchio's form: :meth:`srm_mbs.Mechanism.to_pinocchio`.
 
     Attributes
     ----------
     models
         ``pin.StdVec_RigidConstraintModel``, for ``pin.initConstraintDynamics``; in LOCAL frames.
     names
-        The closures that they are, in this order.
+        Names of these closures, in the same order.
     without
-        Names of the closures, and of the drives, for which Pinocchio has none.
+        Names of the closures and drives for which Pinocchio has no constraint model.
     """
 
     models: Any

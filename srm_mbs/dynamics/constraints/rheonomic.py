@@ -20,7 +20,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination, LoopKinematics, all_rows, closure_errors
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.drives import NOMINAL, Drive, in_order_of_rows
+from srm_mbs.model.drives import NOMINAL_LENGTH, Drive, in_order_of_rows
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.mechanism import MechanismData
 
@@ -81,8 +81,10 @@ class DrivenKinematics:
             (
                 first + k,
                 1.0 / float(scale[total - len(ordered) + k]),
-                # The row of a distance is |p| - NOMINAL.
-                curves[drive.name].shifted(-NOMINAL) if drive.distance else curves[drive.name],
+                # The row of a distance is |p| - NOMINAL_LENGTH.
+                curves[drive.name].shifted(-NOMINAL_LENGTH)
+                if drive.distance
+                else curves[drive.name],
             )
             for k, drive in enumerate(ordered)
             if curves is not None

@@ -1,12 +1,12 @@
 """Load-time analysis of the closures: row scales, structural rank, redundant rows.
 
-A walk on the closure manifold (docs/notation.md, "The walk") visits
+A walk on the closure manifold (docs/notation.md, "Manifold sampling") visits
 closed configurations from several restarts, because the start may itself be singular, and open
 random configurations alone give the wrong rank for over-constrained loops.
 
 The walk on the closure manifold that the load-time analysis makes, and its scaled rows.
 
-Source: docs/notation.md, "The walk" and "Scales of rows".
+Source: docs/notation.md, "Load-time analysis".
 """
 
 from __future__ import annotations
@@ -452,7 +452,7 @@ def row_names(mechanism: MechanismData) -> tuple[str, ...]:
 def analyse(mechanism: MechanismData) -> Structure:
     """Row scales, structural rank, reference pivot and zero rows of ``mechanism``.
 
-    Deterministic: the walk uses a fixed seed.  Source: docs/notation.md, "The walk".
+    Deterministic: the walk uses a fixed seed.  Source: docs/notation.md, "Manifold sampling".
 
     Raises
     ------

@@ -76,7 +76,7 @@ def _idle_or_new(system: ClosedSystem | OpenSystem) -> Any:
 class _TwinTerms:
     """Terms of a regular stage, evaluated by the kernel."""
 
-    weak = False
+    rank_deficient = False
     held = False
 
     def __init__(self, found: dict[str, Any]) -> None:
@@ -124,7 +124,7 @@ class Evaluator:
         """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
         try:
             return self._kernel_system.first_step(  # type: ignore[no-any-return]
-                t, state, memory.rate, memory.magnitude, norm.atol, norm.one, norm.rtol, span,
+                t, state, memory.rate, memory.state_scale, norm.atol, norm.one, norm.rtol, span,
                 order, FIRST_STEP,
             )  # fmt: skip
         except ArithmeticError:  # the reference says why

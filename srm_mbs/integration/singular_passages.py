@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.dynamics.constraints.structure import BLUNT
+from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.local_analysis import (
     Participants,
@@ -411,7 +411,7 @@ def find_crossings(
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
     monitor = ConstraintMonitor(analysis, dense)
-    if analysis.sigma_reference < BLUNT:
+    if analysis.sigma_reference < SMALL_REFERENCE_PIVOT:
         sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
     found: list[Crossing] = []

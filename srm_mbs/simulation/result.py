@@ -217,7 +217,7 @@ class SimulationResult(RunOutcome):
 
     @property
     def held(self) -> HeldForce | None:
-        """What a sampled controller held; None without one."""
+        """Forces that a sampled controller held; None without one."""
         return self._system.held
 
     @property

@@ -326,7 +326,7 @@ def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
 def event_watch(
     events: Any, system: OpenSystem | ClosedSystem, method: Method, state: FloatArray
 ) -> EventWatch | None:
-    """What looks for the events (t, q, v) -> float; None if none are given."""
+    """The detector of the events (t, q, v) -> float; None if none are given."""
     if events is None:
         return None
 
@@ -339,7 +339,7 @@ def event_watch(
 def sampler(
     system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, kernel_system: Any
 ) -> Callable[[float, FloatArray], None]:
-    """What samples ``controller`` at (t, state), for ``held`` and for the kernel."""
+    """A function (t, state) that samples ``controller`` for ``held`` and for the kernel."""
 
     def sample(t: float, state: FloatArray) -> None:
         force = evaluate_controller(controller, t, *system.split(state))
@@ -591,7 +591,7 @@ def assemble_result(
 
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
-    """What else may be the cause where a driven mechanism cannot go on."""
+    """A sentence on drives as a possible cause of a failure; empty without them."""
     if record.status is not RunStatus.FAILED or not mechanism.drives:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)

@@ -570,7 +570,7 @@ def assemble_result(
         suspects = suspected(wrappers)
     # Counted before anything below reads the dense output, which evaluates stages.
     stats = statistics(system, record, data, placed, replaced)
-    controlled = options.controller is not None or system.calls_forces
+    controlled = options.controller is not None or system.has_user_forces
     by = "kernel" if problem.on_kernel else "python"
     return result_type(
         mechanism,

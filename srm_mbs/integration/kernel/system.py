@@ -25,8 +25,8 @@ LARGEST_KEPT = 64
 def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
     """The kernel's twin of ``system``, with a workspace of its own."""
     held = system.held
-    calls = system.calls_forces or (system.controlled and held is None)
-    controller = system.called_force if calls else None
+    calls = system.has_user_forces or (system.controlled and held is None)
+    controller = system.callback_force if calls else None
     assembled = system.model, system.constants(), controller
     kernel_system = core.System(*assembled)  # type: ignore[union-attr]
     if held is not None:
@@ -41,7 +41,7 @@ def shared(system: ClosedSystem | OpenSystem) -> bool:
     return (
         system.nv <= LARGEST_KEPT
         and system.held is None
-        and not (system.controlled or system.calls_forces or system.mechanism.drives)
+        and not (system.controlled or system.has_user_forces or system.mechanism.drives)
     )
 
 

@@ -57,7 +57,7 @@ public:
     double sigma_ref;
     double sigma = 0.0;
     int rank = 0;
-    bool weak = false;
+    bool rank_deficient = false;
     bool held = false;
     long factorisations = 0;
     std::vector<double> white_force, white_multiplier;

@@ -11,7 +11,12 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.control.step_size import initial_step
-from srm_mbs.integration.kernel.marshalling import FIRST_STEP
+from srm_mbs.integration.kernel.marshalling import (
+    CONSTANTS,
+    norm_struct,
+    state_struct,
+    system_struct,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 
 KEPT = 4
@@ -21,12 +26,12 @@ LARGEST_KEPT = 64
 
 
 def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
-    """The kernel's twin of ``system``, with a workspace of its own."""
+    """The mechanism of ``system`` in the kernel, with a workspace of its own."""
     held = system.held
     calls = system.calls_forces or (system.controlled and held is None)
     controller = system.called_force if calls else None
-    assembled = system.model, system.constants(), controller
-    kernel_system = core.System(*assembled)  # type: ignore[union-attr]
+    data = system_struct(system.constants())
+    kernel_system = core.System(system.model, data, controller)  # type: ignore[union-attr]
     if held is not None:
         for t, force in zip(held.times, held.values):
             kernel_system.hold(t, force, True)
@@ -119,9 +124,8 @@ class Evaluator:
         """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
         try:
             return self._kernel_system.first_step(  # type: ignore[no-any-return]
-                t, state, memory.rate, memory.magnitude, norm.atol, norm.one, norm.rtol, span,
-                order, FIRST_STEP,
-            )  # fmt: skip
+                t, state, state_struct(memory), norm_struct(norm), span, order, CONSTANTS
+            )
         except ArithmeticError:  # the reference says why
             return initial_step(self, state, memory, norm, span, order, t)
 

@@ -50,7 +50,7 @@ namespace srm {
     field(int, max_guard_retries)          /* tries per step */                                    \
     /* Driver: driver.py, singular_endpoints.py, breakpoints.py. */                                \
     field(double, smallest_step)           /* over the length of the run */                        \
-    field(double, standstill)              /* progress in standstill_steps, over the run's length */ \
+    field(double, standstill)              /* progress in standstill_steps / length of run */ \
     field(int, standstill_steps)                                                                   \
     field(double, large_correction)        /* units */                                             \
     field(double, open_residual)           /* of rows, before the correction */                    \

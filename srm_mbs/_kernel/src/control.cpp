@@ -113,9 +113,9 @@ bool Gaps::ends_on(double distance, double h) const {
 
 double Gaps::step_over(double distance) const { return distance / wide_ends_.back(); }
 
-SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner, const ButcherTableau& scheme,
-                                           double t_end, const Constants& constants,
-                                           bool arrivals)
+SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner,
+                                           const ButcherTableau& scheme, double t_end,
+                                           const Constants& constants, bool arrivals)
     : ControlWrapper(std::move(inner)),
       constants_(constants),
       t_end_(t_end),
@@ -270,8 +270,8 @@ bool BranchGuard::velocity_jumps(const StepResult& result) const {
         halfway[i] = 0.5 * result.h * (start[nv + i] + end[nv + i]);
         jump[i] = end[i] - start[i] - halfway[i];
     }
-    const double size =
-        std::max({system_.position_norm(start), system_.position_norm(end), system_.position_norm(halfway)});
+    const double size = std::max({system_.position_norm(start), system_.position_norm(end),
+                                  system_.position_norm(halfway)});
     return system_.position_norm(jump) > constants_.branch_change * size;
 }
 

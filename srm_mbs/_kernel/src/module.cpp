@@ -24,7 +24,7 @@ using namespace srm;
 
 namespace {
 
-// ---- Support -------------------------------------------------------------------------------------
+// ---- Support ------------------------------------------------------------------------------------
 
 // The vector `array`, which has `size` numbers.
 const double* vector_of(const Array& array, int size, const char* name) {
@@ -80,7 +80,7 @@ const void* pinocchio_model_in(nb::handle model) {
     return found;
 }
 
-// ---- Structs -------------------------------------------------------------------------------------
+// ---- Structs ------------------------------------------------------------------------------------
 
 void bind_structs(nb::module_& m) {
     bind_struct<Constants>(m, "Constants");
@@ -105,7 +105,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<DenseConstants>(m, "DenseConstants");
 }
 
-// ---- System --------------------------------------------------------------------------------------
+// ---- System -------------------------------------------------------------------------------------
 
 struct PySystem {
     nb::object model, controller;  // kept alive
@@ -198,16 +198,18 @@ void bind_system(nb::module_& m) {
         .def("first_step", &PySystem::first_step)
         .def("repeat", &PySystem::repeat)
         .def("repeat_tree", &PySystem::repeat_tree)
-        .def("between", [](PySystem& s, double first, double last) { s.system->between(first, last); })
+        .def("between",
+             [](PySystem& s, double first, double last) { s.system->between(first, last); })
         .def("hold", &PySystem::hold)
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
              nb::arg("damping").none(), nb::arg("friction").none())
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
-        .def_prop_ro("factorisations", [](const PySystem& s) { return s.system->factorisations(); });
+        .def_prop_ro("factorisations",
+                     [](const PySystem& s) { return s.system->factorisations(); });
 }
 
-// ---- Run -----------------------------------------------------------------------------------------
+// ---- Run ----------------------------------------------------------------------------------------
 
 // The records of a run, and the shapes of their arrays.
 struct PyRecords {
@@ -458,7 +460,7 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("replaced", [](const PyRun& r) { return r.run->control->replaced; });
 }
 
-// ---- Dense output --------------------------------------------------------------------------------
+// ---- Dense output -------------------------------------------------------------------------------
 
 #define SRM_PY_STEPS(field)                                                           \
     field(Array, times)             /* (k + 1,) */                                    \
@@ -501,7 +503,8 @@ struct PySteps {
         out.break_rates = break_rates.data();
         out.in_zone.assign(k, 0);
         for (long step : zones) {
-            if (step < 0 || step >= out.count) throw nb::value_error("StepArrays.zones: no such step");
+            if (step < 0 || step >= out.count)
+                throw nb::value_error("StepArrays.zones has a step that is not there");
             out.in_zone[static_cast<std::size_t>(step)] = 1;
         }
         return out;
@@ -512,8 +515,8 @@ struct PySteps {
         bool same = array.ndim() == shape.size();
         for (std::size_t i = 0; same && i < shape.size(); ++i)
             same = array.shape(i) == shape.begin()[i];
-        if (!same)
-            throw nb::value_error((std::string("StepArrays.") + field + " has another shape").c_str());
+        const std::string place = std::string("StepArrays.") + field;
+        if (!same) throw nb::value_error((place + " has another shape").c_str());
     }
 };
 

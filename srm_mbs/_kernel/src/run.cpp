@@ -169,8 +169,9 @@ Stop Run::attempt(StepDecision& decision) {
     const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
     const long made = records.count();
-    if (made >= constants().standstill_steps && made % constants().standstill_steps == 0 &&
-        t_ - records.times[made - constants().standstill_steps] < constants().standstill * (t_end() - t0_))
+    const int steps = constants().standstill_steps;
+    if (made >= steps && made % steps == 0 &&
+        t_ - records.times[made - steps] < constants().standstill * (t_end() - t0_))
         return Stop::standstill;
     const StepResult* result = nullptr;
     try {
@@ -185,7 +186,8 @@ Stop Run::attempt(StepDecision& decision) {
     redone_ = decision == StepDecision::replaced;
     if (decision != StepDecision::accepted || !result) {
         attempts.push_back({t_, h, result ? result->error_ratio : inf, decision});
-        return !control->adaptive && decision == StepDecision::rejected ? Stop::evaluation : Stop::chunk;
+        const bool stuck = !control->adaptive && decision == StepDecision::rejected;
+        return stuck ? Stop::evaluation : Stop::chunk;
     }
     evaluation_failed = false;
     if (leaves_closures_open(*result)) return Stop::closures;

@@ -20,10 +20,12 @@ namespace nb = nanobind;
 using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 
 // A NumPy array that owns `values`.
-inline nb::object owned_array(std::vector<double> values, std::initializer_list<std::size_t> shape) {
+inline nb::object owned_array(std::vector<double> values,
+                              std::initializer_list<std::size_t> shape) {
     auto* kept = new std::vector<double>(std::move(values));
     nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), shape.size(), shape.begin(), owner));
+    return nb::cast(
+        nb::ndarray<nb::numpy, double>(kept->data(), shape.size(), shape.begin(), owner));
 }
 
 inline nb::object owned_array(std::vector<double> values) {
@@ -96,12 +98,11 @@ T from_keywords(const std::string& name, const nb::kwargs& given) {
         }
     });
     if (used < given.size()) {
-        for (auto [key, value] : given) {
+        for (auto item : given) {
+            const auto key = nb::cast<std::string>(item.first);
             bool known = false;
-            T::template each_field<T>(
-                [&](const char* field, auto) { known = known || nb::cast<std::string>(key) == field; });
-            if (!known)
-                throw nb::type_error((name + " has no field " + nb::cast<std::string>(key)).c_str());
+            T::template each_field<T>([&](const char* field, auto) { known |= key == field; });
+            if (!known) throw nb::type_error((name + " has no field " + key).c_str());
         }
     }
     if constexpr (HasCheck<T>::value) {

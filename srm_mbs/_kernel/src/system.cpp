@@ -126,7 +126,8 @@ bool System::held() const { return closed_ && projection_->held; }
 // All rows: g, Gdot v, and G into the columns of the projection.
 void System::update_closures(const double* q, bool with_bias) {
     for (const ClosureRows& closure : data_.closures) {
-        if (!closure.directions.empty() || !closure.distances.empty()) update_positions(closure, with_bias);
+        if (!closure.directions.empty() || !closure.distances.empty())
+            update_positions(closure, with_bias);
         if (!closure.alignments.empty()) update_alignments(closure, with_bias);
     }
     for (const JointRow& joints : data_.joint_rows) {
@@ -161,8 +162,8 @@ void System::fill(const ClosureRows& closure, int row, const Vec& force, const V
 
 // Rows along directions and distances of points.
 //
-// x is the point of anchor a in the world, p its offset from the point of anchor b in the axes of b,
-// r and bias the first derivative of p and the second without accelerations of the joints.
+// x is the point of anchor a in the world, p its offset from the point of anchor b in the axes of
+// b, r and bias the first derivative of p and the second without accelerations of the joints.
 void System::update_positions(const ClosureRows& closure, bool with_bias) {
     const Body a(work_->data, closure.joint_a), b(work_->data, closure.joint_b);
     const bool ground = closure.joint_b == 0;
@@ -264,7 +265,8 @@ const double* System::held_force(double t) const {
     std::size_t k = held_from_.size() - 1;
     if (t < held_from_[k] && k > 0) {
         const auto after = std::upper_bound(held_from_.begin(), held_from_.end(), t);
-        k = after == held_from_.begin() ? 0 : static_cast<std::size_t>(after - held_from_.begin()) - 1;
+        const auto later = static_cast<std::size_t>(after - held_from_.begin());
+        k = later == 0 ? 0 : later - 1;
     }
     return &held_[k * nv];
 }
@@ -334,7 +336,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         return;
     }
     pinocchio_model::compute_terms(w);
-    for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
+    for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
     if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
     update_closures(state, true);
@@ -396,7 +398,8 @@ void System::correction(double* out) {
 
 double System::closure_residual() const {
     double out = 0.0;
-    for (int i = 0; i < data_.rows; ++i) out = std::max(out, std::abs(g_[i] * data_.residual_scale[i]));
+    for (int i = 0; i < data_.rows; ++i)
+        out = std::max(out, std::abs(g_[i] * data_.residual_scale[i]));
     return out;
 }
 

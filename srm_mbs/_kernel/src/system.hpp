@@ -110,7 +110,7 @@ using Controller = std::function<void(double, const double*, const double*, doub
     field(std::vector<double>, friction)        /* (nv,) or empty */                             \
     field(double, friction_speed)                                                                \
     field(std::vector<ForceElement>, forces)                                                     \
-    field(double, coincident)                   /* distance of points that count as one, relative */ \
+    field(double, coincident)                   /* relative distance of points that count as one */ \
     field(std::vector<GroupJoint>, groups)                                                       \
     field(std::vector<double>, series)          /* of dexp^-1 */                                 \
     field(std::vector<int>, wrapped_angles)     /* velocity indices of (cos, sin) joints */      \

@@ -365,7 +365,7 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
         x = np.concatenate([q, rng.uniform(-1.0, 1.0, model.nv)])
         terms = system.evaluate(0.0, x)
         found = kernel_system.terms(0.0, x, -1.0)
-        for what in ("rate", "correction", "multiplier", "sigma", "gap"):
+        for what in ("rate", "correction", "multiplier", "sigma", "constraint_residual"):
             theirs = getattr(terms, what)
             theirs = theirs if what == "sigma" else theirs()
             np.testing.assert_allclose(found[what], theirs, rtol=1e-9, atol=1e-10)

@@ -151,7 +151,7 @@ struct PySystem {
         out["multiplier"] = owned_array(std::move(multiplier));
         out["sigma"] = system->sigma();
         out["rank"] = system->rank();
-        out["gap"] = system->closure_residual();
+        out["constraint_residual"] = system->closure_residual();
         return out;
     }
 

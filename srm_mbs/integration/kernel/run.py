@@ -137,9 +137,9 @@ class CompiledRun:
             zone=zone,
             history=history,
             multiplier=None,
-            magnitude=r.state_scale,
+            state_scale=r.state_scale,
             quiet=r.quiet,
-            gap=r.residual,
+            constraint_residual=r.residual,
             held=r.held,
         )
 
@@ -172,7 +172,7 @@ class CompiledRun:
     def arrive(self, passing: BreakpointHandler) -> None:
         """Prepare for the end next to a singular configuration before which the kernel returned."""
         run = self._run
-        self.remember(passing.arrive(run.t, run.state, self.memory(), run.interval))
+        self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.interval))
 
     def remember(self, memory: IntegratorState) -> None:
         """Start the next step from ``memory``."""
@@ -188,8 +188,8 @@ class CompiledRun:
                 state=state,
                 memory=marshalling.state_struct(memory),
                 control=marshalling.control_struct(h=first_step),
-                open_residual=driver.OPEN,
-                search_below=singular_endpoints.LOOK,
+                open_residual=driver.RESIDUAL_EXAMINED,
+                search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
             )
         )
 

@@ -1,9 +1,10 @@
-"""A mechanism in the compiled kernel, and the reference with the kernel's regular stages."""
+"""Mechanisms in the compiled kernel, their pool, and the reference with the kernel's stages."""
 
 from __future__ import annotations
 
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from srm_mbs._kernel import core
@@ -18,6 +19,7 @@ from srm_mbs.integration.kernel.marshalling import (
     system_struct,
 )
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 KEPT = 4
 """Idle workspaces that a mechanism keeps at most."""
@@ -39,8 +41,8 @@ def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
 
 
 def shared(system: ClosedSystem | OpenSystem) -> bool:
-    """Whether a twin of ``system`` serves every run of its mechanism: no function of the user and
-    no motion from one start is in it, and it is small enough to be kept."""
+    """Whether a kernel system of ``system`` serves every run of its mechanism: it holds no function
+    of the user and no motion from one start, and is small enough to be kept."""
     return (
         system.nv <= LARGEST_KEPT
         and system.held is None
@@ -48,35 +50,38 @@ def shared(system: ClosedSystem | OpenSystem) -> bool:
     )
 
 
-def taken(system: ClosedSystem | OpenSystem) -> Any:
-    """A twin of ``system`` for one user: an idle one of its mechanism, or a new one.
+@per_model
+def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
+    """The pool of a mechanism: kernel systems of :func:`shared` ones that no run uses."""
+    return deque(maxlen=KEPT)
 
-    :func:`given_back` returns it.  One that is not, because a run raised, is simply lost.
+
+@contextmanager
+def workspace(system: ClosedSystem | OpenSystem) -> Iterator[Any]:
+    """A kernel system of ``system`` for one user: an idle one of its mechanism, or a new one.
+
+    It returns to the pool afterwards, if it is :func:`shared` and there are not KEPT already.  One
+    whose user raised is left to the garbage collector.
     """
+    kernel_system = _idle_or_new(system)
+    yield kernel_system
+    if shared(system):
+        idle_workspaces(system.mechanism).append(kernel_system)
+
+
+def _idle_or_new(system: ClosedSystem | OpenSystem) -> Any:
     if shared(system):
         with suppress(IndexError):  # deque: two threads never get the same
-            kernel_system = _idle(system).pop()
+            kernel_system = idle_workspaces(system.mechanism).pop()
             kernel_system.renew(**system.constants_of_start())
             return kernel_system
     return make_kernel_system(system)
 
 
-def given_back(system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
-    """Nobody uses ``kernel_system`` any more: keep it for the mechanism's next run, if it is
-    :func:`shared` and there are not KEPT already."""
-    if shared(system):
-        _idle(system).append(kernel_system)
-
-
-def _idle(system: ClosedSystem | OpenSystem) -> deque[Any]:
-    idle: deque[Any] = system.mechanism.derived("idle twins", lambda: deque(maxlen=KEPT))
-    return idle
-
-
-class _TwinTerms:
+class _KernelTerms:
     """Terms of a regular stage, evaluated by the kernel."""
 
-    weak = False
+    rank_deficient = False
     held = False
 
     def __init__(self, found: dict[str, Any]) -> None:
@@ -96,8 +101,8 @@ class Evaluator:
 
     Parameters
     ----------
-    system, twin
-        The mechanism, and what :func:`make_kernel_system` made of it.
+    system, kernel_system
+        The mechanism, and its kernel system from :func:`make_kernel_system`.
     """
 
     def __init__(self, system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
@@ -108,7 +113,7 @@ class Evaluator:
         return getattr(self._system, name)
 
     def between(self, first: float, last: float) -> None:
-        """Times of both within [``first``, ``last``] (s); see :mod:`..stepping.breakpoints`."""
+        """Evaluate both at times within [``first``, ``last``] (s) only: between breakpoints."""
         self._system.between(first, last)
         self._kernel_system.between(first, last)
 
@@ -126,14 +131,14 @@ class Evaluator:
             return self._kernel_system.first_step(  # type: ignore[no-any-return]
                 t, state, state_struct(memory), norm_struct(norm), span, order, CONSTANTS
             )
-        except ArithmeticError:  # the reference says why
+        except ArithmeticError:  # the reference raises the error that says why
             return initial_step(self, state, memory, norm, span, order, t)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""
         if zone is None:
             try:
-                return _TwinTerms(self._kernel_system.terms(t, state))
+                return _KernelTerms(self._kernel_system.terms(t, state))
             except ArithmeticError:
-                pass  # the reference says why
+                pass  # the reference raises the error that says why
         return self._system.evaluate(t, state, zone)

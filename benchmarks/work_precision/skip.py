@@ -24,6 +24,7 @@ from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.multibody import OpenSystem, make_system
 from srm_mbs.formats.urdf.parser import lock_joints
 from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.methods import split_step
 from srm_mbs.simulation import runner
 from srm_mbs.visualization.animation.shapes import visuals_of
@@ -177,7 +178,7 @@ def _islands() -> Item:
 
     def evaluate(algebra: str) -> Callable[[], None]:
         constants = system.constants() | {"algebra": algebra}
-        kernel_system = kernel.core.System(double.model, constants, None)
+        kernel_system = kernel.core.System(double.model, system_struct(constants), None)
         return lambda: kernel_system.repeat(0.0, state, 10000)
 
     return Item(

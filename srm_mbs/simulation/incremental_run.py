@@ -188,7 +188,7 @@ class KernelRun(_IncrementalRun):
         """Go on from a :meth:`snapshot` of another run like this."""
         kept, force = snapshot
         self._held.only(force)
-        self._kernel_system.hold(kept["t"], force, False)
+        self._kernel_system.hold(kept.t, force, False)
         self._run.restore(kept)
 
     def counts(self) -> dict[str, int]:

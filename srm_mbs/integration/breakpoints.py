@@ -81,10 +81,8 @@ def smooth_intervals(
     is_marked = np.arange(len(order)) < len(marked)
     by_time = np.argsort(order, kind="stable")
     order, is_marked = order[by_time], is_marked[by_time]
-    near = max(
-        SMALLEST_DISTANCE * (t_end - t0),
-        ROUNDING_BESIDE * float(np.spacing(max(abs(t0), abs(t_end)))),
-    )
+    rounding = float(np.spacing(max(abs(t0), abs(t_end))))
+    near = max(SMALLEST_DISTANCE * (t_end - t0), ROUNDING_BESIDE * rounding)
     inside = (order >= t0 - near) & (order <= t_end + near)
     order, is_marked = order[inside], is_marked[inside]
     # Each cluster of times that no step fits between is one breakpoint, at its first time.
@@ -201,7 +199,7 @@ class BreakpointHandler:
         self._system = system
         self._method = method
         self._norm = norm
-        self._evaluator = system if evaluator is None else evaluator
+        self._evaluator: Any = system if evaluator is None else evaluator
         self.sample: Callable[[float, FloatArray], None] | None = None
         self.arrivals = system.singularities is not None
         self._index = 0

@@ -11,7 +11,7 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration import dense_output as hermite
-from srm_mbs.integration.dense_output import SLACK, DenseOutput, StepData
+from srm_mbs.integration.dense_output import TIME_TOLERANCE, DenseOutput, StepData
 from srm_mbs.integration.kernel.system import given_back, make_kernel_system, shared, taken
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -94,7 +94,7 @@ class CompiledDenseOutput(DenseOutput):
     def _lone_zones(self) -> bool:
         """Whether a step with a zone has a breakpoint on both sides: the kernel's extra stages have
         no zone."""
-        pieces = (self._steps.piece(step) for step in self._steps.zones)
+        pieces = (self._steps.smooth_interval(step) for step in self._steps.zones)
         return any(last - first < 2 for first, last in pieces)
 
     def _compile(self) -> Any:
@@ -109,12 +109,12 @@ class CompiledDenseOutput(DenseOutput):
                 "degree": len(extension.rows),
                 "n_rates": extension.n_rates,
                 "abscissae": self._abscissae,
-                "nodes": list(hermite.NODES),
-                "spacing": hermite.SPACING,
-                "close": hermite.CLOSE,
-                "probes": hermite.PROBES,
+                "nodes": list(hermite.HERMITE_NODES),
+                "spacing": hermite.NODE_SPACING,
+                "close": hermite.CLOSE_SIGMA,
+                "probes": hermite.COMPARED_AT,
                 "end": steps.end,
-                "slack": SLACK,
+                "slack": TIME_TOLERANCE,
                 "count": steps.count,
                 "width": steps.rates.shape[1],
                 "corrected": steps.corrections.shape[1] > 0,

@@ -27,7 +27,6 @@ from unittest.mock import patch
 import numpy as np
 
 import srm_mbs as srm
-from srm_mbs import api
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.driver import Closures
@@ -36,6 +35,7 @@ from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.methods import psrm
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.split_step import later_stages
+from srm_mbs.simulation import runner
 from srm_mbs.simulation.options import step_size_control
 
 CASES = (
@@ -113,16 +113,9 @@ def plain_accept(memory: IntegratorState, result: StepResult) -> None:
 def nothing_for_singular_configurations() -> Iterator[None]:
     """``simulate`` with no placement, guard, watch, look at the start and look for bifurcations."""
 
-    def control(
-        system: Any,
-        method: Any,
-        step: Any,
-        first_step: Callable[[], float],
-        span: tuple[float, float],
-        *_: Any,
-        **__: Any,
-    ) -> Any:
-        return step_size_control(method.scheme, *span, step, first_step), ()
+    def control(system: Any, options: Any, first_step: Callable[[], float], *_: Any) -> Any:
+        span = options.t0, options.t_end
+        return step_size_control(options.method.scheme, *span, options.step, first_step), ()
 
     def start(
         system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any
@@ -133,9 +126,9 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(psrm, "split_start", plain_start),
         patch.object(psrm, "split_step", plain_step),
         patch.object(psrm, "split_accept", plain_accept),
-        patch.object(api, "placed_control", control),
-        patch.object(api, "start", start),
-        patch.object(api, "bifurcations_told", lambda _: ""),
+        patch.object(runner, "placed_control", control),
+        patch.object(runner, "start", start),
+        patch.object(runner, "bifurcation_sentences", lambda _: ""),
         patch.object(Closures, "failure", lambda *_: None),
     ):
         yield
@@ -150,7 +143,7 @@ def nothing_on_the_kernel() -> Iterator[None]:
     """The same for the kernel, together with ``placement="off"``."""
     with (
         patch.dict(marshalling.CONSTANTS, NEVER),
-        patch.object(api, "bifurcations_told", lambda _: ""),
+        patch.object(runner, "bifurcation_sentences", lambda _: ""),
     ):
         yield
 

@@ -31,15 +31,20 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.row_algebra import (
+    GRAPH_ORDER_ABOVE,
+    coordinate_parents,
+    graph_order,
+)
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.dynamics.system import SingularityAnalysis, Terms, Zone
 from srm_mbs.errors import EvaluationError
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import per_model, per_start
 
 _largest = blas.idamax
 
@@ -269,8 +274,7 @@ class Mechanics(Manifold):
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel
         (:mod:`srm_mbs.integration.kernel`)."""
-        fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
-        return fixed | self.constants_of_start()
+        return _constants(self.mechanism) | self.constants_of_start()
 
     def constants_of_start(self) -> dict[str, Any]:
         """Those among :meth:`constants` that depend on the start, or that the model may change."""
@@ -281,7 +285,7 @@ class Mechanics(Manifold):
             "friction": self._friction,
         }
 
-    def _constants(self) -> dict[str, Any]:
+    def constants_of_model(self) -> dict[str, Any]:
         """Those that do not depend on the start."""
         return {
             "loops": [],
@@ -357,6 +361,51 @@ class OpenSystem(Mechanics):
         return self._terms
 
 
+@per_model
+def _kept_rows(mechanism: Mechanism) -> LoopKinematics:
+    """The kept, scaled rows of the closures."""
+    structure = mechanism.structure
+    return LoopKinematics(
+        mechanism.model,
+        mechanism.loops,
+        structure.row_scale,
+        structure.kept,
+        structure.eliminations,
+    )
+
+
+def _rows_in_use(mechanism: Mechanism) -> LoopKinematics | DrivenKinematics:
+    """The kept, scaled rows of closures and drives, with memory of their own."""
+    if not mechanism.drives:
+        return _kept_rows(mechanism).copy_workspace()
+    structure = mechanism.structure
+    return DrivenKinematics(
+        mechanism.model,
+        mechanism.loops,
+        mechanism.drives,
+        mechanism.drive_curves,
+        structure.row_scale,
+        structure.kept,
+        structure.eliminations,
+    )
+
+
+@per_model
+def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
+    """The rows in use along the graph of the loops, if there are many coordinates."""
+    if mechanism.model.nv <= GRAPH_ORDER_ABOVE:  # every pivot order is cheap
+        return ()
+    return graph_order(_rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
+
+
+@per_start
+def _residual_scale(mechanism: Mechanism) -> FloatArray:
+    """Factor (m,) from each scaled row in use to row units."""
+    structure = mechanism.structure
+    unit = constraint_units(mechanism, structure.units)
+    return (structure.row_scale / unit)[structure.kept]
+
+
 class ClosedSystem(Mechanics):
     """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
 
@@ -365,54 +414,19 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
-        self._residual_scale: FloatArray = mechanism.at_start(
-            "residual scale", self._inverse_row_units
-        )
-        self._order: tuple[int, ...] = mechanism.derived("order", self._graph_order)
+        self._residual_scale = _residual_scale(mechanism)
+        self._order = _graph_order(mechanism)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
-
-    def _graph_order(self) -> tuple[int, ...]:
-        """The rows in use along the graph of the loops, if there are many coordinates."""
-        if self.nv <= LARGE:  # not worth asking for
-            return ()
-        return graph_order(self.loops.pattern(), coordinate_parents(self.model))
-
-    def _resolved_loops(self) -> LoopKinematics:
-        mechanism, structure = self.mechanism, self.structure
-        scale, kept = structure.row_scale, structure.kept
-        return LoopKinematics(self.model, mechanism.loops, scale, kept, structure.eliminations)
-
-    def _inverse_row_units(self) -> FloatArray:
-        structure = self.structure
-        unit = constraint_units(self.mechanism, structure.units)
-        scale: FloatArray = (structure.row_scale / unit)[structure.kept]
-        return scale
 
     @cached_property
     def loops(self) -> LoopKinematics | DrivenKinematics:
         """The rows of closures and drives that are in use, with memory of their own."""
-        if self._driven is not None:
-            return self._driven
-        resolved: LoopKinematics = self.mechanism.derived("loops", self._resolved_loops)
-        return resolved.copy_workspace()
+        return _rows_in_use(self.mechanism)
 
     @cached_property
     def _driven(self) -> DrivenKinematics | None:
         """Those rows, if there are drives."""
-        mechanism, structure = self.mechanism, self.structure
-        if not mechanism.drives:
-            return None
-        curves = mechanism.drive_curves
-        scale, kept = structure.row_scale, structure.kept
-        return DrivenKinematics(
-            self.model,
-            mechanism.loops,
-            mechanism.drives,
-            curves,
-            scale,
-            kept,
-            structure.eliminations,
-        )
+        return self.loops if isinstance(self.loops, DrivenKinematics) else None
 
     @cached_property
     def _mass_matrix(self) -> FloatArray:
@@ -432,14 +446,15 @@ class ClosedSystem(Mechanics):
         """As for open mechanisms, and the scales of the closures."""
         return super().constants_of_start() | {"gap_scale": self._residual_scale}
 
-    def _constants(self) -> dict[str, Any]:
+    def constants_of_model(self) -> dict[str, Any]:
+        """As for open mechanisms, and the rows of the closures."""
         own = {
             "rows": len(self.loops.g),
             "structural_rank": self.structure.rank,
             "sigma_ref": self.structure.sigma_ref,
             "order": list(self._order),
         }
-        return super()._constants() | self.loops.constants() | own
+        return super().constants_of_model() | self.loops.constants() | own
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Count what the compiled kernel did for this system."""
@@ -535,3 +550,8 @@ def make_system(
     if mechanism.structure.rank == 0:
         return OpenSystem(mechanism, controller)
     return ClosedSystem(mechanism, controller)
+
+
+@per_model
+def _constants(mechanism: Mechanism) -> dict[str, Any]:
+    return make_system(mechanism).constants_of_model()

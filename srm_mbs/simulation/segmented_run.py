@@ -1,12 +1,12 @@
-"""Runs with event actions, segment by segment.
+"""Runs, segment by segment where actions of events change the state or the mechanism.
 
-What happens at events: actions that change the state, or the mechanism.
+:func:`run` is the entry of all runs of mechanisms.  Without actions a run is one segment.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,19 +14,18 @@ import numpy as np
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.api import simulate
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
-from srm_mbs.errors import EvaluationError, EventError, InputError, SimulationError
+from srm_mbs.errors import EvaluationError, EventError, InputError
 from srm_mbs.integration.driver import RunStatus
-from srm_mbs.integration.events import EventFunction, prepare_events, same_time
+from srm_mbs.integration.events import EventFunction, acting, prepare_events, same_time
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.options import checked_times, numbers, positive
-from srm_mbs.simulation.result import Request, Solution
-from srm_mbs.simulation.runner import check_consistent
-from srm_mbs.simulation.segmented_result import SegmentedSolution
+from srm_mbs.simulation.options import RunOptions, numbers, positive
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.runner import check_consistent, checked_options, finished, run_segment
+from srm_mbs.simulation.segmented_result import R, ResultTypes
 
 
 class Event:
@@ -203,45 +202,65 @@ class _Sampled:
         return self._last
 
 
-def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any]) -> Solution:
-    """:func:`srm_mbs.simulate` with events that have actions.
+def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
+    """Simulate ``mechanism``; see :func:`srm_mbs.simulate`.
 
     Parameters
     ----------
     options
-        All others of ``simulate``.
+        As the caller gave them.
+    types
+        Classes of the result.
+
+    Raises
+    ------
+    InputError
+        For invalid input, before any stepping.
+    SimulationError
+        Only with ``raise_on_failure``.
     """
-    t_end = float(t_end)
-    prepared = prepare_events(options["events"], lambda event: event)
+    if isinstance(options.events, Iterator):  # they are looked at more than once
+        options = replace(options, events=list(options.events))
+    checked = checked_options(mechanism, options)
+    if acting(options.events):
+        result = _run_segments(mechanism, checked, types)
+    else:
+        result = run_segment(mechanism, checked, types.plain)
+    result.request = options.repeatable()
+    return finished(result, checked)
+
+
+def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
+    """The segments between the actions of events, joined."""
+    t_end = options.t_end
+    prepared = prepare_events(options.events, lambda event: event)
     names = [event.name.strip("'") for event in prepared]
-    if options["t0"] == 0.0 and not (options["q0"] is None and options["v0"] is None):
+    q0, v0 = options.q0, options.v0
+    if options.t0 == 0.0 and not (q0 is None and v0 is None):
         # Drives begin with this state.
-        q0, v0 = options["q0"], options["v0"]
         mechanism = mechanism.with_state(
             mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
         )
-    t_eval = checked_times(options["t_eval"], options["t0"], t_end)
-    asked = options["raise_on_failure"]
-    here = options | {"t_eval": None, "raise_on_failure": False}
-    if options["sample_time"] is not None and callable(options["controller"]):
-        period = positive(options["sample_time"], "sample_time", " of seconds")
-        here["controller"] = _Sampled(options["controller"], period)
+    here = replace(options, t_eval=None)
+    if options.sample_time is not None and options.controller is not None:
+        period = positive(options.sample_time, "sample_time", " of seconds")
+        here = replace(here, controller=_Sampled(options.controller, period))
     counts = [0] * len(prepared)
     last_times: list[list[float]] = [[] for _ in prepared]
     floors = [0.0] * len(prepared)
-    parts: list[Solution] = []
+    parts: list[R] = []
     acted: list[int] = []
     start_tolerances: list[float | None] = [None] * len(prepared)
-    t = float(options["t0"])
+    t = options.t0
     span = t_end - t
     status, message = RunStatus.RUNNING, ""
     while status is RunStatus.RUNNING:
-        here["events"] = [
+        events = [
             _in_segment(event, counts[i], i in acted, floors[i], start_tolerances[i])
             for i, event in enumerate(prepared)
         ]
         try:
-            solution = simulate(mechanism, t_end, **here)
+            part = run_segment(mechanism, replace(here, events=events), types.plain)
         except InputError as error:
             if not parts:
                 raise
@@ -253,29 +272,29 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
                 raise
             status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
             break
-        parts.append(solution)
-        status, message = solution.status, solution.message
-        found = solution.t_events or []
+        parts.append(part)
+        status, message = part.status, part.message
+        found = part.t_events or []
         counts = [n + len(times) for n, times in zip(counts, found)]
-        t = solution.steps.end
+        t = part.steps.end
         due = [i for i, times in enumerate(found) if len(times) and times[-1] == t]
-        left = [event.occurrences for event in here["events"]]
-        if status is not RunStatus.EVENT or any(len(found[i]) >= left[i] for i in due):
+        final = any(len(found[i]) >= events[i].occurrences for i in due)
+        if status is not RunStatus.EVENT or final:
             break
         acted = [i for i in due if prepared[i].action is not None]
         # What was counted here is not counted again just after; the rest has still to be.
-        near = 2.0 * same_time(*solution.steps.times[-2:].tolist())
+        near = 2.0 * same_time(*part.steps.times[-2:].tolist())
         start_tolerances = [
             near if len(times) and times[-1] >= t - near else 0.0 for times in found
         ]
         try:
-            acting = ", ".join(names[i] for i in acted)
-            log.debug("%s: action of %s at t = %.9g s", mechanism.name, acting, t)
+            acting_events = ", ".join(names[i] for i in acted)
+            log.debug("%s: action of %s at t = %.9g s", mechanism.name, acting_events, t)
             actions = [(prepared[i].action, names[i]) for i in acted]
-            mechanism, q, v = _after(solution, t, actions)
-            switched = mechanism.loops != solution.mechanism.loops
+            mechanism, q, v = _after(part, t, actions)
+            switched = mechanism.loops != part.mechanism.loops
             for i in acted:
-                floors[i] = _rounding(prepared[i].function, solution) if switched else 0.0
+                floors[i] = _rounding(prepared[i].function, part) if switched else 0.0
                 last_times[i] = [*last_times[i][1 - MANY :], t]
                 _check_chatter(last_times[i], span, names[i])
         except EventError as error:
@@ -285,18 +304,14 @@ def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any
         except KeyboardInterrupt:
             status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
             break
-        here |= {"t0": t, "q0": q, "v0": v}
+        here = replace(here, t0=t, q0=q, v0=v)
         status = RunStatus.RUNNING if t_end - t > LEFT * span else RunStatus.FINISHED
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
-    whole = SegmentedSolution(parts, t_eval=t_eval, status=status, message=message)
-    whole.request = Request.of(t_end, options)
-    if asked and not whole.success:
-        raise SimulationError(message, whole)
-    return whole
+    return types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
 
 
-def _rounding(event: Callable[..., Any], solution: Solution) -> float:
+def _rounding(event: Callable[..., Any], solution: SimulationResult) -> float:
     """Size of the value of an event that new closures hold at zero."""
     rows = zip(solution.t, solution.q, solution.v)
     return HELD * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
@@ -322,7 +337,7 @@ def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
 
 
 def _after(
-    solution: Solution, t: float, actions: list[tuple[Any, str]]
+    solution: SimulationResult, t: float, actions: list[tuple[Any, str]]
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
     """Mechanism and state after ``actions``, given with the names of their events, at the end of a
     segment."""
@@ -384,7 +399,7 @@ def _switched(
             remedy="Give a mechanism made from this one, for example with dataclasses.replace",
         )
     new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
-    new.__dict__["drive_curves"] = _curves_from(t, mechanism, new)
+    new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)

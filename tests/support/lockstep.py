@@ -24,6 +24,7 @@ from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
+from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
 
 
@@ -145,9 +146,10 @@ def compare(
     memory = start(system, method, 0.0, x, norm, t_end)
     order = scheme.controller_order or 1
     first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
-    control, _ = placed_control(
-        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0), arrivals
+    options = RunOptions(
+        t_end, method=method, step=step, placement=placement, singular_times=np.zeros(0)
     )
+    control, _ = placed_control(system, options, lambda: first, arrivals)
     run = CompiledRun(
         kernel_system,
         method,

@@ -225,7 +225,7 @@ def test_a_sweep_that_was_killed_is_resumed_where_it_stopped(tmp_path: Path) -> 
     cases = [{"length": length} for length in (0.5, 1.0, 1.0, 1.5, 2.0)]
     whole = srm.sweep(pendulum, cases, 0.2, measure=states)
     script = (
-        "import os, signal\nimport srm_mbs as srm\nfrom tests.sweeping import *\n"
+        "import os, signal\nimport srm_mbs as srm\nfrom tests.support.sweeping import *\n"
         "def kill(done, total):\n    done == 3 and os.kill(os.getpid(), signal.SIGKILL)\n"
         f"cases = {cases!r}\n"
         f"srm.sweep(pendulum, cases, 0.2, measure=states, resume={str(file)!r}, progress=kill)\n"

@@ -290,7 +290,7 @@ def test_a_joint_that_moves_no_inertia_is_an_error() -> None:
         "point_on_plane", srm.Anchor("tip", xyz=(1, 0, 0)), srm.Anchor("world"), (0, 0, 1)
     )
     with pytest.raises(
-        srm.InputError, match=r"last.*neither .tip. nor anything behind it has inertia"
+        srm.InputError, match=r"last.*neither .tip. nor anything that it carries has inertia"
     ):
         make_system(srm.Mechanism(model, (loop,)))
 

@@ -24,10 +24,10 @@ from srm_mbs.visualization.animation.scene import (
     View,
     choose_view,
     make_picture,
-    sample_motion,
-    seen_points,
+    points_in_view,
 )
 from srm_mbs.visualization.animation.shapes import visuals_of
+from srm_mbs.visualization.animation.trajectory import sample_motion
 
 ORANGE = np.array([0.902, 0.624, 0.0])
 
@@ -76,7 +76,7 @@ def orange_at(image: Any) -> np.ndarray:
 def view_of(solution: srm.Solution, fps: float) -> View:
     visuals = visuals_of(solution.mechanism)
     motion = sample_motion(solution, (1,), fps)
-    return choose_view(solution.mechanism, seen_points(visuals, motion))
+    return choose_view(solution.mechanism, points_in_view(visuals, motion))
 
 
 @pytest.mark.browser
@@ -219,7 +219,7 @@ def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: 
     saved, first, second = (str(tmp_path / name) for name in ("run.npz", "a.png", "b.png"))
     options = ["--t-end", "1.5", "--out", saved, "--image", first, "--at", "0.4"]
     # In a process of its own, which launches its browser.
-    command = [sys.executable, "-m", "srm_mbs.cli.app", "simulate", "simple_pendulum", *options]
+    command = [sys.executable, "-m", "srm_mbs.cli", "simulate", "simple_pendulum", *options]
     alone = subprocess.run(command, capture_output=True, text=True, check=False)
     assert alone.returncode == 0, alone.stderr
     done = CliRunner().invoke(app, ["play", saved, "--image", second, "--at", "0.4"])

@@ -44,7 +44,7 @@ CLOSE_SIGMA = 1.0
 a singular configuration."""
 COMPARED_AT = np.array([0.25, 0.5, 0.75])
 """Fractions of the step at which polynomials are compared."""
-PLACEMENTS = ("", "a priori", "redone")
+STEP_PLACEMENTS = ("", "a priori", "redone")
 """How steps are placed around singular configurations; see
 :class:`~srm_mbs.integration.methods.base.StepResult`."""
 
@@ -201,7 +201,7 @@ class StepData:
     error_ratios : (n,)
         Error estimate over tolerance.
     placements : (n,)
-        How the step was placed around a singular configuration: index into PLACEMENTS.
+        How the step was placed around a singular configuration: index into STEP_PLACEMENTS.
     held : (n,)
         1 for steps that lingered next to a singular configuration, held on their branch, else 0.
     end_rate : (m,)
@@ -282,7 +282,7 @@ def step_data(
         sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
         ranks=np.array([s.rank for s in steps], dtype=float),
         error_ratios=np.array([s.error_ratio for s in steps]),
-        placements=np.array([PLACEMENTS.index(s.placement) for s in steps], dtype=float),
+        placements=np.array([STEP_PLACEMENTS.index(s.placement) for s in steps], dtype=float),
         held=np.array([s.held for s in steps], dtype=float),
         end_rate=np.array(steps[-1].end_rate if n else np.zeros(tangent_size)),
         zones={

@@ -347,7 +347,7 @@ class IteratedSweeps:
         """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`.
 
         Multipliers of corrector sweeps follow from positions and velocities alone, (2.6), and do
-        not jump; own histories go on.
+        not jump; own histories continue.
         """
         fresh = self.start(system, t, state, norm)
         fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps

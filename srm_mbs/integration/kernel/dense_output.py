@@ -97,7 +97,7 @@ class CompiledDenseOutput(DenseOutput):
     def _lone_zones(self) -> bool:
         """Whether a step with a zone has a breakpoint on both sides: the kernel's extra stages have
         no zone."""
-        pieces = (self._steps.piece(step) for step in self._steps.zones)
+        pieces = (self._steps.smooth_interval(step) for step in self._steps.zones)
         return any(last - first < 2 for first, last in pieces)
 
     def _compile(self) -> Any:

@@ -13,13 +13,13 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
-from srm_mbs.dynamics.scaling import row_angles, turning_coordinates
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import joint_turns, row_angles, turning_coordinates
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.coordinates import position_of
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 JOINT_TYPES = {
     **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
@@ -35,15 +35,15 @@ JOINT_TYPES = {
     "HelicalUnaligned": "screw",
 }
 """Pinocchio's joint types as URDF calls them."""
-MANY = 8
-"""Numbers of a list from which only the ends are shown."""
-BUSHING = [False, False, False, True, True, True]
-"""Which of its six numbers belong to angles."""
+MAX_LISTED = 8
+"""Longest list of numbers that is given in full; of longer ones the ends."""
+BUSHING_ANGULAR = [False, False, False, True, True, True]
+"""Which of the six numbers of a bushing belong to angles."""
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
-def run_rows(solution: Solution, *, passages: bool = True) -> list[tuple[str, str]]:
-    """What a run did: (quantity, value with unit).
+def run_rows(solution: SimulationResult, *, passages: bool = True) -> list[tuple[str, str]]:
+    """Summary of a run: (quantity, value with unit).
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def run_rows(solution: Solution, *, passages: bool = True) -> list[tuple[str, st
 
 
 def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
-    """Degrees of freedom, rank and redundancy: (quantity, value)."""
+    """Degrees of freedom, rank and redundancy of a mechanism: (quantity, value)."""
     structure, source = mechanism.structure, mechanism.source
     found = mechanism.mobility
     count = f"{found.joint_freedoms} - {found.rows} = {found.gruebler}"
@@ -108,53 +108,52 @@ def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
     """(name, type, initial position, initial rate) of each moving joint."""
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
-        kind = _kind(joint)
-        v = mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]
-        rate = f"{_shown(v[0]):.6g} {_unit(kind)}/s" if joint.nv == 1 else _vector(map(_shown, v))
-        yield name, kind, position_text(mechanism, name, mechanism.q0), rate
+        v = [_without_noise(value) for value in mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]]
+        rate = f"{v[0]:.6g} {_unit(mechanism, name)}/s" if joint.nv == 1 else _vector(v)
+        yield name, _joint_type(joint), position_text(mechanism, name, mechanism.q0), rate
 
 
 def position_text(mechanism: Mechanism, name: str, q: FloatArray) -> str:
-    """Position of the joint ``name`` in q (nq,), with its unit where it has one degree."""
+    """Position of the joint ``name`` in q (nq,), with its unit if it has one degree of freedom."""
     joint = mechanism.joint(name)
     if joint.nv > 1:
-        return _vector(map(_shown, q[joint.idx_q : joint.idx_q + joint.nq]))
-    return f"{_shown(position_of(mechanism, q, name)):.6g} {_unit(_kind(joint))}"
+        return _vector(map(_without_noise, q[joint.idx_q : joint.idx_q + joint.nq]))
+    return f"{_without_noise(position_of(mechanism, q, name)):.6g} {_unit(mechanism, name)}"
 
 
 def force_text(mechanism: Mechanism, name: str, force: FloatArray) -> str:
     """The generalised force (n,) on the joint ``name``, with its units."""
-    return _in_units(force, _turning(mechanism, name), ["N m", "N"])
+    return _in_units(force, _angular(mechanism, name), ["N m", "N"])
 
 
-def _turning(mechanism: Mechanism, name: str) -> list[bool]:
+def _angular(mechanism: Mechanism, name: str) -> list[bool]:
     """Which degrees of freedom of the joint ``name`` are angles."""
     joint = mechanism.joint(name)
     own = slice(joint.idx_v, joint.idx_v + joint.nv)
-    turning: list[bool] = turning_coordinates(mechanism.model)[own].tolist()
-    return turning
+    angular: list[bool] = turning_coordinates(mechanism.model)[own].tolist()
+    return angular
 
 
-def _in_units(values: FloatArray, turning: list[bool], units: list[str]) -> str:
-    """Numbers (n,) of angles and of lengths, which have the two ``units``: a list of each."""
-    if len(turning) == 1:
-        return f"{values[0]:.6g} {units[not turning[0]]}"
-    parts = groupby(zip(turning, values.tolist()), itemgetter(0))
-    return ", ".join(f"{_vector(x for _, x in own)} {units[not turns]}" for turns, own in parts)
+def _in_units(values: FloatArray, angular: list[bool], units: list[str]) -> str:
+    """Numbers (n,) in the two ``units``, that of angles and that of lengths: a list of each."""
+    if len(angular) == 1:
+        return f"{values[0]:.6g} {units[not angular[0]]}"
+    parts = groupby(zip(angular, values.tolist()), itemgetter(0))
+    return ", ".join(f"{_vector(x for _, x in own)} {units[not angle]}" for angle, own in parts)
 
 
-def _shown(value: float) -> float:
-    """``value`` without the rounding noise of assembly, which means zero."""
+def _without_noise(value: float) -> float:
+    """``value`` rounded to 12 decimals: assembly leaves rounding errors where it means zero."""
     return round(float(value), 12) + 0.0
 
 
-def _kind(joint: Any) -> str:
+def _joint_type(joint: Any) -> str:
     short = str(joint.shortname()).removeprefix("JointModel")
     return JOINT_TYPES.get(short, short)
 
 
-def _unit(kind: str) -> str:
-    return "m" if kind.startswith("prismatic") else "rad"
+def _unit(mechanism: Mechanism, name: str) -> str:
+    return "rad" if joint_turns(mechanism.model, name) else "m"
 
 
 def body_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
@@ -166,7 +165,7 @@ def body_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
             links.setdefault(int(frame.parentJoint), []).append(frame.name)
     for k, name in enumerate(mechanism.joint_names, start=1):
         inertia = model.inertias[k]
-        centre = _vector(map(_shown, inertia.lever)) + " m" if inertia.mass else ""
+        centre = _vector(map(_without_noise, inertia.lever)) + " m" if inertia.mass else ""
         yield ", ".join(links.get(k, ())), name, f"{inertia.mass:.6g} kg", centre
 
 
@@ -189,7 +188,7 @@ def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
 
 
 def _relation(loop: LoopClosure) -> str:
-    """A coupling in words: "first = 2 second + 0.1"."""
+    """The equation of a coupling: "first = 2 second + 0.1"."""
     (row,) = loop.rows.joint_rows
     if loop.ratio is not None:
         terms = f"{row.joints[0]} = {loop.ratio:g} {row.joints[1]}"
@@ -199,7 +198,7 @@ def _relation(loop: LoopClosure) -> str:
 
 
 def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
-    """(name, type, what it acts on, values with units) of each force element."""
+    """(name, type, joint or anchors, values with units) of each force element."""
     for force in mechanism.forces:
         places, values = [], []
         for key in fields(force):  # type: ignore[arg-type]
@@ -218,8 +217,8 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
                     text = ", ".join(dict.fromkeys(law.type for law in laws))
                 elif len(units) > 1:
                     joint = getattr(force, "joint", None)
-                    turning = BUSHING if joint is None else _turning(mechanism, joint)
-                    text, units = _in_units(np.atleast_1d(value), turning, units), [""]
+                    angular = BUSHING_ANGULAR if joint is None else _angular(mechanism, joint)
+                    text, units = _in_units(np.atleast_1d(value), angular, units), [""]
                 elif isinstance(value, tuple):
                     text = _vector(value)
                 elif callable(value):
@@ -229,7 +228,7 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
 
 
 def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
-    """(name, law, what it moves, values) of each drive."""
+    """(name, law, joint or anchors, values) of each drive."""
     for drive in mechanism.drives:
         place = drive.joint or ""
         if drive.a is not None and drive.b is not None:
@@ -238,7 +237,7 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
         values = []
         for key in fields(drive.law):  # type: ignore[arg-type]
             value = getattr(drive.law, key.name)
-            if isinstance(value, tuple) and len(value) > MANY:
+            if isinstance(value, tuple) and len(value) > MAX_LISTED:
                 values.append(f"{key.name} {value[0]:.6g} .. {value[-1]:.6g} ({len(value)})")
             elif value is not None:
                 text = _vector(value) if isinstance(value, tuple) else f"{value:.6g}"

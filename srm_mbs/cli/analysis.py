@@ -13,7 +13,7 @@ from srm_mbs.cli.output import RUN_FAILED, Model, check_output, reported, table
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
-    from srm_mbs.model.mechanism import Mechanism
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 Hold = Annotated[

@@ -48,7 +48,7 @@ from srm_mbs.model.forces import (
     Wrench,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 
 class Evaluator(Protocol):
@@ -365,13 +365,10 @@ _EVALUATORS = {
 }
 
 
-def resolved_forces(mechanism: Mechanism) -> ForceKinematics | None:
+@per_model
+def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
     """The force elements of ``mechanism``, resolved once; None if it has none."""
-    forces: ForceKinematics | None = mechanism.derived(
-        "forces",
-        lambda: ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None,
-    )
-    return forces
+    return ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None
 
 
 class ForceKinematics:

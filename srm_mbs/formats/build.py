@@ -19,13 +19,14 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.description import Description, parse_description
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.coordinates import write_position, write_rate
-from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
+from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.model.validation import check_inertia, check_tree, undetermined_joint
 
 log = logging.getLogger(__name__)

@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import tomli_w
 
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.build import assembled, rebuild
 from srm_mbs.formats.document import Document
@@ -23,7 +24,7 @@ from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.model.mechanism import Mechanism, Source
+from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array
 
 _GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")

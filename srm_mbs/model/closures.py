@@ -290,7 +290,7 @@ class LoopClosure:
         ``universal``: the axes of the cross, in a's and in b's frame; normalised here.
     length
         ``distance``: m; by default the distance in the initial configuration (the guess), which
-        :class:`~srm_mbs.model.mechanism.Mechanism` fills in.
+        :class:`~srm_mbs.dynamics.mechanism.Mechanism` fills in.
     joints
         ``coupling``: names of joints with one degree of freedom.
     ratio, offset

@@ -15,7 +15,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData
 from srm_mbs.model.numbers import finite_array
 
 UNIT_LENGTH_TOLERANCE = 1e-3
@@ -31,7 +31,7 @@ def _numbers(value: Any, name: str, accepted: dict[int, str]) -> FloatArray:
     return np.atleast_1d(array)
 
 
-def set_position(mechanism: Mechanism, q: FloatArray, name: str, value: Any) -> None:
+def set_position(mechanism: MechanismData, q: FloatArray, name: str, value: Any) -> None:
     """Write the position ``value`` of joint ``name`` into ``q`` (nq,), in place.
 
     Raises
@@ -69,7 +69,7 @@ def write_position(joint: Any, q: FloatArray, name: str, value: Any) -> None:
     q[own] = array
 
 
-def set_rate(mechanism: Mechanism, v: FloatArray, name: str, value: Any) -> None:
+def set_rate(mechanism: MechanismData, v: FloatArray, name: str, value: Any) -> None:
     """Write the rate ``value`` of joint ``name`` into ``v`` (nv,), in place.
 
     Raises
@@ -86,7 +86,7 @@ def write_rate(joint: Any, v: FloatArray, name: str, value: Any) -> None:
     v[joint.idx_v : joint.idx_v + joint.nv] = _numbers(value, name, {joint.nv: accepted})
 
 
-def coordinate_names(mechanism: Mechanism) -> tuple[str, ...]:
+def coordinate_names(mechanism: MechanismData) -> tuple[str, ...]:
     """A name for each velocity component (nv,): the joint's, or ``joint[i]`` if it has several."""
     names = []
     for name in mechanism.joint_names:
@@ -95,7 +95,7 @@ def coordinate_names(mechanism: Mechanism) -> tuple[str, ...]:
     return tuple(names)
 
 
-def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
+def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexArray:
     """Velocity indices of the joints ``names``, in that order.
 
     Raises
@@ -112,7 +112,7 @@ def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
     return np.array(indices, dtype=int)
 
 
-def position_of(mechanism: Mechanism, q: FloatArray, name: str) -> float:
+def position_of(mechanism: MechanismData, q: FloatArray, name: str) -> float:
     """Position (rad or m) of the one-degree joint ``name`` in q (nq,)."""
     joint = mechanism.joint(name)
     own = q[joint.idx_q : joint.idx_q + joint.nq]

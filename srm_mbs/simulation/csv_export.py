@@ -26,10 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.analysis.summary import JOINT_TYPES
-from srm_mbs.dynamics.scaling import row_dimensions
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import joint_turns, row_dimensions
+from srm_mbs.simulation.result import SimulationResult
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +47,7 @@ _COMPONENTS = {
 """Columns of joints of several degrees of freedom: positions, velocities."""
 
 
-def write_csv(solution: Solution, path: Path) -> None:
+def write_csv(solution: SimulationResult, path: Path) -> None:
     """Write ``solution`` at its times ``solution.t`` to ``path``; see the module's text.
 
     Raises
@@ -78,7 +77,7 @@ def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
     log.info("written: %s", path)
 
 
-def _columns(solution: Solution) -> dict[str, FloatArray]:
+def _columns(solution: SimulationResult) -> dict[str, FloatArray]:
     """Header and values (n,) of each column."""
     mechanism = solution.mechanism
     positions: dict[str, FloatArray] = {}
@@ -86,7 +85,7 @@ def _columns(solution: Solution) -> dict[str, FloatArray]:
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         if joint.nv == 1:
-            unit = _unit(joint.shortname())
+            unit = "rad" if joint_turns(mechanism.model, name) else "m"
             positions[f"{name} ({unit})"], rates[f"{name} rate ({unit}/s)"] = solution.joint(name)
             continue
         numbered = [f"q{i}" for i in range(joint.nq)], [f"v{i}" for i in range(joint.nv)]
@@ -101,11 +100,6 @@ def _columns(solution: Solution) -> dict[str, FloatArray]:
         columns[f"||g|| ({lengths})"], columns[f"||G v|| ({speeds})"] = solution.drift.T
     columns["energy (J)"] = solution.energy
     return columns
-
-
-def _unit(joint_type: str) -> str:
-    kind = JOINT_TYPES.get(joint_type.removeprefix("JointModel"), "")
-    return "m" if kind.startswith("prismatic") else "rad"
 
 
 def _drift_units(mechanism: Mechanism) -> tuple[str, str]:

@@ -1,11 +1,8 @@
 """Saved runs: one ``.npz`` with everything needed to interpolate, replay and plot a run.
 
-Arrays are stored as they are; the rest (description, URDF, closures, settings) as one JSON text.
-Nothing is pickled.
-
-What a run was asked for, as saved runs hold it: everything but Python functions.
-
-Saved runs of several segments: the files of the segments in one archive.
+Arrays are stored as they are; the rest (description, URDF, closures, settings, options of the run
+but Python functions) as one JSON text.  Nothing is pickled.  A run of several segments is one
+archive of the files of its segments.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -27,6 +24,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination
 from srm_mbs.dynamics.constraints.structure import Structure, row_names
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import InputError
@@ -36,29 +34,27 @@ from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel.dense_output import dense_output
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.integration.methods.srm import SRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
+from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Curve, Law
-from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
-from srm_mbs.simulation.result import ATTEMPT, Request, Settings, Solution, Statistics
-from srm_mbs.simulation.segmented_result import SegmentedSolution
-
-if TYPE_CHECKING:
-    from srm_mbs.simulation.result import Solution
+from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.simulation.options import REPEATED, RunOptions
+from srm_mbs.simulation.result import ATTEMPT, Settings, SimulationResult, Statistics
+from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
 _KINDS = {"PSRM": PSRM, "SRM": SRM}
 
 
-def request_entry(solution: Solution) -> dict[str, Any] | None:
-    """The request of a run as JSON, with what is lost by that named."""
+def request_entry(solution: SimulationResult) -> dict[str, Any] | None:
+    """The options of a run as JSON, and the names of those that JSON cannot hold."""
     request = solution.request
     if request is None:
         return None
-    options = dict(request.options)
+    options = {name: getattr(request, name) for name in REPEATED}
     lost = list(request.lost)
     if options.pop("controller") is not None:
         lost.append("the controller")
@@ -82,8 +78,8 @@ def request_entry(solution: Solution) -> dict[str, Any] | None:
     return {"t_end": end, "options": options, "lost": lost}
 
 
-def request_from(entry: dict[str, Any] | None) -> Request | None:
-    """The request in a saved run; None if it has none."""
+def request_from(entry: dict[str, Any] | None) -> RunOptions | None:
+    """The options in a saved run; None if it has none."""
     if entry is None:
         return None
     options = dict(entry["options"]) | {"controller": None, "events": None}
@@ -92,7 +88,7 @@ def request_from(entry: dict[str, Any] | None) -> Request | None:
     if isinstance(options["method"], dict):
         values = dict(options["method"])
         options["method"] = _KINDS[values.pop("kind")](**values)
-    return Request(entry["t_end"], options, tuple(entry["lost"]))
+    return RunOptions(entry["t_end"], **options, lost=tuple(entry["lost"]))
 
 
 log = logging.getLogger(__name__)
@@ -116,9 +112,9 @@ _STEP_ARRAYS = (
 )
 
 
-def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
+def save_solution(solution: SimulationResult, path: Path | IO[bytes]) -> None:
     """Write ``solution`` to ``path``, a file name or an open file; see
-    :meth:`srm_mbs.simulation.result.Solution.save`.
+    :meth:`srm_mbs.Solution.save`.
 
     Raises
     ------
@@ -251,7 +247,7 @@ def _value(plain: Any) -> Any:
     return LAW_TYPES[values.pop("type")](**values)
 
 
-def _drive_starts(solution: Solution) -> dict[str, float] | None:
+def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
     """The driven coordinates at t = 0 of a run that starts later: its q0 does not have them."""
     if solution.span[0] == 0.0:
         return None
@@ -288,7 +284,8 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         notes=tuple(entry["notes"]),
     )
     if entry.get("drive_starts"):
-        mechanism.__dict__["drive_curves"] = _drive_curves(mechanism.drives, entry["drive_starts"])
+        curves = _drive_curves(mechanism.drives, entry["drive_starts"])
+        return mechanism.with_drive_curves(curves)
     return mechanism
 
 
@@ -345,31 +342,30 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
         raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 
 
-def load_solution(path: str | Path) -> Solution:
-    """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
+def load_result(path: Path, types: ResultTypes[R]) -> R:
+    """Read a saved run; see :func:`srm_mbs.load_solution`.
 
-    A controller is not saved: reactions of a controlled run cannot be computed afterwards, unless
-    it was sampled; what it held is saved.
+    Parameters
+    ----------
+    types
+        Classes of the result.
 
     Raises
     ------
     InputError
         If the file is missing, is no saved run, or is of another format.
     """
-    pass
-
-    path = Path(path)
-    segments = load_segments(path) if path.is_file() else None
-    return load_plain(path, str(path)) if segments is None else segments
+    segments = load_segments(path, types) if path.is_file() else None
+    return load_plain(path, str(path), types.plain) if segments is None else segments
 
 
-def load_plain(path: Path | IO[bytes], name: str) -> Solution:
+def load_plain(path: Path | IO[bytes], name: str, result_type: type[R]) -> R:
     """A run without segments from a file name or an open file, which messages call ``name``.
 
     Raises
     ------
     InputError
-        As :func:`load_solution`.
+        As :func:`load_result`.
     """
     try:
         opened = path.open("rb") if isinstance(path, Path) else nullcontext(path)
@@ -391,7 +387,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         mechanism = _mechanism(meta["mechanism"], arrays)
         structure = meta["structure"]
         # The analysis of the run itself, so that the dense output is the same to the last bit.
-        mechanism.__dict__["structure"] = Structure(
+        analysis = Structure(
             row_names(mechanism),
             arrays["row_scale"],
             arrays["kept"],
@@ -406,6 +402,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
                 for row, other, factor in arrays.get("eliminations", np.zeros((0, 3))).tolist()
             ),
         )
+        mechanism = mechanism.with_structure(analysis)
         zones = {
             int(index): (
                 float(threshold),
@@ -423,7 +420,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         settings = Settings(**meta["settings"] | tuples)
         system = make_system(mechanism, _held(arrays, mechanism.model.nv))
         scheme = get_tableau(settings.tableau)
-        solution = Solution(
+        solution = result_type(
             mechanism,
             system,
             scheme,
@@ -459,7 +456,7 @@ CONTENTS = "segments.json"
 SEGMENTS_FORMAT = 1
 
 
-def save_segments(solution: SegmentedSolution, path: Path) -> None:
+def save_segments(solution: SegmentedResult, path: Path) -> None:
     """Write ``solution`` to ``path``.
 
     Raises
@@ -485,7 +482,7 @@ def save_segments(solution: SegmentedSolution, path: Path) -> None:
             archive.writestr(f"{k}.npz", kept.getvalue())
 
 
-def load_segments(path: Path) -> Solution | None:
+def load_segments(path: Path, types: ResultTypes[R]) -> R | None:
     """The run in ``path``; None if it is no archive of segments.
 
     Raises
@@ -509,9 +506,11 @@ def load_segments(path: Path) -> Solution | None:
                     remedy=OTHER_VERSION,
                 )
             t_eval = contents["t_eval"]
-            whole = SegmentedSolution(
+            whole = types.segmented(
                 [
-                    load_plain(io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}")
+                    load_plain(
+                        io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}", types.plain
+                    )
                     for k in range(contents["count"])
                 ],
                 t_eval=None if t_eval is None else np.array(t_eval),

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 
 _NOT_COMPARED = ("name", "source", "defaults", "notes")
 """Fields of a mechanism that change nothing in a run."""

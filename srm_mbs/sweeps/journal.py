@@ -16,8 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import srm_mbs
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, __version__
 from srm_mbs.sweeps.cases import Case
 from srm_mbs.sweeps.fingerprint import fingerprint
 from srm_mbs.sweeps.tasks import Outcome, Task
@@ -51,7 +50,7 @@ class Journal:
         self._path = path
         self._keys = _keys(cases)
         self.known: dict[int, Outcome] = {}
-        head = {"format": FORMAT, "version": srm_mbs.__version__, "sweep": _parts(task)}
+        head = {"format": FORMAT, "version": __version__, "sweep": _parts(task)}
         try:
             whole = self._read(head) if path.exists() else 0
             self._file: TextIOWrapper = path.open("r+" if whole else "w", encoding="utf-8")

@@ -16,7 +16,7 @@ from srm_mbs.integration.control.step_size import FixedStep
 from srm_mbs.integration.driver import integrate
 from srm_mbs.integration.events import EventWatch, prepare_events
 from srm_mbs.integration.methods.base import ErrorNorm
-from srm_mbs.visualization.animation import scene
+from srm_mbs.visualization.animation.trajectory import sample_motion
 from tests.support import reduced
 from tests.support.mechanisms import along_x, floating_ring, rod
 
@@ -150,7 +150,7 @@ def test_nothing_of_the_run_goes_beyond_a_terminal_event(slider_crank: srm.Mecha
     assert solution.drift[-1, 0] < 1e-8
     with pytest.raises(ValueError, match="the run covers"):
         solution(end + 1e-3)
-    assert scene.sample_motion(solution, (1,), 30.0).times[-1] == solution.t[-1]
+    assert sample_motion(solution, (1,), 30.0).times[-1] == solution.t[-1]
     assert solution.plot().axes[-1].get_xlim()[1] < end + 0.02
     sampled = srm.simulate(slider_crank, 5.0, t_eval=np.linspace(0.0, 5.0, 51), events=stop)
     assert sampled.t[-1] == pytest.approx(1.0)
@@ -286,7 +286,7 @@ def test_events_may_come_from_a_generator(slider_crank: srm.Mechanism) -> None:
     made = srm.simulate(slider_crank, 5.0, events=(event(rate) for _ in range(2)))
     assert np.array_equal(times(made, 1), times(listed))
     assert made.request is not None
-    assert len(list(made.request.options["events"])) == 2
+    assert len(list(made.request.events)) == 2
     swept = srm.sweep(
         slider_crank,
         [{}, {}],

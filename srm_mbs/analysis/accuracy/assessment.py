@@ -16,8 +16,8 @@ from srm_mbs.analysis.accuracy.error_estimate import (
     ErrorEstimate,
     Trial,
 )
-from srm_mbs.integration.methods.regularisation import parse_eps
-from srm_mbs.simulation.result import Solution
+from srm_mbs.integration.methods.thesis.regularisation import parse_eps
+from srm_mbs.simulation.result import SimulationResult
 
 Grade = Literal["good", "fair", "poor", "unknown"]
 GRADES: tuple[Grade, ...] = ("good", "fair", "unknown", "poor")
@@ -69,7 +69,7 @@ def _grade(value: float, limits: tuple[float, float]) -> Grade:
     return "good" if value <= good else "fair" if value <= fair else "poor"
 
 
-def status_finding(solution: Solution) -> Finding:
+def status_finding(solution: SimulationResult) -> Finding:
     """Whether the run came to its end."""
     start, end = solution.span
     if solution.status == "finished":
@@ -127,7 +127,7 @@ def _setting(estimate: ErrorEstimate, trial: Trial) -> str:
     return f"step {trial.setting:.3g} s" if estimate.fixed else f"rtol {trial.setting:.3g}"
 
 
-def error_findings(solution: Solution, estimate: ErrorEstimate | str) -> list[Finding]:
+def error_findings(solution: SimulationResult, estimate: ErrorEstimate | str) -> list[Finding]:
     """What the other runs say about the error of the run."""
     if isinstance(estimate, str):
         return [
@@ -144,7 +144,7 @@ def error_findings(solution: Solution, estimate: ErrorEstimate | str) -> list[Fi
     return found + _sensitivity(estimate.comparison, rate) + _shared(solution)
 
 
-def _error(solution: Solution, estimate: ErrorEstimate) -> Finding:
+def _error(solution: SimulationResult, estimate: ErrorEstimate) -> Finding:
     largest: dict[str, list[float]] = {}
     for row in estimate.joints:
         largest.setdefault(row.unit, []).append(row.position)
@@ -178,7 +178,7 @@ def _error(solution: Solution, estimate: ErrorEstimate) -> Finding:
     return Finding("estimated error", grade, text)
 
 
-def _others(solution: Solution, estimate: ErrorEstimate) -> list[Finding]:
+def _others(solution: SimulationResult, estimate: ErrorEstimate) -> list[Finding]:
     """What the other runs did that this one did not."""
     out = []
     others = [trial for trial in estimate.trials if not trial.own]
@@ -273,9 +273,9 @@ def _sensitivity(comparison: Comparison, rate: float) -> list[Finding]:
     return [Finding("sensitivity", "fair", text)]
 
 
-def _shared(solution: Solution) -> list[Finding]:
+def _shared(solution: SimulationResult) -> list[Finding]:
     """Errors that all runs have in common."""
-    method = None if solution.request is None else solution.request.options["method"]
+    method = None if solution.request is None else solution.request.method
     eps = getattr(method, "eps", None)
     if eps is None or parse_eps(eps).power:
         return []

@@ -1,6 +1,7 @@
-"""One page about a run: mechanism, motion, settings, accuracy and pictures in a single file.
+"""Report of a run: one page with its mechanism, motion, settings, accuracy and plots.
 
-It needs neither a network nor a server, and can be printed.
+The page is a single file, needs neither a network nor a server, and can be printed.  Its text is in
+``report.html.j2``, its data come from :mod:`srm_mbs.analysis.report.sections`.
 """
 
 from __future__ import annotations
@@ -10,23 +11,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import srm_mbs
 from srm_mbs.analysis.accuracy.certificate import Certificate, certify
-from srm_mbs.analysis.report.html import paragraph, text
 from srm_mbs.analysis.report.sections import (
-    MARKS,
+    GRADE_LABELS,
     PICTURES,
-    accuracy_section,
-    animation_section,
-    freedom_section,
-    mechanism_section,
-    pictures_section,
-    run_section,
+    accuracy_data,
+    animation_page,
+    freedom_rows,
+    mechanism_data,
+    pictures_data,
+    run_data,
 )
-from srm_mbs.errors import InputError
-from srm_mbs.simulation.result import Solution
-from srm_mbs.visualization.animation.page import filled, write_page
+from srm_mbs.errors import InputError, __version__
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.animation.page import render, write_page
 
+FOLDER = Path(__file__).parent
 CONTENTS = {
     "mechanism": "The mechanism",
     "animation": "The motion",
@@ -35,10 +35,11 @@ CONTENTS = {
     "accuracy": "Accuracy",
     "pictures": "Pictures",
 }
+"""Titles of the sections in the table of contents, by their ids."""
 
 
 def write_report(
-    solution: Solution,
+    solution: SimulationResult,
     path: str | Path,
     *,
     animation: bool = True,
@@ -57,20 +58,20 @@ def write_report(
     path
         Name of the file, usually ``.html``; an existing one is replaced.
     animation
-        Whether it holds the animation, which is most of the file; a still picture there is anyway.
+        Whether to include the animation, which is most of the file; a snapshot is always included.
     pictures
         Kinds of plots (:meth:`srm_mbs.Solution.plot`) among ``run``, ``state``, ``balance``,
-        ``reactions`` and ``sigma``; those that the run has not are left out with a sentence.
+        ``reactions`` and ``sigma``; a sentence replaces one that this run does not have.
     certificate
-        From :func:`srm_mbs.certify` of this run; made with ``rtol``, ``again`` and ``progress`` if
-        it is not given.
+        From :func:`srm_mbs.certify` of this run; by default it is computed with ``rtol``, ``again``
+        and ``progress``.
     rtol, again, progress
         As for :func:`srm_mbs.certify`.
 
     Raises
     ------
     InputError
-        If ``rtol`` or a kind of plot cannot be used, or the animation or the file cannot be made.
+        If ``rtol`` or a kind of plot is not valid, or the animation or the file cannot be written.
     """
     check_pictures(pictures)
     if certificate is None:
@@ -80,7 +81,7 @@ def write_report(
 
 
 def report_page(
-    solution: Solution,
+    solution: SimulationResult,
     certificate: Certificate,
     *,
     animation: bool = True,
@@ -88,25 +89,24 @@ def report_page(
 ) -> str:
     """The page of :func:`write_report`."""
     check_pictures(pictures)
-    sections = [
-        ("mechanism", mechanism_section(solution)),
-        *([("animation", animation_section(solution))] if animation else []),
-        ("freedom", freedom_section(solution.mechanism)),
-        ("run", run_section(solution)),
-        ("accuracy", accuracy_section(solution, certificate)),
-        *([("pictures", pictures_section(solution, pictures))] if pictures else []),
-    ]
-    name = solution.mechanism.name
-    links = "".join(f'<a href="#{key}">{text(CONTENTS[key])}</a>' for key, _ in sections)
-    body = [
-        f"<header><h1>{text(name)}: report of a run</h1>{_about()}</header>",
-        f'<nav aria-label="Contents">{links}</nav>',
-        f"<main>{_summary(solution, certificate)}",
-        *(content for _, content in sections),
-        "</main>",
-    ]
-    parts = {"title": text(f"{name}: report of a run"), "body": "\n".join(body)}
-    return filled("report.html", parts)
+    included = {"animation": animation, "pictures": bool(pictures)}
+    return render(
+        FOLDER,
+        "report.html.j2",
+        name=solution.mechanism.name,
+        today=datetime.date.today().isoformat(),
+        version=__version__,
+        contents=[(key, title) for key, title in CONTENTS.items() if included.get(key, True)],
+        summary=_summary(solution, certificate),
+        passages=bool(solution.crossings),
+        grades=GRADE_LABELS,
+        mechanism=mechanism_data(solution),
+        animation=animation_page(solution) if animation else None,
+        freedom=freedom_rows(solution.mechanism),
+        run=run_data(solution),
+        accuracy=accuracy_data(solution, certificate),
+        pictures=pictures_data(solution, pictures) if pictures else None,
+    )
 
 
 def check_pictures(kinds: Sequence[str]) -> None:
@@ -126,16 +126,8 @@ def check_pictures(kinds: Sequence[str]) -> None:
             )
 
 
-def _about() -> str:
-    today = datetime.date.today().isoformat()
-    words = f"Written on {today} by srm_mbs {srm_mbs.__version__}, which simulates mechanisms with"
-    return paragraph(
-        f"{words} closed kinematic loops. Units are SI; angles are in radians.", "about"
-    )
-
-
-def _summary(solution: Solution, certificate: Certificate) -> str:
-    """What the page says, in a few sentences."""
+def _summary(solution: SimulationResult, certificate: Certificate) -> list[str]:
+    """Sentences that summarise the mechanism, the run and its accuracy."""
     mechanism = solution.mechanism
     start, end = solution.span
     counts = [
@@ -151,10 +143,9 @@ def _summary(solution: Solution, certificate: Certificate) -> str:
     worst = next(f for f in certificate.findings if f.grade == certificate.grade)
     estimate = next(f for f in certificate.findings if f.topic == "estimated error")
     shown = [estimate] if worst.grade == estimate.grade else [worst, estimate]
-    lines = [
+    return [
         f"Mechanism: {shape}.",
         f"Run: {end - start:.6g} s of motion in {steps} steps; {solution.status}.{passed}",
-        f"Accuracy, overall {MARKS[certificate.grade]}.",
+        f"Accuracy, overall {GRADE_LABELS[certificate.grade]}.",
         *(f"{finding.topic.capitalize()}: {finding.text}" for finding in shown),
     ]
-    return f'<div class="summary">{"".join(map(paragraph, lines))}</div>'

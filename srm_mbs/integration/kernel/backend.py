@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import logging
 import os
-import warnings
 from functools import cache
 
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.errors import InputError, warn
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
@@ -103,9 +102,7 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
 @cache
 def warn_missing() -> None:
     """Warn, once per process, that runs are slow because there is no kernel."""
-    warnings.warn(
+    warn(
         "runs use the Python reference, which is many times slower, because the compiled kernel "
-        f"is not available: {missing}. {remedy}",
-        SrmWarning,
-        stacklevel=4,  # who calls simulate, or makes a Simulator
+        f"is not available: {missing}. {remedy}"
     )

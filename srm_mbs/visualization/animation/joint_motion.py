@@ -1,39 +1,40 @@
-"""A prescribed motion that can be played like a run: mode shapes, dragged joints.
+"""Prescribed motions, such as mode shapes and dragged joints, that are animated like runs.
 
-What runs and prescribed motions have in common: they can be looked at.
+:class:`AnimationMixin` has the methods that show a motion: those of runs and of prescribed motions.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 
 if TYPE_CHECKING:
     from srm_mbs.visualization.animation.playback import Embedded
 
 
 class AnimationMixin:
-    """Base of :class:`~srm_mbs.Solution` and :class:`~srm_mbs.JointMotion`.
+    """Animations of a :class:`~srm_mbs.Solution` or :class:`~srm_mbs.JointMotion`.
 
-    Upward imports, made when something is to be seen.
+    meshcat and the modules that draw with it are imported on first use.
     """
 
     def play(self, **options: Any) -> None:
-        """Play it in the browser; see :func:`srm_mbs.visualization.animation.playback.play`."""
+        """Play the motion in the browser; see
+        :func:`srm_mbs.visualization.animation.playback.play`."""
         from srm_mbs.visualization.animation.playback import play
 
         play(self, **options)  # type: ignore[arg-type]
 
-    def show_in_notebook(self, **options: Any) -> Embedded:
-        """What a notebook shows as the animation; see
+    def show(self, **options: Any) -> Embedded:
+        """The animation as the output of a notebook cell; see
         :func:`srm_mbs.visualization.animation.playback.show_in_notebook`."""
         from srm_mbs.visualization.animation.playback import show_in_notebook
 
@@ -54,35 +55,20 @@ class AnimationMixin:
         export_image(self, path, **options)  # type: ignore[arg-type]
 
     def export_video(self, path: str | Path, **options: Any) -> None:
-        """Write a film; see :func:`srm_mbs.visualization.animation.video.export_video`."""
+        """Write a video; see :func:`srm_mbs.visualization.animation.video.export_video`."""
         from srm_mbs.visualization.animation.video import export_video
 
         export_video(self, path, **options)  # type: ignore[arg-type]
 
 
-class Playable(Protocol):
-    """What :mod:`srm_mbs.visualization.animation.playback` needs of a run or a motion."""
-
-    @property
-    def mechanism(self) -> Mechanism:
-        """What moves."""
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """Start and end (s)."""
-
-    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
-        """q and v at times ``t``."""
-
-
 @dataclass(frozen=True, eq=False)
 class JointMotion(AnimationMixin):
-    """Configurations over time.
+    """Configurations of a mechanism over time.
 
     Attributes
     ----------
     mechanism
-        What moves.
+        The mechanism.
     t : (n,) s, q : (n, nq)
         Increasing times, and closed configurations there.
     """
@@ -106,11 +92,16 @@ class JointMotion(AnimationMixin):
         """Start and end (s)."""
         return float(self.t[0]), float(self.t[-1])
 
-    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
-        """q and v at ``t`` (s), a scalar or a vector: straight from frame to frame.
+    @property
+    def segments(self) -> tuple[JointMotion]:
+        """The motion itself: no event divides it."""
+        return (self,)
 
-        Returns shapes (nq,), (nv,) for a scalar, (k, nq), (k, nv) for a vector; beyond the ends
-        the motion stands still.
+    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
+        """q and v at ``t`` (s), a scalar or a vector, by geodesic interpolation of the frames.
+
+        Returns shapes (nq,), (nv,) for a scalar, (k, nq), (k, nv) for a vector; the motion is at
+        rest outside its span.
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
         model = self.mechanism.model

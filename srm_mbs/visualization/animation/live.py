@@ -1,12 +1,13 @@
-"""A run seen in the browser while it is computed."""
+"""The state of a run in the browser while it is computed."""
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,16 +15,21 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat, node_names
 from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays
-from srm_mbs.visualization.animation.page import DRIFT, ENERGY, as_json, drift_unit, make_page
+from srm_mbs.visualization.animation.page import (
+    DRIFT,
+    ENERGY,
+    drift_unit,
+    make_page,
+    page_data,
+)
 from srm_mbs.visualization.animation.playback import (
     REPLY_TIME,
-    about_picture,
     answered,
     close,
     serve,
@@ -31,37 +37,40 @@ from srm_mbs.visualization.animation.playback import (
     wait,
 )
 from srm_mbs.visualization.animation.scene import make_picture
-
-if TYPE_CHECKING:
-    from srm_mbs.visualization.animation.joint_motion import Playable
+from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
 log = logging.getLogger(__name__)
 
 SHARE = 0.03
-"""Part of the time of the run that showing it may take."""
-OFTEN, SELDOM = 0.01, 0.04
-"""Seconds between two calls below and above which they come after twice, or half, as many steps."""
-MOST = 4096
+"""Largest part of the wall time of the run that the view takes."""
+SHORTEST_INTERVAL, LONGEST_INTERVAL = 0.01, 0.04
+"""Seconds between two calls below and above which the stride is doubled or halved."""
+LARGEST_STRIDE = 4096
+"""Most steps between two calls."""
 PATIENCE = 2.0
-"""Seconds for the server to accept one state."""
-ANEW = "Use solution.play(), which starts a server, or solution.export_html(path), which needs none"
-"""Remedy where the server of a view is gone."""
-WIDER = 1.6
-"""How much farther away the camera is than the start needs: where the motion goes is not known."""
+"""Time (s) for the server to accept one state."""
+SERVER_GONE_REMEDY = (
+    "Use solution.play(), which starts a server, or solution.export_html(path), which needs none"
+)
+"""Remedy if the server of a view has stopped."""
+CAMERA_MARGIN = 1.6
+"""Distance of the camera over the one that shows the start: the extent of the motion is not known
+in advance."""
 
 
 class LiveView:
     """Shows the state of a run in the browser: ``simulate(mechanism, 10.0, progress=view)``.
 
-    It takes at most :data:`SHARE` of the run's time, by leaving states out.  The panel has the
-    time, the closure error and the change of the energy since the first step.  Bodies only, springs
-    and the like come with :meth:`play`.  It is a context manager, which stops serving at its end.
+    The view takes at most the part :data:`SHARE` of the wall time, by leaving states out.  The
+    panel has the time, the closure error and the change of the energy since the first step.  Only
+    bodies are drawn; :meth:`play` adds springs and overlays.  As a context manager it stops serving
+    at its end.
 
     Parameters
     ----------
     mechanism
-        What is simulated.  The closure error and the energy are those of its closures and forces,
-        also where an event lets one go.
+        The simulated mechanism.  The closure error and the energy are those of its closures and
+        forces, also after an event has released one.
     open_browser
         Open a browser window; otherwise only serve the page.  Its address is logged.
 
@@ -70,9 +79,9 @@ class LiveView:
     visualizer
         The meshcat Visualizer.
     shown, spent
-        How many states were shown, and the time that it took, s.
+        Number of states that were shown, and the time that this took, s.
     stride
-        Steps between two calls that it asks of the run for.
+        Number of steps between two calls that the view requests from the run.
 
     Raises
     ------
@@ -84,24 +93,24 @@ class LiveView:
         self._meshcat = import_meshcat()
         start = JointMotion(mechanism, np.zeros(1), np.array(mechanism.q0)[None])
         picture = make_picture(start, 1.0, OverlayOptions())
-        view = replace(picture.view, distance=WIDER * picture.view.distance)
+        view = replace(picture.view, distance=CAMERA_MARGIN * picture.view.distance)
         picture = replace(picture, view=view, overlays=Overlays())
-        about = about_picture(start, picture, panel=True)
+        data = page_data(start, picture)
         self._system, self._energy = make_system(mechanism), math.nan
         unit = drift_unit(start)
-        about["values"] = [{"label": DRIFT, "unit": unit, "live": 1}] if unit else []
-        about["values"].append({"label": ENERGY, "unit": "J", "live": 2})
+        data["values"] = [{"label": DRIFT, "unit": unit, "live": 1}] if unit else []
+        data["values"].append({"label": ENERGY, "unit": "J", "live": 2})
         names = node_names(mechanism)
         self._joints = sorted({visual.joint for visual in picture.visuals} - {0})
-        about["live"] = [names[joint] for joint in self._joints]
-        page = make_page(self._meshcat, mechanism.name, about, None)
+        data["live"] = [names[joint] for joint in self._joints]
+        page = make_page(self._meshcat, mechanism.name, data, None)
         self.visualizer = serve(self._meshcat, page, picture)
         self._mechanism = mechanism
         self._model, self._data = mechanism.model, workspace(mechanism.model)
         self._node = self.visualizer["/live"]
         self._began = self._last = 0.0
         self.spent, self.shown, self.stride = 0.0, 0, 1
-        # What a state costs is known before the run.
+        # The cost of one state is measured before the run.
         began = time.perf_counter()
         try:
             self._send(0.0, np.concatenate([mechanism.q0, mechanism.v0]), REPLY_TIME)
@@ -113,22 +122,22 @@ class LiveView:
         show(self.visualizer, mechanism.name, open_browser=open_browser)
 
     def __call__(self, t: float, h: float, state: FloatArray) -> None:
-        """Show the state (nq + nv,) at t (s), if there is time for it."""
+        """Show the state (nq + nv,) at t (s), if the share of time allows it."""
         now = time.perf_counter()
         if not self._began:
             self._began = self._last = now
             self._energy = self._system.energy(state)
             return
-        if now - self._last < OFTEN:
-            self.stride = min(2 * self.stride, MOST)
-        elif now - self._last > SELDOM:
+        if now - self._last < SHORTEST_INTERVAL:
+            self.stride = min(2 * self.stride, LARGEST_STRIDE)
+        elif now - self._last > LONGEST_INTERVAL:
             self.stride = max(self.stride // 2, 1)
         self._last = now
         if self.spent + self._cost > SHARE * (now - self._began):
             return
         try:
             self.send(t, state)
-        except InputError:  # what has become of the page must not stop the run
+        except InputError:  # a failure of the page must not stop the run
             log.warning("the page no longer follows the run: its server does not answer")
             self.spent = math.inf
             return
@@ -155,13 +164,13 @@ class LiveView:
         g, _ = constraint_errors(self._mechanism, np.array([t]), q[None], v[None])
         head = np.zeros((4, 4))
         head[:3, 0] = t, np.linalg.norm(g), energy - self._energy
-        # One command for all, which the page takes apart: each waits for the server's answer.
+        # One command for all bodies, because each waits for the server's answer.
         places = [self._data.oMi[joint].homogeneous for joint in self._joints]
-        with answered(self.visualizer.window, patience, ANEW):
+        with answered(self.visualizer.window, patience, SERVER_GONE_REMEDY):
             self._node.set_transform(np.hstack([head, *places]))
         self.shown += 1
 
-    def play(self, solution: Playable, **drawn: Any) -> None:
+    def play(self, solution: DrawableMotion, **drawn: Any) -> None:
         """Play the run in the same page.
 
         Parameters
@@ -175,12 +184,12 @@ class LiveView:
         Raises
         ------
         InputError
-            If the server does not answer, or has stopped, or what is asked for cannot be drawn.
+            If the server does not answer, or has stopped, or an overlay cannot be drawn.
         """
         picture = make_picture(solution, 60.0, OverlayOptions(**drawn))
-        about = about_picture(solution, picture, panel=True)
-        with answered(self.visualizer.window, REPLY_TIME, ANEW):
-            self.visualizer["/about"].set_property("about", as_json(about))
+        data = page_data(solution, picture)
+        with answered(self.visualizer.window, REPLY_TIME, SERVER_GONE_REMEDY):
+            self.visualizer["/about"].set_property("about", json.dumps(data, allow_nan=False))
             draw_picture(self._meshcat, self.visualizer, picture)
 
     def wait(self) -> None:
@@ -188,7 +197,7 @@ class LiveView:
         wait(self.visualizer)
 
     def close(self) -> None:
-        """Stop serving; a page that is open stays as it is."""
+        """Stop serving; an open page keeps its last state."""
         close(self.visualizer)
 
     def __enter__(self) -> LiveView:

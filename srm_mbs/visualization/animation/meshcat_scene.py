@@ -1,8 +1,8 @@
-"""Drawing with meshcat.
+"""A picture as nodes and animations of a meshcat scene.
 
-In the page, ``/mechanism/<joint>`` is the body that the joint moves, ``/mechanism/world`` the
-ground; ``/overlays`` holds what is drawn beside the bodies.  The transform of both puts the centre
-of the picture at the origin, about which meshcat's camera turns.
+``/mechanism/<joint>`` is the body that the joint moves, ``/mechanism/world`` the ground, and
+``/overlays`` has the overlays.  The transforms of ``/mechanism`` and ``/overlays`` place the centre
+of the picture at the origin, about which meshcat's camera rotates.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import WORLD
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, Motion, Picture, View
+from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, Picture, View
 from srm_mbs.visualization.animation.shapes import Box, Colour, Cylinder, Mesh, Shape, Sphere
-from srm_mbs.visualization.animation.trajectory import Spans
+from srm_mbs.visualization.animation.trajectory import ActiveIntervals, BodyMotion
 
 TOP_COLOUR, BOTTOM_COLOUR = (1.0, 1.0, 1.0), (0.90, 0.92, 0.94)
 
@@ -35,7 +35,7 @@ def import_meshcat() -> Any:
     """
     try:
         with warnings.catch_warnings():
-            # Its imports are not the reader's to mend: it takes a deprecated module of pyzmq.
+            # meshcat imports a deprecated module of pyzmq.
             warnings.simplefilter("ignore", DeprecationWarning)
             import meshcat
             import meshcat.animation
@@ -88,7 +88,7 @@ def _material(meshcat: Any, shape: Shape, colour: Colour, in_front: bool) -> Any
         color=_number(colour), opacity=colour[3], shininess=20.0, flatShading=flat
     )
     if in_front:
-        # Transparent things are drawn last; without depth a shape must not show its back.
+        # Transparent objects are drawn last; without depth test, only front faces are drawn.
         material.transparent, material.side = True, 0
         material.properties["depthTest"] = False
     return material
@@ -98,10 +98,10 @@ def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
     """Send the whole picture, the motion included, to ``scene``, a meshcat Visualizer."""
     motion, view = picture.motion, picture.view
     names = node_names(picture.mechanism)
-    _light(scene, view)
+    _light_scene(scene, view)
     root = scene["/mechanism"]
     animation = meshcat.animation.Animation(default_framerate=motion.rate)
-    _shift(meshcat, animation, root, picture)
+    _centre(meshcat, animation, root, picture)
     drawn = {visual.joint for visual in picture.visuals} - {0}
     for k, joint in enumerate(motion.joints):
         if joint in drawn:
@@ -109,18 +109,18 @@ def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
                 "position": ("vector3", motion.positions[:, k]),
                 "quaternion": ("quaternion", motion.quaternions[:, k]),
             }
-            _move(meshcat, animation, root[names[joint]], tracks, motion)
+            _animate(meshcat, animation, root[names[joint]], tracks, motion)
     for number, visual in enumerate(picture.visuals):
         node = root[f"{names[visual.joint]}/shape_{number}"]
-        _put(meshcat, node, visual.shape, visual.placement, visual.colour)
-        _show(meshcat, animation, node, visual.spans, motion)
+        _add_shape(meshcat, node, visual.shape, visual.placement, visual.colour)
+        _show_while_active(meshcat, animation, node, visual.active, motion)
     _draw_overlays(meshcat, scene["/overlays"], picture, animation)
     if animation.clips:
-        # For ever: a page that is looked at late still moves; "pause" stops it.
+        # Repeated without end: a page that is opened late still moves; "pause" stops it.
         scene.set_animation(animation, play=True, repetitions=math.inf)
 
 
-def _put(
+def _add_shape(
     meshcat: Any,
     node: Any,
     shape: Shape,
@@ -133,50 +133,50 @@ def _put(
     node.set_transform(placement)
 
 
-def _shift(meshcat: Any, animation: Any, root: Any, picture: Picture) -> None:
-    """Put what the camera looks at at the origin, and keep it there."""
+def _centre(meshcat: Any, animation: Any, root: Any, picture: Picture) -> None:
+    """Keep the target of the camera at the origin."""
     shift = np.eye(4)
     shift[:3, 3] = -picture.view.target
     root.set_transform(shift)
     if picture.along is not None:
         places = -picture.view.target - picture.along
-        _move(meshcat, animation, root, {"position": ("vector3", places)}, picture.motion)
+        _animate(meshcat, animation, root, {"position": ("vector3", places)}, picture.motion)
 
 
 def _draw_overlays(meshcat: Any, root: Any, picture: Picture, animation: Any) -> None:
-    """Shapes with a motion of their own, and paths."""
+    """Animated shapes, and paths."""
     overlays = picture.overlays
-    if overlays.moving:
-        _shift(meshcat, animation, root, picture)
-    for moving in overlays.moving:
-        node = root[moving.name]
-        for number, (shape, at, colour) in enumerate(moving.parts):
+    if overlays.shapes:
+        _centre(meshcat, animation, root, picture)
+    for group in overlays.shapes:
+        node = root[group.name]
+        for number, (shape, at, colour) in enumerate(group.parts):
             part = node[f"part_{number}"]
-            _put(meshcat, part, shape, at, colour, moving.in_front)
-            if moving.colours is not None:
-                tracks = {"material.color": ("color", moving.colours)}
-                _move(meshcat, animation, part["<object>"], tracks, picture.motion)
+            _add_shape(meshcat, part, shape, at, colour, group.in_front)
+            if group.colours is not None:
+                tracks = {"material.color": ("color", group.colours)}
+                _animate(meshcat, animation, part["<object>"], tracks, picture.motion)
         tracks = {
-            "position": ("vector3", moving.positions),
-            "quaternion": ("quaternion", moving.quaternions),
+            "position": ("vector3", group.positions),
+            "quaternion": ("quaternion", group.quaternions),
         }
-        if moving.scales is not None:
-            tracks["scale"] = ("vector3", moving.scales)
-        _move(meshcat, animation, node, tracks, picture.motion)
-        _show(meshcat, animation, node, moving.spans, picture.motion)
+        if group.scales is not None:
+            tracks["scale"] = ("vector3", group.scales)
+        _animate(meshcat, animation, node, tracks, picture.motion)
+        _show_while_active(meshcat, animation, node, group.active, picture.motion)
     for trace in overlays.traces:
         points = meshcat.geometry.PointsGeometry(trace.points.T.astype(np.float32))
         material = meshcat.geometry.LineBasicMaterial(color=_number(trace.colour))
         root[trace.name].set_object(meshcat.geometry.Line(points, material))
 
 
-def _light(scene: Any, view: View) -> None:
+def _light_scene(scene: Any, view: View) -> None:
     """Background, lights and camera."""
     scene["/Background"].set_property("top_color", list(TOP_COLOUR))
     scene["/Background"].set_property("bottom_color", list(BOTTOM_COLOUR))
     scene["/Axes"].set_property("visible", False)
     scene["/Grid"].set_property("visible", False)
-    # Two lamps on the camera's side, to the left above and to the right, and a faint one behind.
+    # Two lamps on the side of the camera, upper left and right, and a faint one opposite to it.
     lamps = {
         "PointLightNegativeX": ((-0.6, 0.9, -1.0), 0.55),
         "PointLightPositiveX": ((1.0, 0.3, -0.5), 0.25),
@@ -186,23 +186,23 @@ def _light(scene: Any, view: View) -> None:
     for name, (position, intensity) in lamps.items():
         lamp = scene[f"/Lights/{name}/<object>"]
         lamp.set_property("intensity", intensity)
-        lamp.set_property("distance", 0.0)  # it does not fade with the distance
+        lamp.set_property("distance", 0.0)  # intensity independent of the distance
         lamp.set_property("position", (view.distance * np.array(position) @ view.axes).tolist())
     camera = scene["/Cameras/default/rotated/<object>"]
     camera.set_property("fov", FIELD_OF_VIEW)
     camera.set_property("near", 0.02 * view.distance)
     camera.set_property("far", 50.0 * view.distance)
-    # Cameras live in three.js's own axes, y up.
+    # Cameras are placed in the axes of three.js, y up.
     x, y, z = (-view.distance * view.axes[2]).tolist()
     camera.set_property("position", [x, z, -y])
 
 
-def _move(
+def _animate(
     meshcat: Any,
     animation: Any,
     node: Any,
     values: dict[str, tuple[str, FloatArray]],
-    motion: Motion,
+    motion: BodyMotion,
 ) -> None:
     """Set ``node`` to the first of its values, and add a clip if they change.
 
@@ -210,7 +210,7 @@ def _move(
     """
     tracks, frames = {}, motion.frames
     for name, (kind, rows) in values.items():
-        # What stays is said once: the pivot of a crank, the direction of a slider.
+        # A constant value has one key: the pivot of a crank, the direction of a slider.
         count = len(rows) if np.ptp(rows, axis=0).max() > 1e-12 else 1
         tracks[name] = meshcat.animation.AnimationTrack(
             name, kind, frames[:count], rows[:count].tolist()
@@ -222,20 +222,22 @@ def _move(
         animation.clips[node.path] = meshcat.animation.AnimationClip(tracks, fps=fps)
 
 
-def _show(meshcat: Any, animation: Any, node: Any, spans: Spans | None, motion: Motion) -> None:
-    """Show ``node`` during ``spans`` only, to the very time and not to the next key frame."""
-    if spans is None:
+def _show_while_active(
+    meshcat: Any, animation: Any, node: Any, active: ActiveIntervals | None, motion: BodyMotion
+) -> None:
+    """Show ``node`` during its ``active`` intervals only, exact in time, not to a key frame."""
+    if active is None:
         return
     start, end = float(motion.times[0]), float(motion.times[-1])
     changes = {start: False, end: False}
-    for first, last in spans:
+    for first, last in active:
         changes |= {first: True, last: last >= end}
     times = sorted(changes)
     node.set_property("visible", changes[times[0]])
     clip = animation.clips.setdefault(
         node.path, meshcat.animation.AnimationClip({}, fps=animation.default_framerate)
     )
-    # The last key is that of all clips, so that all of them last as long.
+    # All clips have the same last key, so that they have the same duration.
     frames = [(t - start) * motion.rate for t in times[:-1]] + [len(motion.times) - 1]
     clip.tracks["visible"] = meshcat.animation.AnimationTrack(
         "visible", "bool", frames, [changes[t] for t in times]

@@ -1,75 +1,88 @@
-"""The page that plays a run: meshcat's viewer with a panel of values and a bar of controls.
+"""The page that plays a motion: meshcat's viewer with a panel of values and a bar of controls.
 
-The files of the folder ``page`` are put together with meshcat's viewer into one that needs nothing
-else.
-
-What the page of a run tells in words and numbers: values over time, singular passages, notes.
+:func:`page_data` computes the values over time, the singular passages and the notes; with them
+:func:`make_page` fills the files of the folder ``web`` into one self-contained page.
 """
 
 from __future__ import annotations
 
 import base64
-import html
-import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError
-from srm_mbs.simulation.result import Solution
-from srm_mbs.visualization.animation.trajectory import parts_of
+from srm_mbs.integration.singular_passages import Crossing
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.animation.scene import ASPECT, Picture
+from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
-if TYPE_CHECKING:
-    from srm_mbs.integration.singular_passages import Crossing
-    from srm_mbs.visualization.animation.joint_motion import Playable
+log = logging.getLogger(__name__)
+
+FOLDER = Path(__file__).with_name("web")
 
 MAX_SAMPLES = 3000
 """Times at which the values are sampled: some 100 kB in a page."""
 NAMED_LOOPS, NAMED_PASSAGES = 12, 100
-"""Loops, and passages, up to which the passages name their loops."""
+"""Numbers of loops and of passages up to which the passages name their loops."""
 DRIFT, ENERGY = "drift |g|", "energy change"
 DIGITS = 4
-"""Digits of a value in the page; it shows three."""
+"""Significant digits of a value in the page, which shows three."""
 
 
-def read_out(solution: Playable, times: FloatArray, *, panel: bool = True) -> dict[str, Any]:
-    """Values and passages as the page takes them, ready for JSON.
+def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -> dict[str, Any]:
+    """The data of the panel and the bar, ready for JSON.
 
     Parameters
     ----------
-    solution
-        A run, or a motion, which has no values.
-    times : (n,) s
-        Of the key frames.
+    motion
+        A run, or a prescribed motion, which has no values.
+    picture
+        Its picture.
     panel
-        Whether the page shows them; otherwise they are not computed.
+        Whether the page shows the values and passages; otherwise they are not computed.
 
     Returns
     -------
     dict
-        ``start`` (s); ``times`` (s) and ``values``, each with ``label``, ``unit`` and ``samples``
-        at the times, null where they are not finite; ``passages``, each with ``time`` (s) and
-        ``text``; ``panel``.
+        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``aspect``.
     """
-    about: dict[str, Any] = {"start": float(times[0]), "panel": panel, "times": []}
-    about |= {"values": [], "passages": []}
-    if not (panel and isinstance(solution, Solution)):
-        return about
+    times = picture.motion.times
+    data: dict[str, Any] = {"times": [], "values": [], "passages": []}
+    if panel and isinstance(motion, SimulationResult):
+        data = values_over_time(motion, times)
+    return data | {
+        "start": float(times[0]),
+        "panel": panel,
+        "notes": picture.overlays.notes,
+        "aspect": ASPECT,
+    }
+
+
+def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str, Any]:
+    """Drift, energy and sigma of a run at the ``times`` (n,) s of its key frames.
+
+    Returns
+    -------
+    dict
+        ``times`` (s) and ``values``, each with ``label``, ``unit`` and ``samples`` at the times,
+        null where they are not finite; ``passages``, each with ``time`` (s) and ``text``.
+    """
     crossings = solution.crossings
     few = len(solution.mechanism.loops) <= NAMED_LOOPS and len(crossings) <= NAMED_PASSAGES
-    about["passages"] = [
-        {"time": crossing.time, "text": _passage(crossing, named=few)} for crossing in crossings
+    passages = [
+        {"time": crossing.time, "text": _passage_text(crossing, named=few)}
+        for crossing in crossings
     ]
     if len(times) > MAX_SAMPLES:
         times = np.linspace(times[0], times[-1], MAX_SAMPLES)
     times = np.union1d(times, [crossing.time for crossing in crossings])
-    about["times"] = [float(f"{t:.9g}") for t in times]
     run = solution.at(times)
     values = []
     unit = drift_unit(solution)
@@ -79,36 +92,40 @@ def read_out(solution: Playable, times: FloatArray, *, panel: bool = True) -> di
         values.append((ENERGY, "J", run.energy - solution.at(times[:1]).energy))
         if unit and solution.steps.count:
             values.append(("sigma", "", sigma_at(solution, times)))
-    about["values"] = [
-        {"label": label, "unit": unit, "samples": [_rounded(x) for x in samples.tolist()]}
-        for label, unit, samples in values
-    ]
-    return about
+    return {
+        "times": [float(f"{t:.9g}") for t in times],
+        "values": [
+            {"label": label, "unit": unit, "samples": [_rounded(x) for x in samples.tolist()]}
+            for label, unit, samples in values
+        ],
+        "passages": passages,
+    }
 
 
-def drift_unit(solution: Playable) -> str:
-    """Units of the closure errors of a run or motion, "" if it never has closures or drives."""
+def drift_unit(motion: DrawableMotion) -> str:
+    """Units of the closure errors of a motion, "" if it never has closures or drives."""
     units: dict[str, None] = {}
-    for mechanism, _ in parts_of(solution):
-        if mechanism.constrained:
-            units |= dict.fromkeys(row_dimensions(mechanism))
+    for segment in motion.segments:
+        if segment.mechanism.constrained:
+            units |= dict.fromkeys(row_dimensions(segment.mechanism))
     return ", ".join(units)
 
 
-def _passage(crossing: Crossing, *, named: bool) -> str:
-    """What the mark of a passage says: its time and, where all are few, the loops and drives.
+def _passage_text(crossing: Crossing, *, named: bool) -> str:
+    """Text at the mark of a passage: its time and, where loops and passages are few, the loops and
+    drives that lose rank.
 
-    Which loops lose rank takes a second to find out among dozens, and nobody could read them.
+    To find them among dozens of loops takes a second.
     """
     text = f"singular configuration passed at t = {crossing.time:.4g} s"
     return f"{text}: {crossing.participants.names}" if named else text
 
 
-def sigma_at(solution: Solution, times: FloatArray) -> FloatArray:
+def sigma_at(solution: SimulationResult, times: FloatArray) -> FloatArray:
     """sigma (relative) at ``times`` (n,) s.
 
-    Straight lines between the stages of the run, where it was recorded, as in the plot of the run,
-    and zero at the singular passages, which lie between two of them.
+    Linear interpolation between the stages of the run, which record it, as in the plot of the run,
+    and zero at the singular passages, which lie between stages.
     """
     steps = solution.steps
     abscissae = np.append(solution.scheme.c, 1.0)
@@ -125,13 +142,8 @@ def _rounded(value: float) -> float | None:
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 
 
-log = logging.getLogger(__name__)
-
-FOLDER = Path(__file__).with_name("web")
-
-
 def make_page(
-    meshcat: Any, title: str, about: dict[str, Any], commands: Sequence[dict[str, Any]] | None
+    meshcat: Any, title: str, data: dict[str, Any], commands: Sequence[dict[str, Any]] | None
 ) -> str:
     """One self-contained page.
 
@@ -141,46 +153,43 @@ def make_page(
         The package.
     title
         Of the window.
-    about
-        What the panel and the bar show (:func:`srm_mbs.visualization.animation.page.read_out`).
+    data
+        Data of the panel and the bar (:func:`page_data`).
     commands
         meshcat's commands, which the page holds and, unlike that of meshcat's own
         ``static_html``, applies in their order; None for a page that takes them from the server
         that it comes from.
     """
     root = Path(meshcat.servers.zmqserver.VIEWER_ROOT)
-    parts = {
-        "title": html.escape(title),
-        "viewer": (root / "main.min.js").read_text(encoding="utf-8"),
-        "commands": json.dumps(None if commands is None else _packed(commands)),
-        # Names are the user's: they must not end the script.
-        "about": as_json(about).replace("<", "\\u003c"),
-        "script": (FOLDER / "page.js").read_text(encoding="utf-8"),
-    }
-    return filled("page.html", parts)
+    return render(
+        FOLDER,
+        "page.html.j2",
+        title=title,
+        viewer=(root / "main.min.js").read_text(encoding="utf-8"),
+        commands=None if commands is None else _packed(commands),
+        data=data,
+        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
+    )
 
 
-def filled(template: str, parts: Mapping[str, str]) -> str:
-    """A file of the folder ``page`` with each mark ``@name@`` replaced by what it stands for.
+def render(folder: Path, template: str, **values: Any) -> str:
+    """A Jinja2 template of ``folder``, filled with ``values``.
 
-    Parameters
-    ----------
-    template
-        Name of the file.
-    parts
-        What is put in, in the order of the marks.
+    Values are escaped as HTML, or as JavaScript by the filter ``tojson``: names in them are the
+    user's.
     """
-    page = (FOLDER / template).read_text(encoding="utf-8")
-    # The last first: what is put in may itself hold marks.
-    for name in reversed(list(parts)):
-        before, after = page.split(f"@{name}@", 1)
-        page = before + parts[name] + after
-    return page
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-
-def as_json(about: dict[str, Any]) -> str:
-    """``about`` of :func:`make_page` as text."""
-    return json.dumps(about, allow_nan=False)
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
+    return environment.get_template(template).render(values)
 
 
 def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:

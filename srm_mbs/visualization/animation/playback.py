@@ -1,17 +1,12 @@
-"""Playing a run in the browser: live with :func:`play`, or from one file with :func:`export_html`.
+"""Playback in the browser: from a local server, from one file, or in the output of a notebook.
 
-Both draw with meshcat and hand the motion to its animation, so that the browser plays it in real
-time and its time slider scrubs through it.
-
-A run in a notebook: the page of ``export_html`` inside the output of a cell.
-
-Nothing here needs IPython: notebooks ask what they show for ``_repr_html_``.
+:func:`play`, :func:`export_html` and :func:`show_in_notebook` draw with meshcat and its animation,
+so that the browser plays the motion in real time and its time slider scrubs through it.
 """
 
 from __future__ import annotations
 
 import atexit
-import html
 import logging
 import math
 import sys
@@ -21,22 +16,27 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
 from srm_mbs.visualization.animation.overlays import OverlayOptions
-from srm_mbs.visualization.animation.page import make_page, read_out, write_page
-from srm_mbs.visualization.animation.scene import ASPECT, Picture, make_picture
+from srm_mbs.visualization.animation.page import (
+    FOLDER,
+    make_page,
+    page_data,
+    render,
+    write_page,
+)
+from srm_mbs.visualization.animation.scene import Picture, make_picture
 from srm_mbs.visualization.animation.server import SERVERLESS, start_server
-
-if TYPE_CHECKING:
-    from srm_mbs.visualization.animation.joint_motion import Playable
+from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
 log = logging.getLogger(__name__)
 
-REPLY_TIME = 30.0  # s, for meshcat's server to accept one command
+REPLY_TIME = 30.0
+"""Time (s) for meshcat's server to accept one command."""
 
 # Playing ------------------------------------------------------------------------------------
 
@@ -47,7 +47,7 @@ def check_fps(fps: Any) -> float:
     Raises
     ------
     InputError
-        If it is none.
+        If ``fps`` is not a positive number.
     """
     try:
         value = float(fps)
@@ -66,7 +66,7 @@ _open_visualizers: list[Any] = []
 
 
 def play(
-    solution: Playable,
+    solution: DrawableMotion,
     *,
     fps: float = 60.0,
     open_browser: bool = True,
@@ -75,37 +75,37 @@ def play(
     gaps: bool = False,
     reactions: bool = False,
 ) -> Any:
-    """Play a run in the browser, in real time, over and over.
+    """Play a run in the browser, in real time and repeatedly.
 
     The page is that of :func:`export_html`, served by a local process.
 
     Parameters
     ----------
     solution
-        The run; one that failed is played up to its end.
+        The run, or a prescribed motion; a run that failed is played up to its end.
     fps, trace, gaps, reactions
         As for :func:`export_html`.
     open_browser
         Open a browser window; otherwise only serve the page.  Its address is logged.
     block
-        Wait until Ctrl-C, and then stop serving.  By default in a script, whose end would also be
-        that of the page, and not in an interactive session.
+        Wait until Ctrl-C, and then stop serving.  The default is True in a script, whose end would
+        also end the page, and False in an interactive session.
 
     Returns
     -------
     meshcat.Visualizer
-        To add to the scene, or for :func:`close`.
+        For :func:`close`, or to add to the scene.
 
     Raises
     ------
     InputError
-        If ``fps`` is not a positive number, what is asked for cannot be drawn, or meshcat is
-        missing or cannot start.
+        If ``fps`` is not a positive number, an overlay cannot be drawn, or meshcat is missing or
+        cannot start.
     """
     meshcat = import_meshcat()
     picture = make_picture(solution, check_fps(fps), OverlayOptions(trace, gaps, reactions))
-    about = about_picture(solution, picture, panel=True)
-    visualizer = serve(meshcat, make_page(meshcat, solution.mechanism.name, about, None), picture)
+    data = page_data(solution, picture)
+    visualizer = serve(meshcat, make_page(meshcat, solution.mechanism.name, data, None), picture)
     show(visualizer, solution.mechanism.name, open_browser=open_browser)
     if block is None:
         block = not (hasattr(sys, "ps1") or sys.flags.interactive)
@@ -126,12 +126,12 @@ def wait(visualizer: Any) -> None:
 
 
 def close(visualizer: Any) -> None:
-    """Stop serving the page of :func:`play`; a page that is open goes on playing.
+    """Stop serving the page of :func:`play`; an open page keeps playing.
 
     Parameters
     ----------
     visualizer
-        What :func:`play` returned; closing it twice is harmless.
+        Returned by :func:`play`; closing it twice is harmless.
     """
     window = visualizer.window
     if visualizer in _open_visualizers:
@@ -159,12 +159,12 @@ def _zmq() -> Any:
 
 @contextmanager
 def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[None]:
-    """While the server has ``seconds`` to accept each command, instead of for ever.
+    """Context in which the server has ``seconds`` to accept each command.
 
     Raises
     ------
     InputError
-        If it does not, or has stopped.
+        If the server does not accept a command in time, or has stopped.
     """
     if window.server_proc.poll() is not None:
         raise InputError("meshcat's server has stopped", remedy=remedy)
@@ -177,14 +177,14 @@ def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[
         window.zmq_socket.setsockopt(zmq.RCVTIMEO, -1)
     except zmq.ZMQError as error:
         if window.zmq_socket is not None:
-            # A socket that waits for an answer takes no other command.
+            # A socket that waits for an answer accepts no other command.
             window.zmq_socket.close(linger=0)
             window.connect_zmq()
         raise InputError(f"meshcat's server does not answer: {error}", remedy=remedy) from error
 
 
 def serve(meshcat: Any, page: str, picture: Picture) -> Any:
-    """Serve ``page``, and draw in it.
+    """Serve ``page``, and draw ``picture`` in it.
 
     Returns
     -------
@@ -198,11 +198,11 @@ def serve(meshcat: Any, page: str, picture: Picture) -> Any:
     """
     process, commands, address = start_server(page)
     kind = meshcat.visualizer.ViewerWindow
-    window = kind.__new__(kind)  # its constructor starts a server of its own, or leaves a socket
+    window = kind.__new__(kind)  # the constructor would start another server
     window.server_proc, window.zmq_url, window.web_url = process, commands, address
     window.zmq_socket = None
     visualizer = meshcat.Visualizer(window=window)
-    # Kept until closed: an abandoned process and socket would warn when collected.
+    # Kept until closed: garbage collection of an open process or socket gives a warning.
     _open_visualizers.append(visualizer)
     try:
         with answered(window, REPLY_TIME):
@@ -214,7 +214,7 @@ def serve(meshcat: Any, page: str, picture: Picture) -> Any:
 
 
 def show(visualizer: Any, name: str, *, open_browser: bool) -> None:
-    """Log where the page is and, if wanted, open it."""
+    """Log the address of the page and, on request, open it."""
     address = visualizer.url()
     log.info("%s is played at %s", name, address)
     if open_browser and not webbrowser.open(address, new=2):
@@ -225,7 +225,7 @@ def show(visualizer: Any, name: str, *, open_browser: bool) -> None:
 
 
 class _Recorder:
-    """Stands in for meshcat's window: keeps the commands instead of sending them to a server."""
+    """Replaces meshcat's window: records the commands instead of sending them to a server."""
 
     def __init__(self) -> None:
         self.commands: list[dict[str, Any]] = []
@@ -235,7 +235,7 @@ class _Recorder:
 
 
 def export_html(
-    solution: Playable,
+    solution: DrawableMotion,
     path: str | Path,
     *,
     fps: float = 60.0,
@@ -246,74 +246,65 @@ def export_html(
 ) -> None:
     """Write one file that plays a run in any browser, without a network or a server.
 
-    It starts at once and repeats for ever.  Below are pause, play, the speed, and the time slider
-    with the singular passages marked; a panel has the time, and of a run drift, energy and sigma
-    there.  The mouse turns, shifts and zooms the picture.  Spring-dampers between two points are
-    drawn.
+    The animation starts at once and repeats.  The bar below has pause, play, the speed, and the
+    time slider with marks at singular passages.  The panel has the time and, for a run, drift,
+    energy and sigma at that time.  The mouse rotates, shifts and zooms the picture.
+    Spring-dampers between two points are drawn.
 
     Parameters
     ----------
     solution
-        The run; one that failed is shown up to its end, or as it stood.
+        The run, or a prescribed motion; a run that failed is shown up to its end.
     path
         Name of the file, usually ``.html``; an existing one is replaced.
     fps
-        Key frames per second; between them the browser goes straight.  More are taken where bodies
-        would be seen beside their places, such as in short runs of fast mechanisms, and fewer where
-        their number would get too large
-        (:data:`srm_mbs.visualization.animation.scene.MAX_BODY_FRAMES`), to keep the file below 5 MB
-        unless there are mesh files or very many bodies, or the run takes the better part of an
-        hour.
+        Key frames per second, between which the browser interpolates linearly.  More are used
+        where the error of interpolation would be visible, such as in short runs of fast mechanisms,
+        and fewer above :data:`srm_mbs.visualization.animation.trajectory.MAX_BODY_FRAMES` key
+        frames of all bodies together, to keep the file below 5 MB unless there are mesh files or
+        very many bodies, or the run takes the better part of an hour.
     trace
         Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
     gaps
-        Draw the gaps of the closures, so much exaggerated that they are seen; the panel gives the
-        factor.
+        Draw the gaps of the closures, exaggerated by a factor that the panel gives.
     reactions
-        Colour the closures by the size of their reaction force, with a legend in the panel.
+        Colour the closures by the magnitude of their reaction force, with a legend in the panel.
     panel
-        Whether there are the panel and the marks.
+        Whether the page has the panel and the marks.
 
     Raises
     ------
     InputError
-        If ``fps`` is not a positive number, what is asked for cannot be drawn, meshcat is missing,
-        or the file cannot be written.
+        If ``fps`` is not a positive number, an overlay cannot be drawn, meshcat is missing, or the
+        file cannot be written.
     """
-    drawn = OverlayOptions(trace, gaps, reactions)
-    write_page(page_of(solution, fps, drawn, panel=panel), Path(path))
+    options = OverlayOptions(trace, gaps, reactions)
+    write_page(page_of(solution, fps, options, panel=panel), Path(path))
 
 
 def page_of(
-    solution: Playable,
+    solution: DrawableMotion,
     fps: float,
-    wanted: OverlayOptions,
+    options: OverlayOptions,
     *,
     panel: bool,
     extra: Iterable[float] = (),
 ) -> str:
     """The page of :func:`export_html`, with key frames at ``extra`` times (s); errors as there."""
     meshcat = import_meshcat()
-    picture = make_picture(solution, check_fps(fps), wanted, extra)
+    picture = make_picture(solution, check_fps(fps), options, extra)
     recorder = _Recorder()
     draw_picture(meshcat, meshcat.Visualizer(window=recorder), picture)
-    about = about_picture(solution, picture, panel=panel)
-    return make_page(meshcat, solution.mechanism.name, about, recorder.commands)
-
-
-def about_picture(solution: Playable, picture: Picture, *, panel: bool) -> dict[str, Any]:
-    """What the page says about a run and its picture, for
-    :func:`srm_mbs.visualization.animation.page.make_page`."""
-    about = read_out(solution, picture.motion.times, panel=panel)
-    return about | {"notes": picture.overlays.notes, "aspect": ASPECT}
+    data = page_data(solution, picture, panel=panel)
+    return make_page(meshcat, solution.mechanism.name, data, recorder.commands)
 
 
 @dataclass(frozen=True)
 class Embedded:
-    """A page that a notebook shows where it is the value of a cell.
+    """A page that a notebook shows as the value of a cell, through ``_repr_html_``.
 
-    It stands in the notebook itself, needs neither a server nor a network, and plays in exported
-    HTML too.
+    The notebook contains the page, which needs neither a server nor a network, and plays in
+    exported HTML too.
 
     Attributes
     ----------
@@ -327,14 +318,11 @@ class Embedded:
     height: int
 
     def _repr_html_(self) -> str:
-        return (
-            f'<iframe srcdoc="{html.escape(self.page)}" title="animation" width="100%" '
-            f'height="{self.height}" style="border: 0"></iframe>'
-        )
+        return render(FOLDER, "notebook.html.j2", page=self.page, height=self.height)
 
 
 def show_in_notebook(
-    solution: Playable,
+    solution: DrawableMotion,
     *,
     height: int = 420,
     fps: float = 60.0,
@@ -343,12 +331,12 @@ def show_in_notebook(
     reactions: bool = False,
     panel: bool = True,
 ) -> Embedded:
-    """The animation of a run for a notebook: let it be the value of a cell.
+    """The animation of a run as the value of a notebook cell.
 
     Parameters
     ----------
     solution
-        The run, or a motion.
+        The run, or a prescribed motion.
     height
         Of the frame, pixels.
     fps, trace, gaps, reactions, panel

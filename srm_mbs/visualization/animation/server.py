@@ -1,8 +1,7 @@
-"""meshcat's server with the page of :mod:`srm_mbs.visualization.animation.page`: ``python -m
-srm_mbs.visualization.animation.server``.
+"""meshcat's server for the page of :mod:`srm_mbs.visualization.animation.page`.
 
-The page is read from standard input.  Then the addresses are printed as meshcat does, and commands
-are passed to every page that is open, or is opened later.
+``python -m srm_mbs.visualization.animation.server`` reads the page from standard input, prints the
+addresses as meshcat does, and passes commands to every page that is open, or is opened later.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 SERVERLESS = "Use solution.export_html(path), which needs no server"
-"""Remedy where the server does not work."""
+"""Remedy if the server does not work."""
 
 
 def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
-    """Serve ``page`` from a process of its own.
+    """Serve ``page`` from a new process.
 
     Returns
     -------
@@ -33,9 +32,9 @@ def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
     Raises
     ------
     InputError
-        If it ends before it serves.
+        If the process ends before it serves.
     """
-    # The package and meshcat are where this process has found them.
+    # The new process finds the package and meshcat on the path of this one.
     paths = os.pathsep.join(path for path in sys.path if path)
     process = subprocess.Popen(
         [sys.executable, "-u", "-m", __name__],
@@ -43,7 +42,7 @@ def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": paths},
-        start_new_session=True,  # Ctrl-C is the player's
+        start_new_session=True,  # Ctrl-C ends the player only
     )
     to_server, from_server = cast(IO[bytes], process.stdin), cast(IO[bytes], process.stdout)
     with suppress(OSError):  # it may have ended
@@ -65,13 +64,12 @@ def start_server(page: str) -> tuple[subprocess.Popen[bytes], str, str]:
 
 
 def _serve(page: bytes) -> None:
-    """Serve until the process is ended."""
+    """Serve until the process is killed."""
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", DeprecationWarning
-        )  # as in srm_mbs.visualization.animation.scene
+        # meshcat imports a deprecated module of pyzmq.
+        warnings.simplefilter("ignore", DeprecationWarning)
         import tornado.web
         from meshcat.servers import zmqserver
 

@@ -1,8 +1,8 @@
-"""What a mechanism looks like: coloured shapes, each fixed to one joint of the tree.
+"""Shapes of the bodies of a mechanism, each with a colour and fixed to one joint of the tree.
 
-The shapes are the ``<visual>`` elements of the URDF.  Each is attached through the frame of its
-link in the model that is simulated, so that locked joints and moving bases need no special care.
-A mechanism without visuals is drawn as bars between its joints and loop anchors.
+The shapes are the ``<visual>`` elements of the URDF.  Each is placed through the frame of its link
+in the simulated model, which accounts for locked joints and moving bases.  A mechanism without
+visuals is drawn as bars between its joints and loop anchors.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.visualization.animation.trajectory import Spans
+from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
 log = logging.getLogger(__name__)
 
 Colour = tuple[float, float, float, float]
 
-PALETTE: tuple[Colour, ...] = (  # after Okabe and Ito: told apart by colour-blind readers too
+PALETTE: tuple[Colour, ...] = (  # after Okabe and Ito: distinct for colour-blind readers too
     (0.000, 0.447, 0.698, 1.0),
     (0.902, 0.624, 0.000, 1.0),
     (0.000, 0.620, 0.451, 1.0),
@@ -41,7 +41,8 @@ PALETTE: tuple[Colour, ...] = (  # after Okabe and Ito: told apart by colour-bli
 GROUND_COLOUR: Colour = (0.55, 0.57, 0.60, 1.0)
 PIN_COLOUR: Colour = (0.15, 0.16, 0.18, 1.0)
 ANCHOR_COLOUR: Colour = (0.835, 0.369, 0.000, 1.0)
-BAR_THICKNESS = 0.025  # of the mechanism's extent, in drawings without visuals
+BAR_THICKNESS = 0.025
+"""Of the mechanism's extent, in drawings without visuals."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +108,15 @@ class Visual:
         Of the shape in the joint's frame.
     colour
         Red, green, blue and opacity, 0 to 1.
-    spans
-        When it is there (s); None for always.
+    active
+        When it is drawn (s); None for always.
     """
 
     joint: int
     placement: pin.SE3
     shape: Shape
     colour: Colour
-    spans: Spans | None = None
+    active: ActiveIntervals | None = None
 
     def corners(self) -> FloatArray:
         """Corners (8, 3) m of its bounding box, in the joint's frame."""
@@ -126,15 +127,20 @@ class Visual:
 
 
 def visuals_of(
-    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, Spans | None]] | None = None
+    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, ActiveIntervals | None]] | None = None
 ) -> list[Visual]:
     """Shapes of ``mechanism``: those of its URDF or, if there are none, bars.
 
-    ``loops`` are the closures whose anchors the bars reach and mark, with when they are there;
-    those of ``mechanism`` by default.
+    Parameters
+    ----------
+    mechanism
+        The mechanism.
+    loops
+        Closures with their active intervals: bars end at their anchors, which are marked.  Those
+        of ``mechanism`` by default.
 
-    Mesh files are looked for beside the URDF, in the folders above it (``package://``), and in
-    the data of ``example-robot-data``; one that cannot be read is left out with a warning.
+    Mesh files are searched beside the URDF, in the folders above it (``package://``), and in the
+    data of ``example-robot-data``; one that cannot be read is left out with a warning.
     """
     found = list(_urdf_visuals(mechanism))
     if found:
@@ -270,7 +276,7 @@ class _MeshFiles:
             If the file does not exist or is no mesh.
         """
         path = self.find(name)
-        # Pinocchio's own reader: it honours the units and the up axis that a file declares.
+        # Pinocchio's own reader applies the units and the up axis that a file declares.
         import coal  # type: ignore[import-untyped]
 
         try:
@@ -302,17 +308,17 @@ def _robot_data() -> list[Path]:
 
 
 def _skeleton(
-    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, Spans | None]]
+    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, ActiveIntervals | None]]
 ) -> list[Visual]:
-    """Bars from each joint to the joints and loop anchors behind it, and markers at them."""
+    """Bars from each joint to its child joints and loop anchors, with markers there."""
     model = mechanism.model
     ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
     for joint in range(1, model.njoints):
         ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
-    anchors = [(*side.resolve(model), spans) for loop, spans in loops for side in loop.anchors]
+    anchors = [(*side.resolve(model), active) for loop, active in loops for side in loop.anchors]
     for joint, placement, _ in anchors:
         ends[joint].append(placement.translation)
-    # The last body of a chain ends in its centre of mass, for want of anything else.
+    # The bar of the last body of a chain ends in its centre of mass.
     masses = [
         joint
         for joint in range(1, model.njoints)
@@ -337,9 +343,9 @@ def _skeleton(
         centre = pin.SE3(np.eye(3), model.inertias[joint].lever)
         colour = _default_colour(joint)
         out.append(Visual(joint, centre, Sphere(1.5 * width), colour))
-    for joint, placement, spans in anchors:
+    for joint, placement, active in anchors:
         if joint:
-            out.append(Visual(joint, placement, Sphere(0.9 * width), ANCHOR_COLOUR, spans))
+            out.append(Visual(joint, placement, Sphere(0.9 * width), ANCHOR_COLOUR, active))
     for end in ends[0]:
         block = Box((2.0 * width,) * 3)
         out.append(Visual(0, pin.SE3(np.eye(3), end), block, GROUND_COLOUR))
@@ -366,9 +372,9 @@ def _marker(mechanism: Mechanism, joint: int, width: float) -> Visual:
     """A pin along the axis of a hinge, a block along that of a slide, otherwise a ball."""
     model = mechanism.model
     kind = model.joints[joint]
-    # The joint moves itself only by its own columns, which are constant for a hinge or a slide.
+    # The joint's own columns of its Jacobian are constant for a hinge or a slide.
     jacobian = pin.computeJointJacobian(model, workspace(model), np.array(mechanism.q0), joint)
-    # With one column it comes as a vector.
+    # Pinocchio returns a single column as a vector.
     linear, angular = np.split(jacobian.reshape(6, model.nv)[:, kind.idx_v], 2)
     if kind.nv == 1 and np.any(angular):
         hinge = Cylinder(0.8 * width, 2.4 * width)

@@ -1,13 +1,12 @@
-"""A still picture of a run without a browser: triangles into a buffer of depths, in NumPy.
+"""Snapshot of a run without a browser, by a software rasteriser with a depth buffer in NumPy.
 
-It shows what the page of the animation shows, from the same place
-(:func:`srm_mbs.visualization.animation.scene.choose_view`) or, of a mechanism that is about to
-drive far away, from nearer. It is there for print and where no Chromium is installed that could
-photograph that page.
+It shows bodies and springs as the page of the animation does, from the same view
+(:func:`srm_mbs.visualization.animation.scene.choose_view`) or, if the mechanism travels far, from a
+closer one.  Reports need it for print, and where no Chromium is installed.
 
-Matplotlib has no buffer of depths.  It draws whole polygons from the farthest to the nearest, and
-then a rod shows through the sleeve around it unless both are cut into pieces about as small as the
-gap between them, which takes many times as long.
+Matplotlib's mplot3d has no depth buffer: it sorts whole polygons by distance, so that a rod shows
+through the sleeve around it unless both are divided into pieces about as small as their clearance,
+which takes many times as long.  meshcat renders in a browser only.
 """
 
 from __future__ import annotations
@@ -21,36 +20,38 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.simulation.result import Solution
-from srm_mbs.visualization.animation.overlays import OverlayOptions, springs_of
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.animation.overlays import OverlayOptions, active_springs
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
 from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Shape
-from srm_mbs.visualization.animation.trajectory import within
+from srm_mbs.visualization.animation.trajectory import active_at
 
 SIZE = (900, 600)
-"""Width and largest height in pixels."""
-FINER = 2
+"""Width and largest height of the image, pixels."""
+SUPERSAMPLING = 2
 """Samples per pixel in each direction."""
 SIDES = 20
-"""Of a cylinder, and of a sphere along its equator."""
-FRAMES = 200
-"""Frames of the motion that decide the place of the camera."""
-TOGETHER = (4, 8, 16, 32)
-"""Triangles of up to these sizes (samples) are drawn many at a time."""
-SAMPLES = 1_000_000
-"""Most samples that are looked at together."""
-FAR = 4.0
-"""How many times as far as the mechanism alone asks for the camera may stand to show the motion."""
+"""Number of faces around a cylinder, and around the equator of a sphere."""
+VIEW_FRAMES = 200
+"""Key frames of the motion from which the view is computed."""
+BATCH_SIZES = (4, 8, 16, 32)
+"""Triangles of up to these sizes (samples) are rasterised in batches."""
+MAX_BATCH_SAMPLES = 1_000_000
+"""Most samples of a batch."""
+FARTHEST_VIEW = 4.0
+"""Largest distance of the camera that shows the whole motion, over that which shows the mechanism
+at the time of the snapshot."""
 MARGIN = 24
-"""Pixels left above and below."""
+"""Pixels of background above and below."""
 LIGHT = np.array([-0.4, 0.65, -0.65]) / np.linalg.norm([-0.4, 0.65, -0.65])
 """Direction to the light: right, up, forward as the camera sees them."""
 AMBIENT = 0.45
+"""Intensity of ambient light; that of the directed light is 1 - AMBIENT."""
 BACKGROUND = (1.0, 1.0, 1.0)
 
 
-def still_picture(solution: Solution, t: float) -> bytes:
-    """The bodies and springs at ``t`` (s) as a PNG.
+def draw_snapshot(solution: SimulationResult, t: float) -> bytes:
+    """The bodies and springs at ``t`` (s) as a PNG file.
 
     Raises
     ------
@@ -61,24 +62,26 @@ def still_picture(solution: Solution, t: float) -> bytes:
 
     start, end = solution.span
     picture = make_picture(
-        solution, FRAMES / (end - start) if end > start else 1.0, OverlayOptions()
+        solution, VIEW_FRAMES / (end - start) if end > start else 1.0, OverlayOptions()
     )
     mechanism, now = solution.mechanism, np.array([t])
     data = workspace(mechanism.model)
     pin.forwardKinematics(mechanism.model, data, solution(t)[0])
     triangles, colours = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
     for visual in picture.visuals:
-        if not within(now, visual.spans, end).all():
+        if not active_at(now, visual.active, end).all():
             continue
         own = _triangles(visual.shape)
         triangles.append(_placed(own, data.oMi[visual.joint] * visual.placement))
         colours.append(np.tile(visual.colour[:3], (len(own), 1)))
-    for (spring, spans), moving in zip(springs_of(solution), picture.overlays.moving, strict=True):
-        if not within(now, spans, end).all():
+    for (spring, active), group in zip(
+        active_springs(solution), picture.overlays.shapes, strict=True
+    ):
+        if not active_at(now, active, end).all():
             continue
         (ja, a), (jb, b) = (x.resolve(mechanism.model) for x in (spring.a, spring.b))
         ends = (data.oMi[ja] * a).translation, (data.oMi[jb] * b).translation
-        for shape, placement, colour in moving.parts:
+        for shape, placement, colour in group.parts:
             own = _stretched(_placed(_triangles(shape), placement), ends[0], ends[1])
             triangles.append(own)
             colours.append(np.tile(colour[:3], (len(own), 1)))
@@ -86,11 +89,11 @@ def still_picture(solution: Solution, t: float) -> bytes:
     view = picture.view
     if len(corners):
         here = choose_view(mechanism, corners.reshape(-1, 3))
-        view = here if FAR * here.distance < view.distance else view
-    pixels = _drawn(corners, np.concatenate(colours), view)
+        view = here if FARTHEST_VIEW * here.distance < view.distance else view
+    pixels = _rasterised(corners, np.concatenate(colours), view)
     out = io.BytesIO()
     image = Image.fromarray((255.0 * _trimmed(pixels)).round().astype(np.uint8))
-    # Few colours: a third of the size, and no loss that is seen.
+    # 128 colours: a third of the size without visible loss.
     image.quantize(128, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
     return out.getvalue()
 
@@ -109,7 +112,7 @@ def _triangles(shape: Shape) -> FloatArray:
         return _of_quads(corners[np.array(sides)] * np.array(shape.size))
     turn = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
     if isinstance(shape, Cylinder):
-        # The outline from axis to axis, turned about it.
+        # The outline from axis to axis, which is rotated about the axis.
         r, half = shape.radius, 0.5 * shape.length
         outline = np.array([(0.0, -half), (r, -half), (r, half), (0.0, half)])
     else:
@@ -136,7 +139,7 @@ def _placed(triangles: FloatArray, placement: pin.SE3) -> FloatArray:
 
 
 def _stretched(triangles: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """What lies along z from 0 to 1, from a to b (m)."""
+    """Triangles along z from 0 to 1, rotated and scaled to reach from a to b (m)."""
     length = float(np.linalg.norm(b - a))
     if length == 0.0:
         return np.zeros((0, 3, 3))
@@ -148,22 +151,23 @@ def _stretched(triangles: FloatArray, a: FloatArray, b: FloatArray) -> FloatArra
 
 
 class _Canvas:
-    """Pixels, and the depth of what each shows."""
+    """An image with a depth buffer."""
 
     def __init__(self) -> None:
-        self.width, self.height = FINER * SIZE[0], FINER * SIZE[1]
+        self.width, self.height = SUPERSAMPLING * SIZE[0], SUPERSAMPLING * SIZE[1]
         self._depths = np.full(self.height * self.width, np.inf)
         self._image = np.tile(np.array(BACKGROUND), (self.height * self.width, 1))
 
     def paint(self, corners: FloatArray, colours: FloatArray, columns: Any, rows: Any) -> None:
-        """Triangles, corners (n, 3, 3) as x, y and depth, on the samples (n, h, w) around them.
+        """Rasterise triangles with corners (n, 3, 3), x, y and depth, on the samples (n, h, w) at
+        ``columns`` and ``rows``.
 
-        One over the depth is linear on the screen.
+        1/depth is linear on the screen.
         """
         (xa, ya), (xb, yb), (xc, yc) = corners[:, :, :2, None, None].transpose(1, 2, 0, 3, 4)
         area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
         dx, dy = columns + 0.5 - xa, rows + 0.5 - ya
-        with np.errstate(divide="ignore", invalid="ignore"):  # seen edge on: covers nothing
+        with np.errstate(divide="ignore", invalid="ignore"):  # edge-on: covers no sample
             b = (dx * (yc - ya) - (xc - xa) * dy) / area
             c = ((xb - xa) * dy - dx * (yb - ya)) / area
             inside = (b >= 0.0) & (c >= 0.0) & (b + c <= 1.0)
@@ -179,11 +183,11 @@ class _Canvas:
 
     def pixels(self) -> FloatArray:
         """(height, width, 3), 0 to 1."""
-        fine = self._image.reshape(SIZE[1], FINER, SIZE[0], FINER, 3)
+        fine = self._image.reshape(SIZE[1], SUPERSAMPLING, SIZE[0], SUPERSAMPLING, 3)
         return np.asarray(fine.mean(axis=(1, 3)))
 
 
-def _drawn(triangles: FloatArray, colours: FloatArray, view: View) -> FloatArray:
+def _rasterised(triangles: FloatArray, colours: FloatArray, view: View) -> FloatArray:
     """Pixels (height, width, 3), 0 to 1, of triangles (n, 3, 3) m with colours (n, 3)."""
     canvas = _Canvas()
     seen = (triangles - view.target) @ view.axes.T
@@ -193,7 +197,7 @@ def _drawn(triangles: FloatArray, colours: FloatArray, view: View) -> FloatArray
     kept = (sizes > 0.0) & (far > 0.0).all(axis=1)
     seen, colours, far = seen[kept], colours[kept], far[kept]
     normals = normals[kept] / sizes[kept, None]
-    # Both sides are lit, as meshes turn their triangles either way.
+    # Both sides are lit, because meshes have triangles of either orientation.
     towards = seen.mean(axis=1) + np.array([0.0, 0.0, view.distance])
     normals *= -np.sign(np.sum(normals * towards, axis=1))[:, None]
     light = AMBIENT + (1.0 - AMBIENT) * np.clip(normals @ LIGHT, 0.0, None)
@@ -206,11 +210,11 @@ def _drawn(triangles: FloatArray, colours: FloatArray, view: View) -> FloatArray
     extent = np.ceil(corners[:, :, :2].max(axis=1)).astype(int) - low
     widest = extent.max(axis=1)
     before = -1
-    for side in TOGETHER:
+    for side in BATCH_SIZES:
         chosen = np.flatnonzero((widest > before) & (widest <= side))
         before = side
         rows, columns = np.mgrid[:side, :side]
-        for part in np.array_split(chosen, 1 + len(chosen) * side**2 // SAMPLES):
+        for part in np.array_split(chosen, 1 + len(chosen) * side**2 // MAX_BATCH_SAMPLES):
             around = low[part][:, :, None, None]
             canvas.paint(corners[part], shaded[part], around[:, 0] + columns, around[:, 1] + rows)
     for k in np.flatnonzero(widest > before):
@@ -221,7 +225,7 @@ def _drawn(triangles: FloatArray, colours: FloatArray, view: View) -> FloatArray
 
 
 def _trimmed(pixels: FloatArray) -> FloatArray:
-    """Without most of what is empty above and below."""
+    """The image without most of the background above and below."""
     rows = np.flatnonzero((pixels < 1.0).any(axis=(1, 2)))
     if not len(rows):
         return pixels

@@ -1,70 +1,278 @@
-"""What is there during which part of a run, whose events may change its closures and forces."""
+"""Motions that can be drawn: their elements over time, and their bodies at the key frames.
+
+A run or a prescribed motion is a :class:`DrawableMotion`.  Actions of events change its closures
+and forces, so each of these has :data:`ActiveIntervals`.  A :class:`BodyMotion` has the placements
+of the bodies at the key frames of an animation.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, TypeVar
+import logging
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import pinocchio as pin
 
+from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.simulation.result import Solution
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.model.closures import LoopClosure
 
-if TYPE_CHECKING:
-    from srm_mbs.model.closures import LoopClosure
-    from srm_mbs.model.mechanism import Mechanism
-    from srm_mbs.visualization.animation.joint_motion import Playable
+log = logging.getLogger(__name__)
 
-Spans = tuple[tuple[float, float], ...]
-"""Intervals of time (s), apart and in order: from the first to before the second."""
-Thing = TypeVar("Thing")
+MAX_BODY_FRAMES = 30_000
+"""Key frames of all bodies together; in a page one costs up to 90 bytes, so 2.7 MB at most."""
+MIN_FPS = 10.0
+"""Key frames per second below which the limit above is not kept: motion would look wrong."""
+INTERPOLATION_TOLERANCE = 0.003
+"""Largest distance of a body from its path between key frames, over the size of the motion; also
+the largest angle (rad)."""
+ACCURATE_PART = 0.98
+"""Part of the intervals between key frames that keep the tolerance."""
+
+ActiveIntervals = tuple[tuple[float, float], ...]
+"""Disjoint intervals of time (s), in order: each includes its first time, not its last."""
+Element = TypeVar("Element")
 
 
-def parts_of(solution: Playable) -> list[tuple[Mechanism, tuple[float, float]]]:
-    """The mechanisms of a run in order, each with its interval of time (s)."""
-    segments = solution.segments if isinstance(solution, Solution) else (solution,)
-    return [(segment.mechanism, segment.span) for segment in segments]
+class DrawableMotion(Protocol):
+    """A run or a prescribed motion: configurations of a mechanism over time."""
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The mechanism, as it is at the start."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end (s)."""
+
+    @property
+    def segments(self) -> Sequence[DrawableMotion]:
+        """Parts of the motion between the actions of events, in order; itself without any."""
+
+    def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
+        """q (n, nq) and v (n, nv) at times ``t`` (n,) s."""
 
 
-def spans_of(
-    solution: Playable, things: Callable[[Mechanism], Iterable[Thing]]
-) -> list[tuple[Thing, Spans | None]]:
-    """``things`` of all mechanisms of a run, each once, with when they are there.
+# Active intervals ---------------------------------------------------------------------------
+
+
+def active_elements(
+    motion: DrawableMotion, elements_of: Callable[[Mechanism], Iterable[Element]]
+) -> list[tuple[Element, ActiveIntervals | None]]:
+    """The elements of all segments of a motion, each once, with its active intervals.
+
+    Parameters
+    ----------
+    motion
+        The run or motion.
+    elements_of
+        Selects the elements of a mechanism, for example its closures.
 
     Returns
     -------
-    list of (thing, spans)
-        In the order in which they come; None for what is there all the time.
+    list of (element, intervals)
+        In order of first appearance; the intervals are None for an element that is always active.
     """
-    parts = parts_of(solution)
-    if len(parts) == 1:
-        return [(thing, None) for thing in things(solution.mechanism)]
-    found: list[tuple[Thing, list[tuple[float, float]]]] = []
-    for mechanism, (start, end) in parts:
-        for thing in things(mechanism):
-            spans = next((own for other, own in found if other is thing or other == thing), None)
-            if spans is None:
-                spans = []
-                found.append((thing, spans))
-            if spans and spans[-1][1] == start:
-                start_before, _ = spans.pop()
-                spans.append((start_before, end))
+    segments = motion.segments
+    if len(segments) == 1:
+        return [(element, None) for element in elements_of(motion.mechanism)]
+    found: list[tuple[Element, list[tuple[float, float]]]] = []
+    for segment in segments:
+        start, end = segment.span
+        for element in elements_of(segment.mechanism):
+            intervals = next(
+                (own for other, own in found if other is element or other == element), None
+            )
+            if intervals is None:
+                intervals = []
+                found.append((element, intervals))
+            if intervals and intervals[-1][1] == start:
+                start_before, _ = intervals.pop()
+                intervals.append((start_before, end))
             else:
-                spans.append((start, end))
-    whole = [(parts[0][1][0], parts[-1][1][1])]
-    return [(thing, None if spans == whole else tuple(spans)) for thing, spans in found]
+                intervals.append((start, end))
+    whole = [(segments[0].span[0], segments[-1].span[1])]
+    return [
+        (element, None if intervals == whole else tuple(intervals)) for element, intervals in found
+    ]
 
 
-def loops_of(solution: Playable) -> list[tuple[LoopClosure, Spans | None]]:
-    """The closures of a run, with when they are there."""
-    return spans_of(solution, lambda mechanism: mechanism.loops)
+def active_closures(motion: DrawableMotion) -> list[tuple[LoopClosure, ActiveIntervals | None]]:
+    """The closures of a motion with their active intervals (:func:`active_elements`)."""
+    return active_elements(motion, lambda mechanism: mechanism.loops)
 
 
-def within(times: FloatArray, spans: Spans | None, end: float) -> BoolArray:
-    """Which of ``times`` (n,) s are in ``spans``; a span up to ``end``, that of the run, has it."""
-    if spans is None:
+def active_at(times: FloatArray, intervals: ActiveIntervals | None, end: float) -> BoolArray:
+    """Which of ``times`` (n,) s are in ``intervals``; an interval up to the ``end`` (s) of the
+    motion includes it."""
+    if intervals is None:
         return np.ones(len(times), dtype=bool)
     inside = np.zeros(len(times), dtype=bool)
-    for first, last in spans:
+    for first, last in intervals:
         inside |= (first <= times) & ((times < last) | (last >= end))
     return inside
+
+
+# Placements at key frames -------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """Placements of the bodies at the key frames.
+
+    Attributes
+    ----------
+    joints
+        Indices of the joints that carry the bodies, k of them.
+    times : (n,) s
+        From the start to the end of the motion, uniform except for requested extra times; one only
+        if the motion has no duration.
+    positions : (n, k, 3) m
+        Origins of the joint frames in the world.
+    quaternions : (n, k, 4)
+        Their rotations, (x, y, z, w), of continuous sign.
+    """
+
+    joints: tuple[int, ...]
+    times: FloatArray
+    positions: FloatArray
+    quaternions: FloatArray
+
+    @property
+    def rate(self) -> float:
+        """Key frames per second; 1 if there is only one."""
+        if len(self.times) == 1:
+            return 1.0
+        return float((len(self.times) - 1) / (self.times[-1] - self.times[0]))
+
+    @property
+    def frames(self) -> list[float]:
+        """``times`` in units of 1/:attr:`rate` from the start: 0, 1, 2 ... if they are uniform."""
+        numbers = ((self.times - self.times[0]) * self.rate).round(6).tolist()
+        return [int(number) if number.is_integer() else number for number in numbers]
+
+    def path(self, joint: int, placement: pin.SE3) -> FloatArray:
+        """Positions (n, 3) m in the world of a point fixed to a joint (0: the ground)."""
+        offset = np.array(placement.translation)
+        if joint == 0:
+            return np.tile(offset, (len(self.times), 1))
+        k = self.joints.index(joint)
+        axis, w = self.quaternions[:, k, :3], self.quaternions[:, k, 3:]
+        across = 2.0 * np.cross(axis, offset)
+        turned = offset + w * across + np.cross(axis, across)
+        return np.asarray(self.positions[:, k] + turned)
+
+
+def sample_motion(
+    motion: DrawableMotion,
+    joints: tuple[int, ...],
+    fps: float,
+    others: int = 0,
+    extra: Iterable[float] = (),
+) -> BodyMotion:
+    """Forward kinematics of a motion at uniform times, and at ``extra`` ones.
+
+    Parameters
+    ----------
+    motion
+        The run, read by its dense output, or a prescribed motion.
+    joints
+        Indices of joints of its model.
+    fps
+        Requested key frames per second.  There are more where linear interpolation between them
+        would leave the paths of the bodies (:data:`INTERPOLATION_TOLERANCE`), and fewer if all
+        bodies together had more than :data:`MAX_BODY_FRAMES`, but at least the smaller of
+        :data:`MIN_FPS` and ``fps``.
+    others
+        Number of other animated nodes that have as many key frames.
+    extra
+        Times (s) in the motion that get key frames of their own.
+    """
+    start, end = motion.span
+    duration = end - start
+    wanted = duration * fps * (1.0 - 1e-12)  # rounding must not add one to a whole number
+    count = max(1, len(joints) + others)
+    allowed = max(MAX_BODY_FRAMES // count, math.ceil(min(MIN_FPS, fps) * duration))
+    intervals = math.ceil(min(wanted, allowed))
+    sampled, needed = _sampled(motion, joints, np.linspace(start, end, intervals + 1))
+    parts = 1  # each interval is divided into as many parts: the requested key frames stay
+    while intervals and parts < min(math.ceil(needed / intervals), allowed // intervals):
+        parts = min(math.ceil(needed / intervals), allowed // intervals)
+        times = np.linspace(start, end, parts * intervals + 1)
+        sampled, needed = _sampled(motion, joints, times)
+    if max(wanted, needed) > allowed:
+        log.info(
+            "%d bodies over %g s: %.3g key frames per second instead of %.3g",
+            count,
+            duration,
+            sampled.rate,
+            max(wanted, needed) / duration,
+        )
+    times = sampled.times
+    apart = [t for t in extra if np.abs(times - t).min() * sampled.rate > 1e-6]
+    if not apart:
+        return sampled
+    return _sampled(motion, joints, np.union1d(times, apart))[0]
+
+
+def _sampled(
+    motion: DrawableMotion, joints: tuple[int, ...], times: FloatArray
+) -> tuple[BodyMotion, int]:
+    """Placements at ``times`` (n,) s, and the number of intervals that the tolerance needs."""
+    model = motion.mechanism.model
+    data = workspace(model)
+    placements = np.empty((len(times), len(joints), 7))
+    rates = np.empty((len(times), len(joints), 6))
+    for i, (q, v) in enumerate(zip(*motion(times))):
+        pin.forwardKinematics(model, data, q, v)
+        for k, joint in enumerate(joints):
+            placements[i, k] = pin.SE3ToXYZQUAT(data.oMi[joint])
+            rates[i, k] = pin.getVelocity(model, data, joint, pin.LOCAL_WORLD_ALIGNED).vector
+    quaternions = placements[:, :, 3:]
+    # q and -q are the same rotation: take the one closer to the previous frame.
+    flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=2) < 0.0, -1.0, 1.0)
+    quaternions[1:] *= np.cumprod(flips, axis=0)[:, :, None]
+    sampled = BodyMotion(joints, times, placements[:, :, :3], quaternions)
+    excess = _interpolation_error(sampled, rates) / INTERPOLATION_TOLERANCE
+    intervals = len(times) - 1
+    # The error is quadratic in the length of short intervals.
+    needed = math.ceil(intervals * min(math.sqrt(excess), 4.0)) if excess > 1.0 else intervals
+    return sampled, needed
+
+
+def _interpolation_error(motion: BodyMotion, rates: FloatArray) -> float:
+    """Error of linear interpolation between the key frames.
+
+    The larger of distance over the size of the motion and angle (rad), at the quantile
+    :data:`ACCURATE_PART` of the intervals, so that a single jolt does not ask for many frames.
+    ``rates`` (n, k, 6) of the joint frames (m/s, rad/s, world axes) reveal rotations that key
+    frames alias: one and a half turns between two of them look like half a turn.
+    """
+    if not rates[1:].size:
+        return 0.0
+    h = np.diff(motion.times)[:, None, None]
+    places, quaternions = motion.positions, motion.quaternions
+    chords = np.zeros((len(h), rates.shape[1], 6))
+    size = float(np.ptp(places.reshape(-1, 3), axis=0).max())
+    chords[:, :, :3] = np.diff(places, axis=0) / h
+    chords[:, :, 3:] = _rotation_vectors(quaternions[:-1], quaternions[1:]) / h
+    # A cubic whose slopes at both ends differ from that of the chord by d deviates by h d / 4.
+    off = 0.25 * h[:, :, 0, None] * np.maximum(abs(rates[:-1] - chords), abs(rates[1:] - chords))
+    distances = np.linalg.norm(off[:, :, :3], axis=2) / (size or 1.0)
+    turns = np.linalg.norm(off[:, :, 3:], axis=2)
+    return float(np.quantile(np.maximum(distances, turns).max(axis=1), ACCURATE_PART))
+
+
+def _rotation_vectors(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3), rad in the world, from the quaternions ``first`` (..., 4) to
+    ``second``, both (x, y, z, w)."""
+    a, wa, b, wb = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
+    axis = wa * b - wb * a - np.cross(b, a)
+    w = wa * wb + np.sum(a * b, axis=-1, keepdims=True)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, w)
+    return np.asarray(axis * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0))

@@ -1,8 +1,7 @@
-"""Pictures and films of a run, drawn by a browser without a window.
+"""Images and videos of a run, rendered by a headless browser.
 
-The page of :func:`srm_mbs.visualization.animation.playback.export_html` is opened in headless
-Chromium, which playwright drives, and photographed at the wanted times: what is seen is what the
-browser plays.
+Playwright opens the page of :func:`srm_mbs.visualization.animation.playback.export_html` in
+headless Chromium and takes a screenshot at each requested time.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,14 +24,12 @@ from srm_mbs.errors import CHECK_WRITING, InputError
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import write_page
 from srm_mbs.visualization.animation.playback import check_fps, page_of
-
-if TYPE_CHECKING:
-    from srm_mbs.visualization.animation.joint_motion import Playable
+from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
 log = logging.getLogger(__name__)
 
 SIZE = (900, 600)
-"""Width and height of a picture in pixels; other shapes than 3 to 2 leave margins."""
+"""Width and height of an image in pixels; ratios other than 3 to 2 have margins."""
 FILMS = (".gif", ".mp4")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER_OPTIONS = (
@@ -40,8 +37,8 @@ BROWSER_OPTIONS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
-"""Chromium as root, without a graphics card and without a network."""
-_SETTLED = """async t => {
+"""Options of Chromium as root, without a graphics card and without a network."""
+_SEEK = """async t => {
   viewer.animator.pause();
   viewer.animator.seek(t);
   viewer.set_dirty();
@@ -49,7 +46,7 @@ _SETTLED = """async t => {
   await frame(); await frame();
 }"""
 BARE = "#bar, .dg { display: none !important; }"
-"""Style of a page that is photographed: nothing that one operates."""
+"""Style of the page in images: no controls."""
 
 
 @contextmanager
@@ -86,7 +83,7 @@ def browser() -> Iterator[Any]:
 
 @contextmanager
 def photographer(
-    solution: Playable,
+    solution: DrawableMotion,
     size: tuple[int, int],
     fps: float,
     drawn: dict[str, Any],
@@ -103,21 +100,21 @@ def photographer(
     size
         Width and height in pixels.
     fps
-        Key frames per second; between them bodies go straight.
+        Key frames per second, between which the browser interpolates linearly.
     drawn
         ``trace``, ``gaps`` and ``reactions`` of
         :func:`srm_mbs.visualization.animation.playback.export_html`.
     times
-        Those (s) of the pictures, which get key frames of their own.
+        Times (s) of the pictures, which get key frames of their own.
     chromium
-        A :func:`browser` that goes on being used; by default one of its own.
+        A :func:`browser` to use, which stays open; a new one by default.
     style
-        Added to that of the page.
+        Style sheet that is added to that of the page.
 
     Raises
     ------
     InputError
-        If ``size`` is none, something wanted cannot be drawn, or Chromium or playwright is missing.
+        If ``size`` is not valid, an overlay cannot be drawn, or Chromium or playwright is missing.
     """
     width, height = size
     if not (isinstance(width, int) and isinstance(height, int) and min(size) > 0):
@@ -137,7 +134,7 @@ def photographer(
         start = solution.span[0]
 
         def photograph(t: float) -> bytes:
-            page.evaluate(_SETTLED, t - start)
+            page.evaluate(_SEEK, t - start)
             picture: bytes = page.screenshot()
             return picture
 
@@ -156,14 +153,14 @@ def _written(path: Path, content: bytes) -> None:
 
 
 def export_image(
-    solution: Playable,
+    solution: DrawableMotion,
     path: str | Path,
     *,
     t: float | None = None,
     size: tuple[int, int] = SIZE,
     **drawn: Any,
 ) -> None:
-    """Write a picture of a run at one time.
+    """Write an image of a run at one time.
 
     Parameters
     ----------
@@ -203,7 +200,7 @@ def export_image(
 
 
 def export_video(
-    solution: Playable,
+    solution: DrawableMotion,
     path: str | Path,
     *,
     fps: float = 25.0,
@@ -211,7 +208,7 @@ def export_video(
     size: tuple[int, int] = (720, 480),
     **drawn: Any,
 ) -> None:
-    """Write a film of a run.
+    """Write a video of a run.
 
     Parameters
     ----------
@@ -221,9 +218,9 @@ def export_video(
         Name of the ``.gif``, which Pillow writes, or ``.mp4``, for which ``ffmpeg`` or the
         package imageio-ffmpeg must be installed; an existing one is replaced.
     fps
-        Pictures per second of film; browsers slow a GIF of more than 50 down.
+        Frames per second of video; browsers play a GIF of more than 50 more slowly.
     speed
-        Seconds of the run per second of film.
+        Seconds of the run per second of video.
     size
         Width and height in pixels.
     drawn
@@ -265,12 +262,12 @@ def export_video(
 
 
 def encoder_of(film: Path) -> str | None:
-    """ffmpeg of the system, or the one that the package imageio-ffmpeg brings; None for a ``.gif``.
+    """Path of ffmpeg, of the system or of the package imageio-ffmpeg; None for a ``.gif``.
 
     Raises
     ------
     InputError
-        If the film needs one and there is none.
+        If the video needs ffmpeg and it is not installed.
     """
     if film.suffix.lower() == ".gif":
         return None
@@ -297,7 +294,7 @@ def _gif(pictures: Sequence[bytes], fps: float) -> bytes:
         for picture in pictures
     ]
     out = io.BytesIO()
-    # The format counts hundredths of a second: the film as a whole keeps time.
+    # GIF has delays in hundredths of a second: the rounded end times keep the total duration.
     ends = [round(100.0 * k / fps) for k in range(len(pictures) + 1)]
     waits = [10 * (end - begin) for begin, end in pairwise(ends)]
     first.save(out, "GIF", save_all=True, append_images=others, duration=waits, loop=0)
@@ -305,10 +302,10 @@ def _gif(pictures: Sequence[bytes], fps: float) -> bytes:
 
 
 def _encode(encoder: str, pictures: Sequence[bytes], fps: float, path: Path) -> None:
-    """Feed the pictures to ffmpeg as H.264 that every player shows."""
+    """Encode the pictures with ffmpeg as H.264 in the pixel format that every player supports."""
     command = [
         *(encoder, "-loglevel", "error", "-y", "-f", "image2pipe", "-framerate", f"{fps:g}"),
-        # H.264 wants even sides.
+        # H.264 needs an even width and height.
         *("-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", str(path)),
     ]
     done = subprocess.run(command, input=b"".join(pictures), capture_output=True, check=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srm_mbs.dynamics.scaling import row_dimensions
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     BLUE,
@@ -62,7 +62,7 @@ def step_panel(solution: Run, *, kinds: bool = False) -> Draw:
     return partial(_step_sizes, solution=solution, kinds=kinds)
 
 
-def draw_sigma(solution: Solution) -> Figure:
+def draw_sigma(solution: SimulationResult) -> Figure:
     """sigma, step sizes and error estimates of a run (figures 5.14 to 5.16 of the thesis)."""
     draws = [sigma_panel(solution, log=True)] if constrained(solution) else []
     draws.append(step_panel(solution, kinds=True))
@@ -139,7 +139,7 @@ def _special(solution: Run) -> list[tuple[str, BoolArray, str, str, float]]:
     ]
 
 
-def _errors(axes: Axes, solution: Solution) -> str:
+def _errors(axes: Axes, solution: SimulationResult) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=False)
     axes.axhline(1.0, color=BLACK, linewidth=0.7, linestyle="--")
@@ -168,7 +168,7 @@ SMALLEST_DRIFT = 1e-17
 """Drift that is exactly zero is drawn here, since a logarithmic axis has no zero."""
 
 
-def draw_run(solution: Solution) -> Figure:
+def draw_run(solution: SimulationResult) -> Figure:
     """Drift, energy, sigma and step sizes of a run over time, in panels with one time axis.
 
     Drift and energy are drawn at ``solution.t``, sigma and step sizes at the steps.  Without
@@ -182,7 +182,7 @@ def draw_run(solution: Solution) -> Figure:
     return time_panels(solution, draws)
 
 
-def _drift(axes: Axes, solution: Solution) -> str:
+def _drift(axes: Axes, solution: SimulationResult) -> str:
     found = {part for each in solution.segments for part in row_dimensions(each.mechanism)}
     parts = [part for part in ("m", "rad") if part in found]
     units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
@@ -200,7 +200,7 @@ def _drift(axes: Axes, solution: Solution) -> str:
     return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
 
 
-def _energy(axes: Axes, solution: Solution) -> str:
+def _energy(axes: Axes, solution: SimulationResult) -> str:
     change = finite(solution.energy - solution.energy[:1])
     factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
     draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.simulation.dae_result import DaeSolution
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.dae_result import DaeResult
+from srm_mbs.simulation.result import SimulationResult
 
 SMOOTH = 8
 """Pieces of each step: between the ends of steps of high order curves bend."""
@@ -19,28 +19,28 @@ COLUMNS = 1600
 ROWS = 800
 
 
-Run = Solution | DaeSolution
+Run = SimulationResult | DaeResult
 
 
 def passages(solution: Run) -> list[float]:
     """Times (s) of the singular passages that were looked for; none of a DAE."""
-    found = solution.crossings if isinstance(solution, Solution) else ()
+    found = solution.crossings if isinstance(solution, SimulationResult) else ()
     return [crossing.time for crossing in found]
 
 
 def jumps(solution: Run) -> list[float]:
     """Times (s) of the actions of events."""
-    if not isinstance(solution, Solution):
+    if not isinstance(solution, SimulationResult):
         return []
     return [segment.span[0] for segment in solution.segments[1:]]
 
 
-def constrained(solution: Solution) -> bool:
+def constrained(solution: SimulationResult) -> bool:
     """Whether there are closures or drives in any part of the run."""
     return any(segment.mechanism.constrained for segment in solution.segments)
 
 
-def read_smoothly(solution: Solution, most: int = MOST) -> Solution:
+def read_smoothly(solution: SimulationResult, most: int = MOST) -> SimulationResult:
     """The run read so often that curves are smooth: at the ends of its steps, and between them.
 
     Its times increase.  Each action of an event has two, of which the first is the last number
@@ -57,7 +57,7 @@ def read_smoothly(solution: Solution, most: int = MOST) -> Solution:
     return solution.at(times)
 
 
-def _times(solution: Solution, most: int) -> FloatArray:
+def _times(solution: SimulationResult, most: int) -> FloatArray:
     segments = solution.segments
     steps = sum(segment.steps.count for segment in segments)
     parts = []
@@ -79,7 +79,9 @@ def between(ends: FloatArray, steps: int, most: int = MOST) -> FloatArray:
     return np.append(ends[:-1, None] + np.diff(ends)[:, None] * inside, ends[-1])
 
 
-def broken(solution: Solution, t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def broken(
+    solution: SimulationResult, t: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """``t`` (n,) and ``values`` (n, ...) with a gap (nan) at each jump."""
     at = np.searchsorted(t, jumps(solution))
     return np.insert(t, at, np.nan), np.insert(values, at, np.nan, axis=0)

@@ -17,14 +17,13 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import srm_mbs as srm
-from srm_mbs.analysis.report import html as markup
 from srm_mbs.analysis.report.report import report_page
-from srm_mbs.analysis.report.sections import pictures_section
+from srm_mbs.analysis.report.sections import pictures_data
 from srm_mbs.cli.app import app
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.visualization.animation.shapes import ANCHOR_COLOUR
-from srm_mbs.visualization.animation.snapshot import still_picture
+from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import LARGE, opened
 from tests.support.bundled import load
 
@@ -235,17 +234,22 @@ def test_a_run_with_event_actions_and_drives_has_a_page() -> None:
     assert "At the jump by an event action the times differ" in page.text
 
 
-def test_tables_of_nothing_are_left_out() -> None:
-    assert markup.table([]) == ""
-    assert markup.subsection("Loops", "") == ""
+def test_tables_without_rows_and_headings_without_content_are_left_out() -> None:
+    pendulum = srm.simulate(load("simple_pendulum"), 0.1)
+    page = report_page(
+        pendulum, srm.certify(pendulum, again=False), animation=False, pictures=["sigma"]
+    )
+    assert all(Page(page).tables)
+    headings = re.findall("<h3>(.*?)</h3>", page)
+    assert headings == ["Joints", "Bodies", "Loops", "Settings", "Statistics", "Energy balance"]
 
 
-# --- the still picture ---------------------------------------------------------------------------
+# --- the snapshot ---------------------------------------------------------------------------------
 
 
-def test_the_still_picture_shows_a_sphere_as_large_as_the_camera_sees_it(tmp_path: Path) -> None:
+def test_the_snapshot_shows_a_sphere_as_large_as_the_camera_sees_it(tmp_path: Path) -> None:
     run = srm.simulate(load("simple_pendulum"), 0.1)
-    picture = Image.open(io.BytesIO(still_picture(run, 0.0))).convert("RGB")
+    picture = Image.open(io.BytesIO(draw_snapshot(run, 0.0))).convert("RGB")
     pixels = np.asarray(picture, dtype=float)
     assert picture.width == 900
     drawn = (pixels < 250.0).any(axis=2)
@@ -281,8 +285,8 @@ def two_shapes(folder: Path, *visuals: str) -> srm.Solution:
 
 
 def seen(run: srm.Solution, t: float = 0.0) -> Any:
-    """Pixels (height, width, 3) of the still picture, 0 to 255."""
-    picture = Image.open(io.BytesIO(still_picture(run, t))).convert("RGB")
+    """Pixels (height, width, 3) of the snapshot, 0 to 255."""
+    picture = Image.open(io.BytesIO(draw_snapshot(run, t))).convert("RGB")
     return np.asarray(picture, dtype=float)
 
 
@@ -342,7 +346,7 @@ def test_a_spring_around_a_rod_is_the_coil_of_the_page_and_leaves_the_rod_in_sig
     assert 0.5 * without.sum() < around.sum() < 0.95 * without.sum()
 
 
-def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_still_picture() -> None:
+def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_snapshot() -> None:
     pendulum = load("simple_pendulum").model
     model = pin.Model()
     track = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "track")
@@ -355,7 +359,7 @@ def test_a_mechanism_that_is_about_to_drive_far_away_fills_its_still_picture() -
 
 
 @pytest.mark.parametrize("t", [0.0, 0.5])
-def test_the_bob_stands_in_the_still_picture_where_kinematics_puts_it(t: float) -> None:
+def test_the_bob_stands_in_the_snapshot_where_kinematics_puts_it(t: float) -> None:
     run = srm.simulate(load("simple_pendulum"), 1.0)
     _, columns = np.nonzero(coloured(seen(run, t), (0.902, 0.624, 0.0)))
     angle = run(t)[0][0]
@@ -394,7 +398,7 @@ def test_the_command_writes_the_page_beside_the_run(
     saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "srm_mbs.analysis.report.sections.pictures_section", lambda *_: ""
+        "srm_mbs.analysis.report.report.pictures_data", lambda *_: {"images": [], "missing": []}
     )  # they take a second
     done = CliRunner().invoke(app, ["report", str(saved), "--no-animation"])
     assert done.exit_code == 0, done.output
@@ -429,13 +433,14 @@ def test_pictures_that_reports_do_not_have_are_refused(run: srm.Solution, tmp_pa
 def test_a_picture_that_a_loaded_run_has_not_is_named_in_the_page(tmp_path: Path) -> None:
     controlled = srm.simulate(load("four_bar"), 0.1, controller=lambda t, q, v: 0.0 * v)
     controlled.save(tmp_path / "run.npz")
-    section = pictures_section(srm.load_solution(tmp_path / "run.npz"), ["reactions"])
-    assert "Not drawn: the reactions of a loaded run with a controller" in section
+    found = pictures_data(srm.load_solution(tmp_path / "run.npz"), ["reactions"])
+    (sentence,) = found["missing"]
+    assert "Not drawn: the reactions of a loaded run with a controller" in sentence
 
 
 def test_pictures_of_closures_are_left_out_for_an_open_chain() -> None:
     pendulum = srm.simulate(load("simple_pendulum"), 0.1)
-    assert "<p>" not in pictures_section(pendulum, ["reactions", "sigma"])
+    assert pictures_data(pendulum, ["reactions", "sigma"]) == {"images": [], "missing": []}
 
 
 @pytest.mark.stress

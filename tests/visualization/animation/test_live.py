@@ -233,7 +233,7 @@ def test_a_view_whose_server_does_not_answer_stops_it_and_says_so(
         served[0].window.server_proc.send_signal(signal.SIGSTOP)
         return served[0]
 
-    monkeypatch.setattr("srm_mbs.visualization.animation.playback.serve", stopped)
+    monkeypatch.setattr("srm_mbs.visualization.animation.live.serve", stopped)
     monkeypatch.setattr("srm_mbs.visualization.animation.playback.REPLY_TIME", 0.05)
     with pytest.raises(srm.InputError, match="meshcat's server does not answer: "):
         srm.LiveView(load("four_bar"), open_browser=False)
@@ -254,7 +254,7 @@ def test_a_socket_that_cannot_be_opened_is_an_input_error_and_leaves_no_server(
     def refuse(_: Any) -> None:
         raise zmq.ZMQError(errno.EMFILE)
 
-    monkeypatch.setattr("srm_mbs.visualization.animation.server.start_server", start)
+    monkeypatch.setattr("srm_mbs.visualization.animation.playback.start_server", start)
     monkeypatch.setattr("meshcat.visualizer.ViewerWindow.connect_zmq", refuse)
     with pytest.raises(srm.InputError, match="Too many open files"):
         srm.LiveView(load("four_bar"), open_browser=False)

@@ -23,8 +23,8 @@ from srm_mbs.visualization.animation.overlays import (
     ramp_colours,
     turns_along,
 )
-from srm_mbs.visualization.animation.page import make_page, read_out
-from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED, make_picture
+from srm_mbs.visualization.animation.page import make_page, values_over_time
+from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
 from tests.support.browsing import opened
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
@@ -341,7 +341,7 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
         np.linalg.norm(wrench[:, :3], axis=1)
         for wrench in solution.at(np.arange(65) / 64.0).reactions.values()
     ]
-    top = np.percentile(np.concatenate(sizes), closure_overlays.HIGH)
+    top = np.percentile(np.concatenate(sizes), closure_overlays.FORCE_PERCENTILE)
     assert float(re.findall(r"([\d.]+) N", legend)[0]) == pytest.approx(top, rel=6e-3)
     expected = ramp_colours(sizes[3][-1:] / top)[0]
     assert np.abs(np.array(colour) - expected).max() < 1e-6
@@ -436,8 +436,8 @@ def test_what_is_not_there_has_no_gap_and_no_part_in_the_scale(
     times = np.linspace(0.0, 1.5, 31)
     pinned, tied = gaps_of(let_go_and_tied, times)
     assert (pinned.loop.name, tied.loop.name) == ("pin", "rope")
-    assert pinned.spans == ((0.0, pytest.approx(0.5)),)
-    assert tied.spans == ((pytest.approx(0.9), 1.5),)
+    assert pinned.active == ((0.0, pytest.approx(0.5)),)
+    assert tied.active == ((pytest.approx(0.9), 1.5),)
     assert np.all(pinned.arrows[times > 0.51] == 0.0)
     assert np.all(tied.arrows[times < 0.89] == 0.0)
     assert np.linalg.norm(pinned.arrows, axis=1).max() < 1e-3
@@ -521,7 +521,7 @@ def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Sol
     x, y, depth = view.axes @ (path - view.target).T
     slope = np.tan(np.radians(0.5 * FIELD_OF_VIEW)) * (view.distance + depth)
     reach = max(np.abs(x / slope).max() / ASPECT, np.abs(y / slope).max())
-    assert reach == pytest.approx(FILLED, abs=0.02)
+    assert reach == pytest.approx(FILLED_PART, abs=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -578,12 +578,15 @@ def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera
 def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
     for name, t_end, named in [("n_four_bar_2", 2.0, True), ("n_four_bar_13", 2.0, False)]:
         solution = srm.simulate(load(name), t_end)
-        about = read_out(solution, np.linspace(0.0, t_end, 5))
+        about = values_over_time(solution, np.linspace(0.0, t_end, 5))
         assert len(about["passages"]) == len(solution.crossings) > 0
         assert all((": " in passage["text"]) == named for passage in about["passages"])
     solution = srm.simulate(load("slider_crank"), 240.0)
     assert len(solution.crossings) > 100
-    texts = [passage["text"] for passage in read_out(solution, np.linspace(0, 240, 5))["passages"]]
+    texts = [
+        passage["text"]
+        for passage in values_over_time(solution, np.linspace(0, 240, 5))["passages"]
+    ]
     assert not any(": " in text for text in texts)
 
 
@@ -598,7 +601,9 @@ def test_names_do_not_end_the_script_of_a_page() -> None:
 
 def test_what_the_page_is_made_of_is_package_data() -> None:
     folder = Path(srm.__file__).parent / "visualization/animation/web"
-    assert {"page.html", "page.js"} <= {file.name for file in folder.iterdir()}
+    assert {"page.html.j2", "notebook.html.j2", "page.js"} <= {
+        file.name for file in folder.iterdir()
+    }
 
 
 @pytest.mark.browser

@@ -12,8 +12,8 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.formats.load import bundled_models
 from srm_mbs.visualization.animation.meshcat_scene import node_names
-from srm_mbs.visualization.animation.scene import MAX_BODY_FRAMES
 from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
+from srm_mbs.visualization.animation.trajectory import MAX_BODY_FRAMES
 from tests.support.browsing import bodies_in, opened, placements
 from tests.support.bundled import load, problem
 

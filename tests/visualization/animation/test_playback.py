@@ -14,10 +14,11 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.visualization.animation import scene
+from srm_mbs.visualization.animation import scene, trajectory
 from srm_mbs.visualization.animation.playback import close, export_html, play
-from srm_mbs.visualization.animation.scene import choose_view, sample_motion
+from srm_mbs.visualization.animation.scene import choose_view
 from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Sphere, visuals_of
+from srm_mbs.visualization.animation.trajectory import sample_motion
 from tests.support.browsing import bodies_in, opened, placements
 from tests.support.bundled import load
 from tests.support.pacing import assert_pace
@@ -178,15 +179,15 @@ def test_quaternions_turn_the_short_way_between_key_frames(slider_crank: srm.Sol
 def test_key_frames_are_thinned_where_bodies_or_seconds_are_many(
     slider_crank: srm.Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene, "MAX_BODY_FRAMES", 5000)
+    monkeypatch.setattr(trajectory, "MAX_BODY_FRAMES", 5000)
     assert len(sample_motion(slider_crank, (1, 2), 60.0).times) == 2501
-    monkeypatch.setattr(scene, "MAX_BODY_FRAMES", 100)
-    at_least = 1 + round(scene.MIN_FPS * 100.0)
+    monkeypatch.setattr(trajectory, "MAX_BODY_FRAMES", 100)
+    at_least = 1 + round(trajectory.MIN_FPS * 100.0)
     assert len(sample_motion(slider_crank, (1, 2), 60.0).times) == at_least
     assert len(sample_motion(slider_crank, (1, 2), 2.0).times) == 201
 
 
-def halfway(motion: scene.Motion) -> tuple[Any, Any, Any]:
+def halfway(motion: trajectory.BodyMotion) -> tuple[Any, Any, Any]:
     """Times halfway between key frames, and where bodies are seen there: straight between them."""
     q = motion.quaternions
     turned = q[1:] + q[:-1]
@@ -207,8 +208,8 @@ def test_bodies_of_a_short_fast_run_are_seen_in_their_places_between_key_frames(
             seen = pin.Quaternion(quaternion).matrix()
             beside.append(np.linalg.norm(place - expected[joint].translation) / size)
             turned.append(np.linalg.norm(pin.log3(seen.T @ expected[joint].rotation)))
-    assert np.quantile(beside, 0.98) < scene.BESIDE
-    assert np.quantile(turned, 0.98) < scene.BESIDE
+    assert np.quantile(beside, 0.98) < trajectory.INTERPOLATION_TOLERANCE
+    assert np.quantile(turned, 0.98) < trajectory.INTERPOLATION_TOLERANCE
     assert len(motion.times) < 400
 
 
@@ -221,7 +222,7 @@ def test_a_wheel_of_whole_turns_between_frames_does_not_stand_still() -> None:
     motion = sample_motion(srm.simulate(wheel, 1.0), (1,), 60.0)
     for t, _, (quaternion,) in zip(*halfway(motion)):
         angle = 2.0 * np.arctan2(quaternion[1], quaternion[3])
-        assert abs(np.angle(np.exp(1j * (angle - speed * t)))) < scene.BESIDE
+        assert abs(np.angle(np.exp(1j * (angle - speed * t)))) < trajectory.INTERPOLATION_TOLERANCE
 
 
 def test_a_time_that_is_asked_for_is_a_key_frame_and_the_others_stay() -> None:

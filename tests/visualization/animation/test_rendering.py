@@ -24,10 +24,10 @@ from srm_mbs.visualization.animation.scene import (
     View,
     choose_view,
     make_picture,
-    sample_motion,
-    seen_points,
+    points_in_view,
 )
 from srm_mbs.visualization.animation.shapes import visuals_of
+from srm_mbs.visualization.animation.trajectory import sample_motion
 
 ORANGE = np.array([0.902, 0.624, 0.0])
 
@@ -76,7 +76,7 @@ def orange_at(image: Any) -> np.ndarray:
 def view_of(solution: srm.Solution, fps: float) -> View:
     visuals = visuals_of(solution.mechanism)
     motion = sample_motion(solution, (1,), fps)
-    return choose_view(solution.mechanism, seen_points(visuals, motion))
+    return choose_view(solution.mechanism, points_in_view(visuals, motion))
 
 
 @pytest.mark.browser

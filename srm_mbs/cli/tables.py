@@ -1,4 +1,4 @@
-"""What analyses found as rows of text, for the command line."""
+"""Results of analyses as rows of text."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def position_rows(mechanism: Mechanism, q: FloatArray) -> list[tuple[str, str]]:
 
 
 def mode_rows(mechanism: Mechanism, modes: Sequence[AssemblyMode]) -> Iterator[tuple[str, ...]]:
-    """(number, how often found, singular, position of each joint) of each assembly mode."""
+    """(number, starts that led to it, singular, position of each joint) of each assembly mode."""
     for number, mode in enumerate(modes, 1):
         positions = (text for _, text in position_rows(mechanism, mode.q))
         yield (
@@ -101,7 +101,7 @@ def balance_rows(found: EnergyBalance) -> list[tuple[str, str]]:
 
 
 def path_rows(found: FollowedPath) -> list[tuple[str, str]]:
-    """How a path ended, and the singular configurations on it: (quantity, value)."""
+    """End of a path, and the singular configurations on it: (quantity, value)."""
     rows = [
         ("path", found.message),
         ("configurations on the way", str(len(found.path))),

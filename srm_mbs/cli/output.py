@@ -50,7 +50,7 @@ class Lines(logging.Handler):
 
 
 def reported() -> Callable[[Callable[Given, None]], Callable[Given, None]]:
-    """Decorator of commands: warnings and expected errors become single lines, errors with status 2.
+    """Decorator of commands: warnings and expected errors become single lines, errors exit with 2.
 
     Errors name an option as on the command line: ``--t-end``, not ``t_end``.
     """

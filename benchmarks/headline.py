@@ -1,4 +1,4 @@
-"""The tables in the README: error, work, drift, orders, and the drift of SciPy beside ours.
+"""The tables of docs/benchmarks.md: error, work, drift, orders, and the drift of SciPy.
 
     python -m benchmarks.headline [--repeats 5] [--json FILE]
 

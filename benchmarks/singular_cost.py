@@ -27,7 +27,6 @@ from unittest.mock import patch
 import numpy as np
 
 import srm_mbs as srm
-from srm_mbs import api
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.driver import Closures
@@ -36,6 +35,7 @@ from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.methods import psrm
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.split_step import later_stages
+from srm_mbs.simulation import runner
 from srm_mbs.simulation.options import step_size_control
 
 CASES = (
@@ -52,7 +52,7 @@ KERNEL_REPEATS = 10
 def plain_start(system: System, t: float, state: FloatArray) -> IntegratorState:
     """First stage; no multiplier history."""
     terms = system.evaluate(t, state)
-    return IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    return IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
 
 
 def plain_step(
@@ -79,11 +79,11 @@ def plain_step(
         sigmas.append(terms.sigma)
         rate = terms.rate()
         rates[j] = system.chart_rate(delta, rate)
-    magnitude = system.magnitudes(x)
+    state_scale = system.state_scale(x)
     correction = terms.correction()
     if theta != 1.0:
         correction = theta * correction
-    weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+    weights = norm.weights(np.maximum(memory.state_scale, state_scale))
     return StepResult(
         t=t,
         h=h,
@@ -97,7 +97,7 @@ def plain_step(
         zone=None,
         history=None,
         multiplier=None,
-        magnitude=magnitude,
+        state_scale=state_scale,
     )
 
 
@@ -106,23 +106,16 @@ def plain_accept(memory: IntegratorState, result: StepResult) -> None:
     memory.steps += 1
     memory.rate = result.end_rate
     memory.sigma = float(result.sigmas[-1])
-    memory.magnitude = result.magnitude
+    memory.state_scale = result.state_scale
 
 
 @contextmanager
 def nothing_for_singular_configurations() -> Iterator[None]:
     """``simulate`` with no placement, guard, watch, look at the start and look for bifurcations."""
 
-    def control(
-        system: Any,
-        method: Any,
-        step: Any,
-        first_step: Callable[[], float],
-        span: tuple[float, float],
-        *_: Any,
-        **__: Any,
-    ) -> Any:
-        return step_size_control(method.scheme, *span, step, first_step), ()
+    def control(system: Any, options: Any, first_step: Callable[[], float], *_: Any) -> Any:
+        span = options.t0, options.t_end
+        return step_size_control(options.method.scheme, *span, options.step, first_step), ()
 
     def start(
         system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any
@@ -133,10 +126,10 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         patch.object(psrm, "split_start", plain_start),
         patch.object(psrm, "split_step", plain_step),
         patch.object(psrm, "split_accept", plain_accept),
-        patch.object(api, "placed_control", control),
-        patch.object(api, "start", start),
-        patch.object(api, "bifurcations_told", lambda _: ""),
-        patch.object(Closures, "trouble", lambda *_: ""),
+        patch.object(runner, "placed_control", control),
+        patch.object(runner, "start", start),
+        patch.object(runner, "bifurcation_sentences", lambda _: ""),
+        patch.object(Closures, "failure", lambda *_: None),
     ):
         yield
 
@@ -150,7 +143,7 @@ def nothing_on_the_kernel() -> Iterator[None]:
     """The same for the kernel, together with ``placement="off"``."""
     with (
         patch.dict(marshalling.CONSTANTS, NEVER),
-        patch.object(api, "bifurcations_told", lambda _: ""),
+        patch.object(runner, "bifurcation_sentences", lambda _: ""),
     ):
         yield
 

@@ -1,7 +1,7 @@
-"""Drift: the same four-bar by SciPy on the index-1 equations, and by srm_mbs.
+"""Drift of a four-bar, with SciPy on the index-1 equations and with srm_mbs.
 
-SciPy integrates q'' from [M G^T; G 0] [a; lambda] = [f; -Gdot v], which is what a user of Pinocchio
-writes first.  Nothing there holds the loop closed, so its error grows.
+SciPy integrates q'' from [M G^T; G 0] [a; lambda] = [f; -Gdot v], the direct use of Pinocchio's
+terms.  These equations do not enforce the closure itself, so its residual grows.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ mechanism = srm.load("four_bar")
 model, data = mechanism.model, mechanism.model.createData()
 nv = model.nv
 (loop,) = mechanism.loops
-PLANE = [0, 2]  # the loop is planar: the y row is redundant
+PLANE = [0, 2]  # x and z: the y row of a planar loop is redundant
 LOCAL = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -32,7 +32,7 @@ def end(anchor: srm.Anchor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def field(t: float, x: np.ndarray) -> np.ndarray:
-    """(v, a) by one dense solve."""
+    """Time derivative (v, a) of x = (q, v), by one dense solve."""
     q, v = x[:nv], x[nv:]
     pin.forwardKinematics(model, data, q, v, np.zeros(nv))
     pin.updateFramePlacements(model, data)
@@ -46,7 +46,7 @@ def field(t: float, x: np.ndarray) -> np.ndarray:
 
 
 def gap(q: np.ndarray) -> float:
-    """How far the loop has come open (m)."""
+    """Residual of the closure: distance of its two anchors (m)."""
     pin.framesForwardKinematics(model, data, q)
     pin.computeJointJacobians(model, data, q)
     return float(np.linalg.norm(end(loop.a)[0] - end(loop.b)[0]))

@@ -1,8 +1,8 @@
-"""A controller on a five-bar: both cranks are actuated and follow a wanted motion.
+"""A controller on a five-bar: both cranks are actuated and follow a desired motion.
 
-Drives prescribe the motion once; the forces that they need are the feed-forward torques.  The
-controller adds a PD correction, is sampled every five milliseconds and held in between, and works
-on a mechanism whose coupler is heavier than its model thinks.
+In a first run drives prescribe the motion; their forces are the feed-forward torques.  The
+controller adds a PD correction.  It is sampled every five milliseconds, its output is held in
+between, and the coupler of the controlled mechanism is heavier than that of the model.
 """
 
 from dataclasses import replace
@@ -35,7 +35,7 @@ errors = []
 
 
 def controller(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Torques (nv,): the passive joints have none."""
+    """Torques (nv,), zero for the passive joints."""
     q_wanted, v_wanted = wanted(t)
     off = (q_wanted - q)[cranks]
     errors.append(np.abs(off).max())

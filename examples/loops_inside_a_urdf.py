@@ -1,7 +1,7 @@
-"""A four-bar whose loop stands in the URDF itself, as URDF+ writes it.
+"""A four-bar with its loop in the URDF itself, in the form of URDF+.
 
-Pinocchio's own reader drops <loop> without a word.  Here it becomes a closure, and `srm.convert`
-writes the same mechanism as a plain URDF and a TOML description.
+Pinocchio's own reader ignores <loop>.  srm.load makes it a closure, and srm.convert writes the same
+mechanism as a plain URDF and a TOML description.
 """
 
 from pathlib import Path

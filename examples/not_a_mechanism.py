@@ -1,8 +1,7 @@
-"""A DAE that is not a mechanism: a batch reactor held at a set point.
+"""A DAE that is not a mechanism: a chemical reactor with a prescribed amount of one species.
 
-Two species react, A -> B -> C, and a feed u of A is chosen at every time so that the amount of B
-follows a wanted curve exactly.  In the form x' = f - B y, 0 = g(t, x) the feed is the multiplier
-y = -u of an index-2 DAE.
+Two reactions A -> B -> C take place, and the feed u of A makes the amount of A follow a prescribed
+curve.  In the form x' = f - B y, 0 = g(t, x) the feed is the multiplier y = u of an index-2 DAE.
 """
 
 import numpy as np
@@ -13,7 +12,7 @@ K1, K2 = 1.0, 0.5  # 1/s
 
 
 def target(t: float) -> tuple[float, float, float]:
-    """The wanted rate of production of B over K1, that is the amount of A, and derivatives."""
+    """The prescribed amount of A and its first two derivatives."""
     return 1.0 + 0.3 * np.sin(t), 0.3 * np.cos(t), -0.3 * np.sin(t)
 
 
@@ -28,6 +27,6 @@ result = srm.solve_dae(problem, (0.0, 10.0), [1.0, 0.0], rtol=1e-8)
 print(result.message)
 
 amount, slope, _ = target(10.0)
-feed = slope + K1 * amount  # what keeps A on its curve
+feed = slope + K1 * amount  # from A' = u - K1 A on the curve
 print(f"feed at the end: {result.y[-1, 0]:.8f}, exactly {feed:.8f}")
 print(f"B at the end: {result.x[-1, 1]:.8f}")

@@ -1,7 +1,7 @@
-"""A mechanism built in Python: a pin.Model in hand, plus a closure.
+"""A mechanism in Python: a pin.Model and a closure.
 
-Two bars of different length hang from the ground and a third one joins their ends: a four-bar
-without a URDF.  The guess decides on which side the coupler lies.
+Two bars of different length hang from the ground and a third bar joins their ends: a four-bar
+without a URDF.  The guess determines on which side the coupler lies.
 """
 
 import numpy as np

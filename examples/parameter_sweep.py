@@ -1,7 +1,8 @@
-"""A sweep: how heavy a coupler and how fast a crank may be until a pin of a four-bar is overloaded.
+"""A sweep over coupler mass and crank speed of a four-bar, to find overloads of its pin.
 
-Every case has its own masses and its own start; one of them is no mechanism, and says so without
-ending the others.  Finished cases are kept in a file: run it again, and none is simulated again.
+Each case has its own masses and initial state.  One of them is not a valid mechanism; it becomes a
+failure and does not end the sweep.  A file keeps finished cases: a second run of this program
+simulates none of them again.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ four_bar = srm.load("four_bar")
 
 
 def with_coupler(mass: float, speed: float) -> srm.Mechanism:
-    """The four-bar with ``mass`` times its coupler, and the crank at ``speed``."""
+    """The four-bar with ``mass`` times the mass of its coupler, and the crank at ``speed``."""
     if mass < 0.0:
         raise ValueError(f"{mass:g} times a mass")
     model = four_bar.model.copy()
@@ -34,7 +35,7 @@ def with_coupler(mass: float, speed: float) -> srm.Mechanism:
 
 
 def load_of_the_pin(solution: srm.Solution) -> dict[str, float]:
-    """Largest force (N) that the loop has to carry, beside the usual measures."""
+    """Largest force in the closure (N), and the standard measures."""
     (pin,) = solution.reactions.values()
     force = float(np.linalg.norm(pin[:, :3], axis=1).max())
     return {**srm.standard_measures(solution), "force": force}

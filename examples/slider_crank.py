@@ -1,7 +1,7 @@
-"""Play the slider-crank through its singular configurations.
+"""The slider-crank through its singular configurations.
 
 Writes slider_crank.png (drift, energy, distance to singular configurations, steps) and
-slider_crank.html (animation) into the current folder; with --play it opens the browser.
+slider_crank.html (animation) to the current folder; with --play it opens the browser.
 """
 
 import sys

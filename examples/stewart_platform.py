@@ -1,7 +1,7 @@
-"""A Stewart platform: at rest on its springs, how it swings, and a push.
+"""A Stewart platform on springs: static equilibrium, vibration and the response to a push.
 
-Static equilibrium, linearisation with the frequencies of its six modes, and a run that starts with
-a push, whose decay the slowest mode tells in advance.
+The linearisation gives the frequencies of the six modes; a run starts with a push, whose decay
+follows the slowest mode.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ swinging = [s for s in linear.eigenvalues if s.imag > 0.0]
 for k, s in enumerate(sorted(swinging, key=lambda s: s.imag), 1):
     print(f"{k:6d} {abs(s) / (2.0 * np.pi):16.3f} {-s.real / abs(s):15.4f}")
 
-# The push: a velocity of the platform along x, to which the rates of the legs are made to fit.
+# The push: a velocity of the platform along x; assembly computes the rates of the legs.
 still = mechanism.with_state(rest.q, np.zeros(mechanism.model.nv))
 start = srm.assemble(still, v={"platform": [0.3, 0.0, 0.0, 0.0, 0.0, 0.0]})
 run = srm.simulate(still, 5.0, q0=start.q, v0=start.v, rtol=1e-8)

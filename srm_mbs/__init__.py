@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from srm_mbs.errors import __version__ as __version__
 
 if TYPE_CHECKING:
     from srm_mbs.analysis.accuracy.certificate import Certificate, certify
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.inverse_dynamics import InverseDynamics, inverse_dynamics
     from srm_mbs.analysis.linearisation import Linearisation, linearise
     from srm_mbs.analysis.path_following import FollowedPath, follow
-    from srm_mbs.api import simulate
+    from srm_mbs.api import DaeSolution, Solution, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.errors import (
         AnalysisError,
         AssemblyError,
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
     from srm_mbs.integration.kernel.backend import backend
     from srm_mbs.integration.methods.butcher import ButcherTableau
     from srm_mbs.integration.methods.psrm import PSRM
-    from srm_mbs.integration.methods.srm import SRM
     from srm_mbs.integration.methods.tableaus import TABLEAUS
+    from srm_mbs.integration.methods.thesis.srm import SRM
     from srm_mbs.model.anchors import Anchor
     from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
     from srm_mbs.model.dae import SemiExplicitDAE
@@ -50,16 +51,11 @@ if TYPE_CHECKING:
         Wrench,
     )
     from srm_mbs.model.laws import LAW_TYPES, ConstantSpeed, MinimumJerk, Polynomial, Sine, Table
-    from srm_mbs.model.mechanism import Mechanism
     from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
-    from srm_mbs.simulation.dae_result import DaeSolution
-    from srm_mbs.simulation.dae_run import solve_dae
     from srm_mbs.simulation.energy_balance import EnergyBalance
     from srm_mbs.simulation.mobility import MobilityMap, mobility_map
-    from srm_mbs.simulation.result import Solution
     from srm_mbs.simulation.segmented_run import Event, Switch, impact
     from srm_mbs.simulation.simulator import Simulator
-    from srm_mbs.simulation.storage import load_solution
     from srm_mbs.sweeps.results import Sweep
     from srm_mbs.sweeps.sweep import sweep
     from srm_mbs.sweeps.tasks import standard_measures
@@ -77,7 +73,7 @@ _HOME = {
     "CLOSURE_TYPES": "model.closures",
     "Certificate": "analysis.accuracy.certificate",
     "ConstantSpeed": "model.laws",
-    "DaeSolution": "simulation.dae_result",
+    "DaeSolution": "api",
     "Drive": "model.drives",
     "EnergyBalance": "simulation.energy_balance",
     "Equilibrium": "analysis.equilibrium",
@@ -94,17 +90,17 @@ _HOME = {
     "Linearisation": "analysis.linearisation",
     "LiveView": "visualization.animation.live",
     "LoopClosure": "model.closures",
-    "Mechanism": "model.mechanism",
+    "Mechanism": "dynamics.mechanism",
     "MinimumJerk": "model.laws",
     "MobilityMap": "simulation.mobility",
     "PSRM": "integration.methods.psrm",
     "Polynomial": "model.laws",
-    "SRM": "integration.methods.srm",
+    "SRM": "integration.methods.thesis.srm",
     "SemiExplicitDAE": "model.dae",
     "SimulationError": "errors",
     "Simulator": "simulation.simulator",
     "Sine": "model.laws",
-    "Solution": "simulation.result",
+    "Solution": "api",
     "SpringDamper": "model.forces",
     "SrmError": "errors",
     "SrmWarning": "errors",
@@ -128,11 +124,11 @@ _HOME = {
     "inverse_dynamics": "analysis.inverse_dynamics",
     "linearise": "analysis.linearisation",
     "load": "formats.load",
-    "load_solution": "simulation.storage",
+    "load_solution": "api",
     "mobility_map": "simulation.mobility",
     "n_four_bar": "formats.load",
     "simulate": "api",
-    "solve_dae": "simulation.dae_run",
+    "solve_dae": "api",
     "standard_measures": "sweeps.tasks",
     "sweep": "sweeps.sweep",
 }

@@ -1,61 +1,163 @@
-"""``simulate``: from a mechanism and options to a :class:`~srm_mbs.simulation.result.Solution`."""
+"""The public entry points that put the layers together: runs, and results with pictures and files.
+
+:func:`simulate` and :func:`solve_dae` hand their options to the one runner
+(:mod:`srm_mbs.simulation`) and choose the classes of the results.  :class:`Solution` is a
+:class:`~srm_mbs.simulation.result.SimulationResult` that can be looked at, saved and reported.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from srm_mbs.dynamics.controllers import Controller, HeldForce
-from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
-from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
-from srm_mbs.integration.control.prescribed_times import Placing
-from srm_mbs.integration.control.step_size import initial_step
-from srm_mbs.integration.driver import RunRecord, Tick, integrate
-from srm_mbs.integration.events import acting
-from srm_mbs.integration.kernel import driver
-from srm_mbs.integration.kernel.backend import uses_kernel
-from srm_mbs.integration.kernel.run import CompiledRun
-from srm_mbs.integration.kernel.system import Evaluator, given_back, taken
-from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
+from srm_mbs.dynamics.controllers import Controller
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.integration.driver import Tick
+from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.integration.singular_endpoints import start
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
-from srm_mbs.simulation.options import (
-    check_avoidable,
-    check_embedded,
-    check_progress,
-    checked_breakpoints,
-    checked_placement,
-    checked_rtol,
-    checked_samples,
-    checked_singular_times,
-    checked_span,
-    checked_times,
-    loosest_rtol,
-    positive,
-    tightest_rtol,
-)
-from srm_mbs.simulation.result import Request, Settings, Solution
-from srm_mbs.simulation.runner import (
-    absolute_tolerance,
-    assemble_result,
-    bifurcation_sentences,
-    check_consistent,
-    check_mechanism,
-    event_watch,
-    initial_state,
-    mechanism_method,
-    placed_control,
-    sampler,
-)
+from srm_mbs.model.dae import SemiExplicitDAE
+from srm_mbs.simulation.dae_result import DaeResult
+from srm_mbs.simulation.dae_run import run_dae
+from srm_mbs.simulation.options import RunOptions
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.segmented_result import ResultTypes, SegmentedResult
+from srm_mbs.simulation.segmented_run import run
+from srm_mbs.visualization.animation.joint_motion import AnimationMixin
 
-_NO_OPTIONS = ("mechanism", "t_end")
-"""Parameters of :func:`simulate` that are none of its options."""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Solution(AnimationMixin, SimulationResult):
+    """Result of :func:`simulate`: states and physical quantities, pictures, files, report."""
+
+    @property
+    def degrees_of_freedom(self) -> NDArray[np.int_]:
+        """Momentary degrees of freedom (n,) at ``t``; more in :func:`srm_mbs.mobility_map`."""
+        from srm_mbs.simulation.mobility import mobility_map
+
+        return mobility_map(self).degrees_of_freedom
+
+    def to_csv(self, path: str | Path, t: Any = None) -> None:
+        """Write the motion as a table; see :mod:`srm_mbs.simulation.csv_export`.
+
+        Parameters
+        ----------
+        path
+            File name; ``.csv`` is usual and is not added.
+        t : (k,) s
+            Times of its rows, in any order; by default ``solution.t``.
+        """
+        from srm_mbs.simulation.csv_export import write_csv
+
+        write_csv(self if t is None else self.at(t), Path(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write everything needed to replay and interpolate the run, description included.
+
+        Parameters
+        ----------
+        path
+            File name; ``.npz`` is usual and is not added.
+        """
+        from srm_mbs.simulation.storage import save_solution
+
+        save_solution(self, Path(path))
+
+    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
+        """A picture of the run; docs/plots.md shows each kind.
+
+        Parameters
+        ----------
+        path
+            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
+            omitted.
+        kind
+            ``run``: drift, energy, sigma and step sizes with rejected steps and singular passages
+            marked.  ``state``: positions and rates of joints.  ``balance``: energies, works, and
+            the residual of the energy balance.  ``reactions``: forces and moments in the closures.
+            ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
+            position of joints.  ``path``: paths of points in space.
+        **options
+            ``joints`` of ``state`` and ``phase``: names, by default as many as fit.  ``loops`` of
+            ``reactions``: names; ``rows``: whether to draw the multiplier of each row.  ``points``
+            of ``path``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Without pyplot: it is on no screen, and need not be closed.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind, option, joint, loop, point or suffix; if the run has not what is
+            to be drawn; for balance and reactions of a loaded run that had a controller.
+        ControllerError, EvaluationError
+            If forces cannot be evaluated again.
+        OSError
+            If the file cannot be written.
+        """
+        from srm_mbs.visualization.plotting import plot_solution
+
+        return plot_solution(self, path, kind, **options)
+
+    def report(self, path: str | Path, **options: Any) -> None:
+        """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`."""
+        from srm_mbs.analysis.report.report import write_report
+
+        write_report(self, Path(path), **options)
+
+
+class SegmentedSolution(SegmentedResult, Solution):
+    """Result of :func:`simulate` with event actions: smooth segments on one time axis."""
+
+    @cached_property
+    def degrees_of_freedom(self) -> Any:
+        """See :attr:`Solution.degrees_of_freedom`."""
+        return self.rows_of_parts(lambda part: part.degrees_of_freedom)
+
+    def save(self, path: str | Path) -> None:
+        """Write all segments into one file; see :meth:`Solution.save`."""
+        from srm_mbs.simulation.storage import save_segments
+
+        save_segments(self, Path(path))
+
+
+class DaeSolution(DaeResult):
+    """Result of :func:`solve_dae`: states and multipliers, pictures, tables."""
+
+    def plot(self, path: str | Path | None = None, kind: str = "run") -> Figure:
+        """A picture of the run.
+
+        Parameters
+        ----------
+        path
+            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
+            omitted.
+        kind
+            ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind or suffix.
+        OSError
+            If the file cannot be written.
+        """
+        from srm_mbs.visualization.plotting import plot_dae
+
+        return plot_dae(self, path, kind)
+
+
+_NO_OPTIONS = ("mechanism", "problem", "t_span", "x0")
+"""Parameters of :func:`simulate` and :func:`solve_dae` that are none of their options."""
+SOLUTIONS = ResultTypes(Solution, SegmentedSolution)
+"""Classes of the results of :func:`simulate` and :func:`load_solution`."""
 
 
 def simulate(
@@ -161,138 +263,109 @@ def simulate(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    if isinstance(events, Iterator):  # looked at more than once
-        events = list(events)
     options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
-    check_mechanism(mechanism)
-    t0, t_end = checked_span(t0, t_end)
-    for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
-        if value is not None:
-            positive(value, what, " of seconds")
-    if controller is not None and not callable(controller):
-        raise InputError(
-            f"controller = {controller!r} cannot be called",
-            element="controller",
-            remedy="Give a function of (t, q, v) that returns the generalised forces",
-        )
-    check_progress(progress, "(t, h, state)")
-    if acting(events):
-        from srm_mbs.simulation.segmented_run import simulate_segments
+    return run(mechanism, RunOptions(**options), SOLUTIONS)
 
-        return simulate_segments(mechanism, t_end, dict(options, events=events))
-    placement = checked_placement(placement)
-    avoided = checked_singular_times(singular_times, t0, t_end)
-    method = mechanism_method(method, tableau)
-    rtol = checked_rtol(
-        rtol, loosest_rtol(method), tightest_rtol(method.scheme, mechanism.constrained)
-    )
-    times = checked_times(t_eval, t0, t_end)
-    samples = checked_samples(sample_time, controller, t0, t_end)
-    kinks = np.concatenate([checked_breakpoints(breakpoints), mechanism.breakpoints(t0, t_end)])
-    pieces = smooth_intervals(kinks, samples, t0, t_end)
-    check_avoidable(avoided, pieces.ends, t_end - t0)
-    on_kernel = uses_kernel(backend, method, placement, avoided)
-    mechanism, state = initial_state(mechanism, t0, q0, v0)
-    norm = ErrorNorm(
-        absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
-    )
-    held = None if sample_time is None else HeldForce()
-    system = make_system(mechanism, controller if held is None else held)
-    mechanism.check_covers(t_end)
-    if mechanism.constrained:
-        mechanism.at_start(f"consistent at {t0!r}", lambda: check_consistent(mechanism, t0))
 
-    by = "kernel" if on_kernel else "python"
-    log_start(mechanism.name, t0, t_end, method, norm, step, by)
-    watch = event_watch(events, system, method, state)
-    wrappers: Sequence[Placing] = ()
-    kernel_system: Any = None
-    record: RunRecord
-    try:
-        if on_kernel:
-            kernel_system = taken(system)
-        evaluator = system if kernel_system is None else Evaluator(system, kernel_system)
-        passing = BreakpointHandler(pieces, system, method, norm, evaluator)
-        if held is not None and controller is not None:
-            passing.sample = sampler(system, held, controller, kernel_system)
-            passing.sample(t0, state)
-        memory = start(system, method, t0, state, norm, t_end, evaluator)
+def solve_dae(
+    problem: SemiExplicitDAE,
+    t_span: tuple[float, float],
+    x0: Any,
+    *,
+    method: str | Method = "psrm",
+    tableau: str | ButcherTableau | None = None,
+    rtol: float = 1e-6,
+    atol: Any = None,
+    step: float | None = None,
+    first_step: float | None = None,
+    max_step: float | None = None,
+    t_eval: Any = None,
+    events: Any = None,
+    placement: str = "automatic",
+    singular_times: Any = (),
+    progress: bool | Tick = False,
+    raise_on_failure: bool = False,
+) -> DaeSolution:
+    """Solve x' = f(t, x) - B(t, x) y, 0 = g(t, x) over ``t_span``.
 
-        def chosen_first_step() -> float:
-            if first_step is not None:
-                return first_step
-            order = method.scheme.controller_order or 1
-            if isinstance(evaluator, Evaluator):
-                return evaluator.first_step(state, memory, norm, t_end - t0, order, t0)
-            return initial_step(system, state, memory, norm, t_end - t0, order, t0)
+    The driver, the step-size control and the placement around isolated singularities of G B are
+    those of :func:`srm_mbs.simulate`.
 
-        longest = np.inf if max_step is None else max_step
-        with progress_of(progress, system, t_end) as tick:
-            if on_kernel and isinstance(method, PSRM):
-                check_embedded(method.scheme, step)
-                run = CompiledRun(
-                    kernel_system,
-                    method,
-                    norm,
-                    memory,
-                    state,
-                    pieces,
-                    t0=t0,
-                    step=step,
-                    first_step=chosen_first_step() if step is None else 0.0,
-                    max_step=longest,
-                    placed=placement,
-                    arrivals=passing.arrivals,
-                )
-                record = driver.integrate(system, run, tick=tick, events=watch, passing=passing)
-            else:
-                control, wrappers = placed_control(
-                    system,
-                    method,
-                    step,
-                    chosen_first_step,
-                    (t0, t_end),
-                    placement,
-                    avoided,
-                    arrivals=passing.arrivals,
-                )
-                record = integrate(
-                    system,
-                    method,
-                    control,
-                    norm,
-                    memory,
-                    state,
-                    t0,
-                    t_end,
-                    max_step=longest,
-                    tick=tick,
-                    events=watch,
-                    breakpoints=passing,
-                )
-        passing.done()
-        if kernel_system is not None:
-            given_back(system, kernel_system)
-    except (EvaluationError, ControllerError) as error:
-        record = RunRecord(t0, state.copy())
-        record.status, record.message = "failed", f"Stopped at t = {t0:.6g} s: {error}."
-    settings = Settings(
-        type(method).__name__,
-        method.scheme.name,
-        rtol,
-        tuple(norm.atol.tolist()),
-        step,
-        controller is not None or system.calls_forces,
-        placement,
-        tuple(avoided.tolist()),
-        by,
-    )
-    solution = assemble_result(
-        mechanism, system, method, record, wrappers, watch, times, settings, norm, kernel_system
-    )
-    solution.request = Request.of(t_end, options)
-    solution.message += bifurcation_sentences(solution)
-    log_end(mechanism.name, solution)
-    if raise_on_failure and not solution.success:
-        raise SimulationError(solution.message, solution)
-    return solution
+    Parameters
+    ----------
+    problem
+        The equations.
+    t_span : (t0, t1)
+        Start and end.
+    x0 : (nx,)
+        Initial state, with g(t0, x0) = 0.
+    method
+        ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
+        (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of
+        G B are passed by the split form, and by sweeps with T = (GB)^-1: restarted ones with
+        ``carry`` at a tolerance of 1e-4 with errors below 2e-4, at 1e-6 below 2e-6
+        (``tests/test_dae.py``); without it they turn off.  Sweeps with own histories, whose first
+        one is off the constraints by O(eps), would leave on another branch of g = 0; next to the
+        singularity they are restarted, and the message says when.  Sweeps that carry y, which is
+        not bounded there, would leave on another branch, however small the step: x' is compared
+        across every passage, and a run with sweeps that took another branch fails there, with a
+        message that names the remedy.
+    tableau
+        Runge-Kutta scheme for a method given by name.
+    rtol
+        Relative tolerance, at most 1e-4.
+    atol
+        Absolute tolerance, a number or (nx,); rtol by default, for states of order one.
+    step
+        Fixed step instead of step-size control.
+    first_step, max_step
+        First and longest step of the step-size control.
+    t_eval : (n,)
+        Times at which the solution is given; by default the ends of the steps.
+    events
+        A function (t, x) -> float or a list of them; an event is where it passes zero.  As in
+        ``scipy.integrate.solve_ivp``, the attribute ``terminal`` of the function (a bool, or a
+        number of occurrences) ends the run there with status ``event``, and ``direction`` (> 0
+        or < 0) counts only zeros passed upwards or downwards
+        (:mod:`srm_mbs.integration.events`).
+    placement
+        How steps are placed around singular points of G B: ``"automatic"``, ``"halved"`` (thesis,
+        2.4.1 (1)) or ``"off"``; as in :func:`srm_mbs.simulate`.
+    singular_times : (k,)
+        Times on which no stage or end of a step may lie (thesis, 2.4.1 (2)).
+    progress
+        True for a progress bar (on a terminal only), or a callable (t, h, x).
+    raise_on_failure
+        Raise :class:`SimulationError` instead of returning a partial solution.
+
+    Returns
+    -------
+    DaeSolution
+        With ``success`` False and everything computed so far if the run could not go on: a
+        function of the problem that raises, or returns what is not finite, included.
+
+    Raises
+    ------
+    InputError
+        For invalid input, before any stepping.
+    SimulationError
+        Only with ``raise_on_failure``.
+    """
+    options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
+    return run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
+
+
+def load_solution(path: str | Path) -> Solution:
+    """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
+
+    A controller is not saved: reactions of a controlled run cannot be computed afterwards, unless
+    it was sampled; what it held is saved.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is no saved run, or is of another format.
+    """
+    from srm_mbs.simulation.storage import load_result
+
+    return load_result(Path(path), SOLUTIONS)

@@ -2,22 +2,20 @@
 
 Every exception carries the data that failed, so that a program can react to it without
 parsing the text.  Bad input raises :class:`InputError` before any stepping; a run that
-cannot go on returns a partial :class:`~srm_mbs.simulation.result.Solution` and raises
+cannot go on returns a partial :class:`~srm_mbs.Solution` and raises
 :class:`SimulationError` only on request.
 """
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from srm_mbs.simulation.dae_result import DaeSolution
-    from srm_mbs.simulation.result import Solution
-
+from pathlib import Path
+from typing import Any
 
 __version__ = "0.1.0"
-"""Version of the package."""
+"""Version of the package; the ground layer holds it, so that every layer can name it."""
 
 CHECK_WRITING = "Check the folder, its permissions and the space on the disk"
 """Remedy for a file that cannot be written."""
@@ -129,15 +127,28 @@ class EventError(SrmError):
 
 
 class SimulationError(SrmError, RuntimeError):
-    """A run failed and the caller asked for an exception; ``solution`` holds what was computed.
+    """A run failed and the caller asked for an exception.
 
-    None of a :class:`srm_mbs.Simulator`, which records nothing.
+    Attributes
+    ----------
+    solution
+        The :class:`srm_mbs.Solution` or :class:`srm_mbs.DaeSolution` up to the failure; None for a
+        :class:`srm_mbs.Simulator`, which records nothing.
     """
 
-    def __init__(self, message: str, solution: Solution | DaeSolution | None) -> None:
+    def __init__(self, message: str, solution: Any) -> None:
         super().__init__(message)
         self.solution = solution
 
 
 class SrmWarning(UserWarning):
     """A setting was changed to a safe value, or the input is unusual but usable."""
+
+
+def warn(message: str) -> None:
+    """Issue a :class:`SrmWarning` that points at the first caller outside the package."""
+    package = str(Path(__file__).parent)
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, SrmWarning, stacklevel=level)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,22 @@ from typing import Any
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.integration.kernel import backend
 from srm_mbs.visualization.animation.video import browser as headless_browser
 
 DATA = Path(__file__).parent / "data"
+
+# Without a kernel the tests ask for the Python reference, which runs would warn of.
+if srm.backend() == "python":
+    os.environ["SRM_MBS_BACKEND"] = "python"
+
+
+def pytest_report_header() -> str:
+    """The backend of the tests, and why it is not the kernel."""
+    reason = (
+        f" (the compiled kernel is not available: {backend.missing})" if backend.missing else ""
+    )
+    return f"srm_mbs: backend {srm.backend()}{reason}"
 
 
 @pytest.fixture(scope="session")

@@ -12,88 +12,88 @@ import pytest
 import srm_mbs
 
 PACKAGE = Path(srm_mbs.__file__).parent
-
-# From the bottom up; a module may import its own layer and those before it.
-LAYERS = (
-    (
-        "_kernel",
-        "arrays",
-        "derivations",
-        "errors",
-        "provenance",
-        "records",
-        "semi_explicit",
-        "shown",
-    ),
-    ("workspaces",),
-    ("anchors", "closures", "csv_tables", "force_element", "laws"),
-    ("force_checks", "inertias", "loop_closure", "mechanism_checks", "time_dependence"),
-    ("mechanism",),
-    ("coordinates", "drives", "pinocchio_constraints", "forces", "user_forces", "systems"),
-    ("methods",),
-    ("stepping",),
-    ("closing", "compiled", "driven_start", "kernel"),
-    ("closing_failure", "continuation", "joint_limits"),
-    ("assembly", "consistent_rates", "dae_solution", "motion", "segmented", "solution"),
-    ("loading",),
-    ("request_storage", "segment_storage", "storage"),
-    ("options", "progress", "run_log"),
-    ("collecting", "preparation"),
-    ("dae", "simulation"),
-    ("actions", "segments", "simulator", "stepwise", "sweeps"),
-    ("analysis",),
-    ("spans", "visuals", "readout", "page_server", "web_page"),
-    ("moving", "closure_overlays", "overlays"),
-    ("scene", "drawing"),
-    ("plotting", "playback", "rendering", "summary", "export"),
-    ("live", "notebook", "markup", "still"),
-    ("report_sections",),
-    ("report_accuracy",),
-    ("report",),
-    ("findings",),
-    ("cli_output",),
-    ("cli_analysis", "cli_playback", "cli_plots", "cli_report"),
-    ("cli",),
+ORDER = (
+    {"_typing", "errors", "_kernel"},
+    {"model"},
+    {"dynamics"},
+    {"assembly", "integration"},
+    {"formats"},
+    {"simulation"},
+    {"visualization"},
+    {"analysis"},
+    {"api"},
+    {"sweeps"},
+    {"__init__"},
+    {"cli"},
+    {"__main__"},
 )
-LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
-MODULES = sorted(
-    path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py" or path.parent != PACKAGE
-)
+"""Folders and modules at the top of the package, from the ground up (docs/contributing.md)."""
+RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
 
 
-def layer(module: str) -> int:
-    return LEVEL[module.split(".")[1]]
+def imports_of(module: str) -> set[str]:
+    """Modules of the package that ``module`` imports anywhere: at its top, in functions, for type
+    checking, and by ``import_module``."""
+    path = MODULES[module]
+    package = ["srm_mbs", *path.relative_to(PACKAGE).parent.parts]
+    named: list[str] = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            named += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else []
+            source = ".".join([*base, *([node.module] if node.module else [])])
+            named += [f"{source}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Call) and "import_module" in ast.unparse(node.func):
+            named += [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
+    found = set()
+    for name in named:
+        parts = name.split(".")
+        if parts[0] == "srm_mbs":
+            while parts[1:] and ".".join(parts[1:]) not in MODULES:
+                parts.pop()
+            found.add(".".join(parts[1:]) or "__init__")
+    return found - {module}
 
 
-def name_of(path: Path) -> str:
-    relative = path.relative_to(PACKAGE.parent).with_suffix("")
-    return ".".join(part for part in relative.parts if part != "__init__")
+GRAPH = {module: imports_of(module) for module in MODULES}
 
 
-def module_level_imports(path: Path) -> list[ast.ImportFrom]:
-    """Imports executed when the module is; those for type checking only are left out."""
-    tree = ast.parse(path.read_text())
-    return [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+def test_the_top_of_the_package_has_the_folders_of_the_map_only() -> None:
+    assert {module.split(".")[0] for module in MODULES} == set(RANK)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_imports_go_downwards_only(path: Path) -> None:
-    own = layer(name_of(path))
-    for node in module_level_imports(path):
-        if node.module and node.module.startswith("srm_mbs."):
-            assert layer(node.module) <= own, f"{name_of(path)} imports {node.module}"
+@pytest.mark.parametrize("module", MODULES)
+def test_every_import_goes_down(module: str) -> None:
+    own = module.split(".")[0]
+    for target in GRAPH[module]:
+        other = target.split(".")[0]
+        assert other == own or RANK[other] < RANK[own], f"{module} imports {target}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_no_module_imports_private_names_of_another(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text())):
+def test_no_imports_go_in_a_circle() -> None:
+    left = dict(GRAPH)
+    while left:
+        free = [module for module, targets in left.items() if not targets & set(left)]
+        assert free, f"in or above a circle: {sorted(left)}"
+        for module in free:
+            del left[module]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_imports_private_names_of_another(module: str) -> None:
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("srm_mbs"):
             private = [
                 alias.name
                 for alias in node.names
                 if alias.name.startswith("_") and alias.asname is None
             ]
-            assert not private, f"{name_of(path)} imports {private} from {node.module}"
+            assert not private, f"{module} imports {private} from {node.module}"
 
 
 def loaded_by(statement: str) -> set[str]:

@@ -1,8 +1,8 @@
 r"""Docstrings on the documentation site, which is Markdown: roles and shapes in its language.
 
-A cross-reference, such as one to ``~srm_mbs.model.mechanism.Mechanism``, becomes a link where the
-site has that name, and code elsewhere; formulae become code.  Parameters described together, each
-with its own shape, are listed by all of their names.
+A cross-reference, such as one to ``~srm_mbs.dynamics.mechanism.Mechanism``, becomes a link where
+the site has that name, and code elsewhere; formulae become code.  Parameters described together,
+each with its own shape, are listed by all of their names.
 """
 
 from __future__ import annotations

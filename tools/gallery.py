@@ -57,10 +57,10 @@ def page() -> str:
     """The page, from the descriptions and what the package finds in them."""
     parts = [
         "# Gallery",
-        "The mechanisms that come with the package.  Each runs from the command line, say "
+        "The bundled mechanisms.  Each runs on the command line, for example with "
         '`srm-mbs simulate bricard --html bricard.html`, and loads with `srm.load("bricard")`.  '
-        "`python -m tools.gallery` takes the pictures with the playback and writes this page; "
-        "`python -m tools.models` writes the larger mechanisms.",
+        "[Terms](notation.md#terms) defines closures and their rank.  `python -m tools.gallery` "
+        "writes this page and its pictures, `python -m tools.models` the larger mechanisms.",
     ]
     for name in srm.bundled_models():
         mechanism = srm.load(name)

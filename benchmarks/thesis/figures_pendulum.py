@@ -62,12 +62,14 @@ def reduced(out: Path, thin: bool) -> list[Entry]:
             "figure1.3",
             title,
             "Start at (1, 0) m at rest, g = 9.81 m/s^2, dopr54 with fixed steps; the thesis "
-            "prints neither scheme nor step. Baumgarte's method on the index-2 form beside it.",
+            "prints neither scheme nor step. For comparison, Baumgarte's method on the index-2 "
+            "form.",
             PRINTED["figure1.3"],
             ours,
-            "As in print the length collapses, with h = 0.1 s. Nothing holds it, and which way it "
-            "drifts is an accident of scheme and step: with h = 0.05 s it grows. Baumgarte's "
-            "method damps the rate constraint only, so that the length keeps what it once lost.",
+            "As in print the length collapses, with h = 0.1 s. No equation constrains it, and "
+            "the direction of its drift depends on scheme and step: with h = 0.05 s it grows. "
+            "Baumgarte's method damps the rate constraint only, so that an error of the length "
+            "remains.",
         )
     ]
 
@@ -141,8 +143,8 @@ def regularisation(out: Path, thin: bool) -> list[Entry]:
             setup,
             PRINTED["figure5.1"],
             ours,
-            "No numbers are printed. The length errs by O(eps), and the smaller eps the stiffer "
-            f"the equations: steps taken {work}.",
+            "No numbers are printed. The error of the length is O(eps), and the equations "
+            f"become stiffer as eps decreases: steps taken {work}.",
         ),
         Entry(
             "figure5.2",
@@ -150,7 +152,7 @@ def regularisation(out: Path, thin: bool) -> list[Entry]:
             setup,
             PRINTED["figure5.2"],
             ours,
-            "No numbers are printed. Only eps = 1e-2 can be told from the circle by eye.",
+            "No numbers are printed. Only eps = 1e-2 is visibly different from the circle.",
         ),
     ]
 
@@ -185,7 +187,8 @@ def stabilised(out: Path, thin: bool) -> list[Entry]:
             "(2.6) in Cartesian coordinates, own histories, T = (GB)^-1, g = 9.81 m/s^2, t to 20.",
             PRINTED["figure5.3"],
             ours,
-            "The largest drift lies 0.03 of a decade above the line that print reads off as "
-            "10^-4.5: within what can be read from its figure, and of the unprinted g.",
+            "The largest drift is 0.03 of a decade above the line that print gives as 10^-4.5: "
+            "within the reading accuracy of its figure and the effect of g, which is not "
+            "printed.",
         )
     ]

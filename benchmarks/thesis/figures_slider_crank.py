@@ -81,9 +81,9 @@ def _fixed_step(
 
 
 SETUP = (
-    "Bars of 2 m and 1 kg in maximal coordinates, theta_1(0) = 7 pi/4, theta_2 = 2 pi - theta_1, "
-    "at rest, g = 9.81 m/s^2 (start and g inferred); own histories, y_0 = 0; no step is placed "
-    "and no multiplier predicted around singular configurations."
+    "Bars of 2 m and 1 kg in maximal coordinates, theta_1(0) = 7 pi/4, theta_2 = 2 pi - "
+    "theta_1, at rest, g = 9.81 m/s^2 (start and g inferred); own histories, y_0 = 0; without "
+    "placement of steps and prediction of multipliers around singular configurations."
 )
 
 
@@ -94,11 +94,11 @@ def index_two(out: Path, thin: bool) -> list[Entry]:
         out, key, Index2(slider_crank()), 1.2 if thin else 20.0, "index-2 slider-crank"
     )
     difference = (
-        "Print says that the run fails to pass correctly. Ours stays on the right branch in every "
-        "passage and its closures within a millimetre, but fails by degrees: nothing corrects "
-        "positions, each passage adds closure error, and from the ninth (18.3 s) on the amplitude "
-        "is visibly wrong. When that happens depends on how near a stage comes to a singular "
-        "configuration, so on rounding and on the start, which is not printed."
+        "In print the run fails to pass correctly. Ours stays on the right branch in every "
+        "passage, with closure errors below a millimetre, but fails gradually: nothing corrects "
+        "positions, each passage adds closure error, and from the ninth (18.3 s) on the "
+        "amplitude is visibly wrong. The time of failure depends on how close a stage comes to "
+        "a singular configuration, and so on rounding and on the start, which is not printed."
     )
     return [Entry(key, title, SETUP, PRINTED[key], ours, difference)]
 
@@ -231,10 +231,10 @@ def adaptive(out: Path, thin: bool) -> list[Entry]:
         "largest error of theta_1 (rad)": float(f"{run.error:.1e}"),
     }
     difference = (
-        "The counts differ by 6 and 1. First step and threshold of forced steps are not printed; "
-        "of the first steps, exponents and factors tried, 0.5 s, q = 3 and a_max = 5 "
-        "come nearest (q = 2, the lower order of the pair, runs into the impasse of figure 5.16 "
-        "earlier). Passages amplify rounding, so that single steps depend on it."
+        "The counts differ by 6 and 1. Print gives neither the first step nor the threshold of "
+        "forced steps; of the first steps, exponents and factors tried, 0.5 s, q = 3 and a_max "
+        "= 5 give the closest counts (q = 2, the lower order of the pair, reaches the impasse "
+        "of figure 5.16 earlier). Passages amplify rounding, so that single steps depend on it."
     )
     return [Entry(key, title.replace("ε", "eps"), SETUP, PRINTED[key], ours, difference)]
 
@@ -321,22 +321,23 @@ def impasse(out: Path, thin: bool) -> list[Entry]:
             "package's default method with its own control.",
             PRINTED[key],
             ours,
-            "The same impasse at the same place, and its cause: as h falls the estimate tends to "
-            "the gap of two trajectories that were never restarted, which no step makes smaller. "
-            "Print must count forced steps as rejected too: no run of ours rejects more than 50 "
-            "others, whatever its first step (0.001 to 1 s) and threshold (5e-5 to 5e-4 s). The "
-            "number of forced steps is the length of the stall over the threshold, which print "
-            "does not give; 1e-4 s brings the accepted steps to print's. The length itself is "
-            "rounding: a first step changed by a trillionth of itself, or another order of "
+            "The impasse is the same, at the same place. Its cause: as h decreases, the "
+            "estimate tends to the gap between two trajectories that are never restarted, and "
+            "no step makes this gap smaller. Print must count forced steps as rejected as well: "
+            "no run of ours rejects more than 50 other steps, for any first step (0.001 to 1 s) "
+            "and threshold (5e-5 to 5e-4 s). The number of forced steps is the length of the "
+            "stall over the threshold, which print does not give; with 1e-4 s the number of "
+            "accepted steps is close to that of print. The length of the stall depends on "
+            "rounding: a relative change of the first step by 1e-12, or another order of "
             f"operations, gives {accepted[0]} to {accepted[-1]} accepted and {refused[0]} to "
-            f"{refused[-1]} rejected and forced steps; changed by a thousandth, there is no stall "
-            "at all, or one of thousands of steps. What is left is neither threshold nor rounding: "
-            "accepted less rejected steps are 145 in print and about 265 here. It takes some 120 "
-            "more rejections, one after every fourth forced step, as of a control that now and "
-            "then tries more than the threshold; what print's control tries after a forced step "
-            "it does not say. "
-            "With the estimate within one sweep, from the accepted state, no step is forced. "
-            "(The package itself accepts no tolerance looser than 1e-4 for sweeps.)",
+            f"{refused[-1]} rejected and forced steps; after a change by a thousandth there is "
+            "no stall at all, or one of thousands of steps. One difference depends on neither "
+            "threshold nor rounding: accepted minus rejected steps are 145 in print and about "
+            "265 here. Some 120 more rejections would explain it, one after every fourth forced "
+            "step, by a control that sometimes tries more than the threshold; print does not "
+            "say which step its control tries after a forced one. With the estimate within one "
+            "sweep, from the accepted state, no step is forced. (For sweeps the package itself "
+            "accepts no tolerance above 1e-4.)",
         )
     ]
 

@@ -20,12 +20,13 @@ python -m benchmarks.thesis --out DIR
 ```
 
 (two processes, a few minutes), which writes `DIR/thesis.json`, a PNG for each of them, and with
-`--page` this page.  Nothing below is typed in by hand but the printed values
-(`benchmarks/thesis/printed.json`) and the sentences.  Tables 5.2 to 5.7 come from `srm.solve_dae`,
-table 5.1 from its operations written out;
-figures 5.3 and 5.13 to 5.16 from the package's sweeps over steps, with what only the thesis does
-(own histories with an estimate across sweeps, forced steps, index 2) in `benchmarks/thesis`.
-An asterisk marks a value that differs from print by more than 0.1, or in any digit of table 5.1.
+`--page FILE` this page.  "Print" is the printed thesis; its values are in
+`benchmarks/thesis/printed.json`, and all others are computed.  Tables 5.2 to 5.7 come from
+`srm.solve_dae`, table 5.1 from its operations written out, and figures 5.3 and 5.13 to 5.16 from
+the package's sweeps over steps; `benchmarks/thesis` has the parts that only the thesis needs (own
+histories with an estimate across sweeps, forced steps, index 2).  An asterisk marks a value that
+differs from print by more than 0.1, or in any digit of table 5.1.  [Methods](methods.md#method)
+describes the methods, [Notation and equations](notation.md#sweeps) has the sweeps.
 """
 
 

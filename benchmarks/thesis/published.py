@@ -19,17 +19,20 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.control.step_size import Proposal, StepDecision
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult, SweepNode
+from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.sweep import (
+from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.thesis.sweep import (
     Answer,
     Start,
     Sweep,
+    SweepNode,
+    SweepResult,
+    SweepState,
     interpolant,
     multipliers_between,
     sweep_over,
 )
-from srm_mbs.integration.methods.tableaus import get_tableau
 
 SAFETY, LARGEST_FACTOR = 0.8, 5.0
 """alpha and alpha_max of appendix B."""
@@ -58,12 +61,10 @@ class PublishedSRM:
         """The Runge-Kutta data."""
         return get_tableau(self.tableau)
 
-    def start(
-        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
-    ) -> IntegratorState:
+    def start(self, system: System, t: float, state: FloatArray, norm: ErrorNorm) -> SweepState:
         """All sweeps at ``state`` with multiplier 0."""
         terms = system.evaluate(t, state)
-        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+        memory = SweepState(terms.rate().copy(), terms.sigma, system.state_scale(state))
         node = SweepNode(state, np.zeros(system.multiplier_size), None, 0.0, None)
         memory.sweeps = (node,) * self.iterations
         return memory
@@ -74,9 +75,9 @@ class PublishedSRM:
         t: float,
         h: float,
         state: FloatArray,
-        memory: IntegratorState,
+        memory: SweepState,
         norm: ErrorNorm,
-    ) -> StepResult:
+    ) -> SweepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         scheme, s = self.scheme, self.scheme.n_stages
         eps = h if self.eps is None else self.eps
@@ -94,13 +95,13 @@ class PublishedSRM:
             runs.append(sweep_over(system, scheme, t, h, node.state, answer, start))
             previous = multipliers_between(system, scheme, how, t, h, runs[-1], answer)
         last = runs[-1]
-        magnitude = np.maximum(np.abs(memory.sweeps[-1].state), np.abs(last.state))
+        state_scale = np.maximum(np.abs(memory.sweeps[-1].state), np.abs(last.state))
         error_ratio = 0.0
         if scheme.error is not None and self.iterations > 1:
             lower = runs[-2]
             embedded = lower.state - h * (scheme.error @ lower.rates[: s + 1])
-            error_ratio = norm(last.state - embedded, norm.weights(magnitude))
-        return StepResult(
+            error_ratio = norm(last.state - embedded, norm.weights(state_scale))
+        return SweepResult(
             t=t,
             h=h,
             state=last.state,
@@ -113,7 +114,7 @@ class PublishedSRM:
             zone=None,
             history=None,
             multiplier=None,
-            magnitude=magnitude,
+            state_scale=state_scale,
             sweeps=tuple(
                 SweepNode(
                     run.state,
@@ -126,16 +127,16 @@ class PublishedSRM:
             ),
         )
 
-    def gap(self, memory: IntegratorState, norm: ErrorNorm) -> float:
+    def gap(self, memory: SweepState, norm: ErrorNorm) -> float:
         """||x_m - x_{m-1}|| over the tolerance, where the sweeps stand."""
         last, lower = memory.sweeps[-1].state, memory.sweeps[-2].state
         return norm(last - lower, norm.weights(np.abs(last)))
 
-    def accept(self, memory: IntegratorState, result: StepResult) -> None:
+    def accept(self, memory: SweepState, result: SweepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
-        memory.magnitude = result.magnitude
+        memory.state_scale = result.state_scale
         memory.sweeps = result.sweeps
 
 
@@ -164,13 +165,13 @@ class PublishedControl:
         self._just_rejected = False
         self.accepted = self.rejected = self.forced = 0
 
-    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
+    def propose(self, t: float, limit: float, memory: SweepState) -> Proposal:
         """The step that the last error allows."""
         if t + self._h >= self._t_end:
             return Proposal(self._t_end - t, self._t_end)
         return Proposal(self._h, t + self._h)
 
-    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
+    def decide(self, proposal: Proposal, result: SweepResult | None) -> StepDecision:
         """Accept if xi <= 1, or if the step cannot be made smaller."""
         xi = math.inf if result is None else result.error_ratio
         largest = 1.0 if self._just_rejected else LARGEST_FACTOR

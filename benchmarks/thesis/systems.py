@@ -128,7 +128,7 @@ class _Index2Terms:
     def __init__(self, terms: Terms, v: FloatArray) -> None:
         self._terms = terms
         self._v = v
-        self.sigma, self.rank, self.weak = terms.sigma, terms.rank, terms.weak
+        self.sigma, self.rank, self.rank_deficient = terms.sigma, terms.rank, terms.rank_deficient
 
     def rate(self) -> FloatArray:
         return self._terms.rate()
@@ -153,7 +153,7 @@ class _PendulumTerms:
 
     sigma = 1.0
     rank = 1
-    weak = False
+    rank_deficient = False
 
     def __init__(self, state: FloatArray) -> None:
         p, v = state[:2], state[2:]
@@ -188,6 +188,7 @@ class CartesianPendulum:
     """
 
     has_constraints = True
+    singularities = None
     carries_yhat = False
     predicts = True
     tangent_size = 4
@@ -210,11 +211,11 @@ class CartesianPendulum:
         """``rate`` itself."""
         return rate
 
-    def magnitudes(self, state: FloatArray) -> FloatArray:
+    def state_scale(self, state: FloatArray) -> FloatArray:
         """|x|."""
         return np.abs(state)
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """|g|."""
         return abs(float(state[:2] @ state[:2]) - 1.0)
 

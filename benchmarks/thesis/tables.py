@@ -65,11 +65,12 @@ def table_one(out: Path, thin: bool) -> list[Entry]:
     title = "Table 5.1: problem 2 at t = 1"
     drawing.draw_table(out / "table5.1.png", title, printed, ours)
     difference = (
-        "All digits agree. The last ones of y are rounding: y adds up g/eps, and one rounding of g "
-        "over eps is 2e-14. So the table is computed in the operations of a textbook program, one "
-        "by one (benchmarks/thesis/arithmetic.py): of the orders tried it has all of print's "
-        "digits for almost every way to write the continuous extension. The package's own run, "
-        f"whose sums are matrix products, lies within {apart:.0e} of it."
+        "All digits agree. The last digits of y depend on rounding: y accumulates g/eps, and "
+        "one rounding of g, divided by eps, is 2e-14. The table is therefore computed with the "
+        "single operations of a textbook program (benchmarks/thesis/arithmetic.py); of the "
+        "orders of operations tried, it has all printed digits for almost every form of the "
+        "continuous extension. The run of the package itself, whose sums are matrix products, "
+        f"agrees with it to {apart:.0e}."
     )
     setup = (
         "SRM with own histories, y_0 = 0, T = I, eps = 0.005, h = 0.001; dopr54 with its "
@@ -175,8 +176,9 @@ def table_two(out: Path, thin: bool) -> list[Entry]:
 def table_three(out: Path, thin: bool) -> list[Entry]:
     """Table 5.3, figures 5.6 and 5.7: tvd32 and its embedded scheme."""
     difference = (
-        "They agree but for the embedded scheme with a fixed step from sweep 3 on: there the error "
-        "has a minimum over eps, and a slope fitted across it depends on the ends of the grid."
+        "They agree, except for the embedded scheme with a fixed step from sweep 3 on: its "
+        "error has a minimum over eps, and a slope fitted across the minimum depends on the "
+        "ends of the grid."
     )
     columns = _both("tvd32", range(1, 6), thin)
     return _orders(out, "table5.3", ("figure5.6", "figure5.7"), "tvd32", columns, difference)
@@ -185,9 +187,9 @@ def table_three(out: Path, thin: bool) -> list[Entry]:
 def table_four(out: Path, thin: bool) -> list[Entry]:
     """Table 5.4, figures 5.8 and 5.9: erk4."""
     difference = (
-        "Slopes differ by up to 0.1 through the grids. m = 5 with eps = h is exact but for the "
-        "initial transient exp(-t/eps), visible on the coarsest grids only; print has 4.9974 "
-        "there, and 'exact' for the fixed step, where we have it too."
+        "Slopes differ by up to 0.1 because of the grids. m = 5 with eps = h is exact except "
+        "for the initial transient exp(-t/eps), visible on the coarsest grids only; print has "
+        "4.9974 there, and 'exact' for the fixed step, as here."
     )
     columns = _both("erk4", range(1, 7), thin)
     return _orders(out, "table5.4", ("figure5.8", "figure5.9"), "erk4", columns, difference)
@@ -197,10 +199,10 @@ def table_five(out: Path, thin: bool) -> list[Entry]:
     """Table 5.5, figures 5.10 and 5.11: dopr54 and its embedded scheme."""
     difference = (
         "m = 2 and 3 agree. For more sweeps the curves bend: with eps = h the stage order 1 of "
-        "explicit schemes on the stiff terms takes over (O(h^2), both in print and here); with a "
-        "fixed step the error has a minimum over eps, below which it grows again, and a slope "
-        "across it depends on where the grid lies: up to 0.3 apart. The embedded scheme of sweep 6 "
-        "with eps = h has slope 1.9 here, as all its neighbours; print has 0.93."
+        "explicit schemes on the stiff terms takes over (O(h^2), both in print and here); with "
+        "a fixed step the error has a minimum over eps, below which it grows again, and a slope "
+        "across it depends on the grid, by up to 0.3. The embedded scheme of sweep 6 with eps = "
+        "h has slope 1.9 here, as all its neighbours; print has 0.93."
     )
     columns = _both("dopr54", range(1, 8), thin)
     return _orders(out, "table5.5", ("figure5.10", "figure5.11"), "dopr54", columns, difference)
@@ -209,9 +211,9 @@ def table_five(out: Path, thin: bool) -> list[Entry]:
 def table_six(out: Path, thin: bool) -> list[Entry]:
     """Table 5.6, figure 5.12: dopr54 with eps = 5h."""
     difference = (
-        "They agree within 0.1. That takes the right coarse end of the grid, h = 1/25: there eps "
-        "is a fifth of the run and the errors are far from their asymptote, and slopes move by up "
-        "to 0.7 if h = 1/10 is fitted as well."
+        "They agree within 0.1 if the coarse end of the grid is h = 1/25. There eps is a fifth "
+        "of the run and the errors are far from their asymptote; slopes change by up to 0.7 if "
+        "h = 1/10 is fitted as well."
     )
     steps = _thinned(STEPS_FIVE, thin)
     columns = {"eps = 5h": {m: srm_curve("dopr54", m, steps, 5.0) for m in range(1, 9)}}

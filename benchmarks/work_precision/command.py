@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from benchmarks.work_precision.problems import PROBLEMS
 from benchmarks.work_precision.reliability import measure_reliability
 from benchmarks.work_precision.scaling import measure_scaling
 from benchmarks.work_precision.skip import measure_unneeded
+from srm_mbs.integration.kernel.backend import check_kernel
 
 SECTIONS = ("work", "reliability", "unneeded", "scaling")
 FILE = "results.json"
@@ -71,6 +73,13 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         help="CPU time (s) that ends a series.  [default: %(default)g]",
     )
+    out.add_argument(
+        "--backend",
+        choices=("kernel", "python"),
+        default="kernel",
+        help="Backend of srm_mbs: the compiled kernel, or the Python reference in its place.  "
+        "[default: %(default)s]",
+    )
     out.add_argument("--thin", action="store_true", help="Take every third setting: a quick look.")
     out.add_argument("-h", "--help", action="help", help="Show this message and exit.")
     return out
@@ -81,6 +90,24 @@ def main(arguments: Sequence[str]) -> int:
     chosen = parser().parse_args(arguments)
     if chosen.repeats < timing.REPEATS and not chosen.thin:
         parser().error(f"at least {timing.REPEATS} repeats (fewer only with --thin)")
+    if chosen.backend == "kernel":
+        try:
+            check_kernel()
+        except srm.InputError as error:
+            print(
+                f"error: {error}. To measure the Python reference in its place, add "
+                "--backend python",
+                file=sys.stderr,
+            )
+            return 2
+    else:
+        os.environ["SRM_MBS_BACKEND"] = "python"
+    _measure(chosen)
+    return 0
+
+
+def _measure(chosen: argparse.Namespace) -> None:
+    """Measure and write what the command's options ask for."""
     chosen.out.mkdir(parents=True, exist_ok=True)
     path = chosen.out / FILE
     results = records.Results(
@@ -135,7 +162,6 @@ def main(arguments: Sequence[str]) -> int:
     written.append(tables.write(records.load(path), chosen.out))
     for each in written:
         say(f"written: {each}")
-    return 0
 
 
 if __name__ == "__main__":

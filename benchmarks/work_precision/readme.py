@@ -1,9 +1,9 @@
-"""One figure and one table for the README, from a results file.
+"""The figure and the tables of CPU time against error in docs/benchmarks.md and in the README.
 
     python -m benchmarks.work_precision.readme [RESULTS.json] [--docs DIR] [--readme FILE]
 
-Rewrites what stands between the two marks in the README, or puts it before the section "Measured".
-The results, in brief, and the figure go to the documentation.
+Rewrites the text between the two marks of each page: docs/benchmarks.md has all problems, the
+README three of them.  The results, in brief, and the figure are stored with the documentation.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 NAME = "work_precision.json"
 BEGIN, END = "<!-- work-precision: begin -->", "<!-- work-precision: end -->"
-BEFORE = "## Measured"
+PAGE = "benchmarks.md"
 SHOWN = ("slider_crank_whirl", "slider_crank_regular", "n_four_bar_2", "walking_robot")
 """Problems of the figure, as far as they were measured."""
+SUMMARY = ("slider_crank_whirl", "slider_crank_regular", "walking_robot")
+"""Problems of the table in the README, as far as they were measured."""
 
 
 def _triple(entries: Sequence[Best | None]) -> str:
@@ -42,10 +44,23 @@ def _ratio(theirs: Best | None, ours: Best | None) -> str:
     return f"{theirs.seconds / ours.seconds:.2g}" if theirs and ours else "-"
 
 
-def table(results: Results) -> str:
-    """Our default, the best simulator and the reduced equation at every level, in CPU ms."""
+def _measured(results: Results, problems: Sequence[str]) -> list[str]:
+    """Those of ``problems`` that were measured, or the first of all."""
+    measured = [problem for problem in problems if problem in results.problems]
+    return measured or list(results.problems)[: len(problems)]
+
+
+def table(results: Results, problems: Sequence[str] | None = None) -> str:
+    """Our default, the best simulator and the reduced equation at every level, in CPU ms.
+
+    Parameters
+    ----------
+    problems
+        A row for each; all by default.
+    """
     rows = []
-    for problem, facts in results.problems.items():
+    for problem in problems or list(results.problems):
+        facts = results.problems[problem]
         ours = [best(results, problem, [OURS], level, DEFAULT_VARIANT) for level in LEVELS]
         peers = [best(results, problem, simulators(results), level) for level in LEVELS]
         floor = [best(results, problem, [FLOOR], level) for level in LEVELS]
@@ -64,55 +79,74 @@ def table(results: Results) -> str:
     header = (
         f"CPU ms at error {levels}",
         "srm_mbs",
-        "best simulator",
+        "best other simulator",
         "which",
-        "its time over ours",
-        "reduced by hand",
+        "ratio",
+        "hand-reduced ODE",
     )
     return markdown(header, rows)
 
 
+def _until(results: Results, words: str) -> str:
+    """``words`` with the limit (s) of a run; empty without limit."""
+    limit = results.settings.get("limit")
+    return "" if limit is None else words.format(limit=f"{limit:g}")
+
+
+def _marked(lines: Sequence[str]) -> str:
+    return "\n".join([BEGIN, *lines, END])
+
+
+def summary(results: Results, figure: str) -> str:
+    """Text between the marks of the README; ``figure`` is the path of the picture from there."""
+    return _marked(
+        [
+            f"![CPU time against error]({figure})",
+            "",
+            table(results, _measured(results, SUMMARY)),
+            "",
+            "Default settings against the best variant of the best other simulator, on one thread; "
+            "a dash: error not reached" + _until(results, " within\n{limit} s of CPU time") + ".  "
+            "All problems and conditions: [Benchmarks](docs/benchmarks.md).",
+        ]
+    )
+
+
 def block(results: Results, figure: str) -> str:
-    """What stands between the marks; ``figure`` is the path of the picture from the README."""
+    """Text between the marks of docs/benchmarks.md; ``figure`` as in :func:`summary`."""
     versions = results.versions
     names = ("pin", "mujoco", "exudyn", "scikit-sundae", "scipy-dae", "scipy")
-    limit = results.settings.get("limit")
-    option = "" if limit is None else f" --limit {limit:g}"
-    until = "" if limit is None else f" with runs of up to {limit:g} s"
+    option = _until(results, " --limit {limit}")
+    until = _until(results, " with runs of up to {limit} s")
     listed = ", ".join(f"{name} {versions[name]}" for name in names if versions.get(name))
-    return "\n".join(
+    return _marked(
         [
-            BEGIN,
             f"![CPU time against error]({figure})",
             "",
             table(results),
             "",
             f"`srm-mbs benchmark --out DIR --sections work{option}` measures this (least of "
             f"{results.settings['repeats']} runs, one thread, {results.machine['processor']}, "
-            f"{listed}): integration and output at 100 times, the error is the largest over them. "
-            "A setting counts for an error only if it and every tighter one reach it. Ours is the "
-            "default, the others are the best of their variants (Baumgarte rates, softness); a "
-            f"dash: not reached{until}.",
-            END,
+            f"{listed}). A run includes integration and output at 100 times; its error is the "
+            "largest over these times. A setting counts for an error only if it and every tighter "
+            "setting reach it. The column srm_mbs has the default settings, the others the best of "
+            f"their variants (Baumgarte rates, softness). A dash: not reached{until}.",
         ]
     )
 
 
 def rewritten(text: str, new: str) -> str:
-    """``text`` with the marked block replaced by ``new``, or ``new`` before "Measured".
+    """``text`` with the marked block replaced by ``new``.
 
     Raises
     ------
     ValueError
-        If one mark is there without the other, or neither they nor that section.
+        If the text does not have exactly one pair of marks.
     """
-    begins, ends = text.count(BEGIN), text.count(END)
-    if (begins, ends) == (1, 1) and text.index(BEGIN) < text.index(END):
-        start, rest = text.split(BEGIN)
-        return start + new + rest.split(END)[1]
-    if (begins, ends) != (0, 0) or text.count(f"\n{BEFORE}\n") != 1:
-        raise ValueError(f"there is no single pair of marks and no single section {BEFORE!r}")
-    return text.replace(f"\n{BEFORE}\n", f"\n## Beside other simulators\n\n{new}\n\n{BEFORE}\n")
+    if (text.count(BEGIN), text.count(END)) != (1, 1) or text.index(BEGIN) > text.index(END):
+        raise ValueError("the text does not have exactly one pair of marks")
+    start, rest = text.split(BEGIN)
+    return start + new + rest.split(END)[1]
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -127,13 +161,13 @@ def main(given: Sequence[str] | None = None) -> None:
     # The page shows what is kept: numbers rounded twice could differ from it in the last digit.
     results = records.load(kept)
     picture = kept.with_suffix(".png")
-    shown = [problem for problem in SHOWN if problem in results.problems]
-    plots.overview(results, shown or list(results.problems)[:4]).savefig(picture, dpi=130)
-    readme = arguments.readme
-    path = Path(os.path.relpath(picture, readme.parent)).as_posix()
-    text = readme.read_text(encoding="utf-8")
-    readme.write_text(rewritten(text, block(results, path)), encoding="utf-8")
-    print(f"written: {kept}, {picture}, {readme}")
+    plots.overview(results, _measured(results, SHOWN)).savefig(picture, dpi=130)
+    pages = {arguments.docs / PAGE: block, arguments.readme: summary}
+    for page, written in pages.items():
+        path = Path(os.path.relpath(picture, page.parent)).as_posix()
+        text = page.read_text(encoding="utf-8")
+        page.write_text(rewritten(text, written(results, path)), encoding="utf-8")
+    print(f"written: {kept}, {picture}, {', '.join(map(str, pages))}")
 
 
 if __name__ == "__main__":

@@ -218,6 +218,8 @@ def text(results: Results) -> str:
         f"thread, least of {settings.get('repeats', '-')}; a setting counts for a level only if it "
         f"and every tighter one reach it. Sweeps end at {settings.get('limit', '-')} s a run.\n",
     ]
+    if settings.get("backend") == "python":
+        parts.append("srm_mbs was measured on its Python reference, not on the compiled kernel.\n")
     if results.measurements:
         parts += ["## Ours beside the best peer\n", *_ratios(results)]
         levels = " / ".join(f"{level:.0e}" for level in LEVELS)

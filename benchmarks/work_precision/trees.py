@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 
 Array = Any
 AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

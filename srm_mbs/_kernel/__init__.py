@@ -1,51 +1,138 @@
 """The compiled kernel: C++ sources, and the extension module built from them.
 
-``core`` is the extension module, or None; ``missing`` then says why.
+``core`` is the extension module, or None; ``missing`` then says why, and ``remedy`` what to do.
+
+An installation has the extension beside this file.  A checkout has none: it uses the extension of
+the srm-mbs that is installed for the same Python, if that was built from the same sources.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
+import sys
+from collections.abc import Iterator, Sequence
+from importlib.machinery import PathFinder
 from importlib.metadata import version
+from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
-from srm_mbs._kernel.build_hash import fingerprint
+from srm_mbs._kernel.build_hash import fingerprint, install_command, installation_records
 
+PACKAGE = "srm_mbs._kernel"
 INSTALL_AGAIN = (
-    "install srm-mbs again from its source: "
     "pip install --force-reinstall --no-deps --no-cache-dir <folder or address of srm-mbs>"
 )
-OUTDATED = "it was built from other sources (install again: pip install -e .)"
-"""``missing`` of a checkout whose sources have changed since the kernel was built."""
+"""The command that builds the kernel of an installation again."""
 
 
-def _load() -> tuple[ModuleType | None, str]:
-    """The extension module, or why there is none."""
-    try:
-        built = import_module("srm_mbs._kernel.built")
-    except ModuleNotFoundError:
-        return None, (
-            "it was not built when srm-mbs was installed, because there was no C++17 compiler "
-            f"or because it failed; {INSTALL_AGAIN} (with -v, it says why)"
+class Kernel(NamedTuple):
+    """The extension module, or why there is none.
+
+    Attributes
+    ----------
+    core
+        The extension module, or None.
+    missing
+        The reason why it is None, a clause whose subject "it" is the kernel; else empty.
+    remedy
+        The command that makes it available, as an imperative; else empty.
+    """
+
+    core: ModuleType | None
+    missing: str = ""
+    remedy: str = ""
+
+
+def load(folder: Path, search: Sequence[str]) -> Kernel:
+    """The first extension module that fits the sources and the installed Pinocchio.
+
+    Parameters
+    ----------
+    folder
+        ``srm_mbs/_kernel`` of a checkout or of an installation.
+    search
+        Folders of installed packages, as in ``sys.path``: searched for a checkout only.
+    """
+    sources = fingerprint(folder)
+    refused: list[Kernel] = []
+    for place in _places(folder, search if sources else ()):
+        found = _load_from(place, folder, sources, search)
+        if found.core is not None:
+            return found
+        refused.append(found)
+    return refused[0] if refused else _not_built(folder, sources, search)
+
+
+def _places(folder: Path, search: Sequence[str]) -> Iterator[Path]:
+    """The folder itself, then those of installed packages, where they hold a built kernel."""
+    for place in dict.fromkeys([folder, *(Path(entry, *PACKAGE.split(".")) for entry in search)]):
+        if (place / "built.py").is_file():
+            yield place
+
+
+def _load_from(place: Path, folder: Path, sources: str, search: Sequence[str]) -> Kernel:
+    """The extension module in ``place``, for the package in ``folder`` with these ``sources``."""
+    built = _module("built", place)
+    # Kernels that do not name their sources were built before the sources were compared.
+    if sources and sources != getattr(built, "SOURCES", ""):
+        return Kernel(
+            None,
+            f"it was built from other sources than those in {folder.parents[1]}",
+            f"Run: {install_command(folder, search)}",
         )
     built_against: str = built.PINOCCHIO
     installed = version("pin")
-    if built_against.split(".")[:2] != installed.split(".")[:2]:
-        return None, (
-            f"it was built against Pinocchio {built_against}, but pin {installed} is installed; "
-            f"{INSTALL_AGAIN}"
+    minor = built_against.split(".")[:2]
+    # Another Pinocchio would crash the interpreter.
+    if minor != installed.split(".")[:2]:
+        pin = f'pip install "pin=={".".join(minor)}.*"'
+        return Kernel(
+            None,
+            f"it was built against Pinocchio {built_against}, but pin {installed} is installed",
+            f"Run: {install_command(folder, search) if sources else pin}",
         )
-    sources = fingerprint(Path(__file__).parent)
-    # A kernel that does not say from what it was built is older than this question.
-    if sources and sources != getattr(built, "SOURCES", ""):
-        return None, OUTDATED
     import pinocchio  # noqa: F401 - loads the libraries that the kernel links to
 
     try:
-        return import_module("srm_mbs._kernel._core"), ""
+        core = _module("_core", place)
     except ImportError as error:
-        return None, f"it cannot be loaded: {error}; {INSTALL_AGAIN}"
+        return Kernel(
+            None,
+            f"it cannot be loaded: {error}",
+            f"Run: {install_command(folder, search) if sources else INSTALL_AGAIN}",
+        )
+    return Kernel(core)
 
 
-core, missing = _load()
+def _module(name: str, place: Path) -> ModuleType:
+    """The submodule ``name`` of this package, loaded from the folder ``place``."""
+    spec = PathFinder.find_spec(f"{PACKAGE}.{name}", [str(place)])
+    if spec is None or spec.loader is None:
+        raise ModuleNotFoundError(f"{place} has no {name} for this Python", name=name)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if name == "_core":
+        sys.modules[spec.name] = module
+    return module
+
+
+def _not_built(folder: Path, sources: str, search: Sequence[str]) -> Kernel:
+    """Why no kernel was built for the package in ``folder``."""
+    if sources and next(installation_records(search), None) is None:
+        return Kernel(
+            None,
+            "a checkout of the source has none of its own, and no srm-mbs is installed for "
+            f"{sys.executable}",
+            f"Run: {install_command(folder, search)}",
+        )
+    command = install_command(folder, search) if sources else INSTALL_AGAIN
+    return Kernel(
+        None,
+        "it was not built when srm-mbs was installed, because there was no C++17 compiler or "
+        "because it failed",
+        f"With a C++17 compiler, run: {command} -v",
+    )
+
+
+core, missing, remedy = load(Path(__file__).parent, sys.path)

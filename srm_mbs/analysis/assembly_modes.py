@@ -21,9 +21,9 @@ from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.diagnosis import free_coordinates
 from srm_mbs.assembly.position import ClosureProblem, close_from, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, set_position
-from srm_mbs.model.mechanism import Mechanism
 
 log = logging.getLogger(__name__)
 

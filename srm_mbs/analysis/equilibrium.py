@@ -29,6 +29,7 @@ from srm_mbs.dynamics.constraints.local_coordinates import (
     tangent_basis,
 )
 from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import (
     SINGULAR,
@@ -38,7 +39,6 @@ from srm_mbs.dynamics.singularities.local_analysis import (
 )
 from srm_mbs.errors import AnalysisError, InputError
 from srm_mbs.model.coordinates import joint_coordinates
-from srm_mbs.model.mechanism import Mechanism
 
 log = logging.getLogger(__name__)
 

@@ -22,12 +22,13 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.constraints.structure import structure_of
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import numbers
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 MOTION_TOLERANCE = 1e-6
 """Default of ``tolerance``: relative error of the motion, and of its forces."""
@@ -88,7 +89,7 @@ def _motion(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """t (n,), q (n, nq), v (n, nv), a (n, nv) of a motion in any of its forms."""
     nq, nv = mechanism.model.nq, mechanism.model.nv
-    if isinstance(motion, Solution):
+    if isinstance(motion, SimulationResult):
         if (motion.mechanism.model.nq, motion.mechanism.model.nv) != (nq, nv):
             raise InputError(
                 "the run is one of another mechanism",
@@ -233,7 +234,7 @@ def _check_motion(
     """Refuse positions, rates u and accelerations a, in units, that violate the closures."""
     g, G = geometry.closure(q)
     # At rest the error is rounding: it is compared with the characteristic rate.
-    rate = geometry.mechanism.structure.units.rate
+    rate = structure_of(geometry.mechanism).units.rate
     speed = max(float(np.abs(u).max(initial=0.0)), rate)
     bias = geometry.bias(q, u) * geometry.row_size
     checks = (

@@ -25,11 +25,11 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import TangentChart, differences, tangent_basis
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.controllers import Controller
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import positive
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 

@@ -17,10 +17,10 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.continuation import drag
 from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import position_of
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = logging.getLogger(__name__)

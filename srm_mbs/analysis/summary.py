@@ -13,13 +13,13 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import joint_turns, row_angles, turning_coordinates
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.coordinates import position_of
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 JOINT_TYPES = {
     **{f"R{axis}": f"revolute about {axis.lower()}" for axis in "XYZ"},
@@ -42,7 +42,7 @@ BUSHING_ANGULAR = [False, False, False, True, True, True]
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
-def run_rows(solution: Solution, *, passages: bool = True) -> list[tuple[str, str]]:
+def run_rows(solution: SimulationResult, *, passages: bool = True) -> list[tuple[str, str]]:
     """Summary of a run: (quantity, value with unit).
 
     Parameters

@@ -24,12 +24,12 @@ from srm_mbs.assembly.position import (
     close_within_limits,
 )
 from srm_mbs.assembly.velocity import consistent_rates
-from srm_mbs.dynamics.constraints.rheonomic import DriveRows
+from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.model.coordinates import set_position, set_rate
-from srm_mbs.model.mechanism import Mechanism
 
 CONTRADICTS = 1e-9
 """Difference (rad, m) between a held position and where a drive begins."""

@@ -10,10 +10,10 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.continuation import CLOSE, drag
 from srm_mbs.assembly.position import ClosureProblem, beyond_limits, close_loops
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, smallest_singular_value
 from srm_mbs.errors import AssemblyError
 from srm_mbs.model.coordinates import joint_coordinates, position_of
-from srm_mbs.model.mechanism import Mechanism
 
 
 def free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:

@@ -17,15 +17,15 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
 from srm_mbs.dynamics.scaling import coordinate_units, counted_turns, row_angles
 from srm_mbs.dynamics.singularities.local_analysis import refine_singular_point
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.forces import OPEN, LimitSpring
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.forces import OPEN_LIMIT, LimitSpring
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 CLOSED = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
@@ -48,6 +48,11 @@ def _plain(loop: LoopClosure) -> IndexArray:
     rows = np.arange(loop.rows.count)
     turns = () if len(loop.rows.matched) else rows[alignments]
     return np.concatenate([rows[lengths], turns, rows[joints]]).astype(int)
+
+
+@per_model
+def _counted_turns(mechanism: MechanismData) -> BoolArray:
+    return counted_turns(mechanism.model)
 
 
 class ClosureProblem(ClosureGeometry):
@@ -119,7 +124,7 @@ class ClosureProblem(ClosureGeometry):
         """Indices into q and into v of the angles of which whole turns do not matter: those of
         coupled joints do."""
         coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
-        turning = self.mechanism.derived("counted turns", lambda: counted_turns(self.model))
+        turning = _counted_turns(self.mechanism)
         in_q: list[int] = []
         in_v: list[int] = []
         for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
@@ -293,7 +298,7 @@ SPREAD = 1.5
 """Size of the restarts, rad or scene diagonals."""
 
 
-def _limited(mechanism: Mechanism) -> list[tuple[str, int, int, float, float]]:
+def _limited(mechanism: MechanismData) -> list[tuple[str, int, int, float, float]]:
     """(name, index in q, index in v, lowest, highest) of the one-degree joints with limits."""
     model = mechanism.model
     rows = []
@@ -308,7 +313,7 @@ def _limited(mechanism: Mechanism) -> list[tuple[str, int, int, float, float]]:
     return rows
 
 
-def beyond_limits(mechanism: Mechanism, q: FloatArray) -> dict[str, tuple[float, float]]:
+def beyond_limits(mechanism: MechanismData, q: FloatArray) -> dict[str, tuple[float, float]]:
     """Joint name -> (its position in q (nq,), the limit that it is beyond), rad or m."""
     out = {}
     for name, i, _, low, high in _limited(mechanism):
@@ -346,7 +351,7 @@ def close_within_limits(
     return min(found, key=problem.distance, default=None)
 
 
-def limit_springs(mechanism: Mechanism) -> tuple[LimitSpring, ...]:
+def limit_springs(mechanism: MechanismData) -> tuple[LimitSpring, ...]:
     """Springs at all position limits that have none yet, as stiff as the mechanism is fast.
 
     k = M_jj (100 w)^2 and c = 0.2 sqrt(k M_jj), with the inertia M_jj that the joint moves in the
@@ -360,7 +365,7 @@ def limit_springs(mechanism: Mechanism) -> tuple[LimitSpring, ...]:
     for name, _, j, low, high in _limited(mechanism):
         moved = max(float(inertia[j]), SMALLEST_INERTIA * float(inertia.max()))
         stiffness = moved * (CONTACT * rate) ** 2
-        if name not in there and min(abs(low), abs(high)) < OPEN:
+        if name not in there and min(abs(low), abs(high)) < OPEN_LIMIT:
             damping = 2.0 * DAMPING_RATIO * float(np.sqrt(stiffness * moved))
             out.append(LimitSpring(name, stiffness, damping, name=f"limit_{name}"))
     return tuple(out)

@@ -15,12 +15,13 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.diagnosis import free_coordinates, quoted
 from srm_mbs.assembly.position import ClosureProblem
-from srm_mbs.dynamics.constraints.rheonomic import DriveRows
+from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import (
     null_basis,
     rank_revealing_qr,
     smallest_singular_value,
 )
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
 from srm_mbs.dynamics.singularities.local_analysis import (
     SINGULAR,
@@ -29,7 +30,6 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
 )
 from srm_mbs.errors import AssemblyError
-from srm_mbs.model.mechanism import Mechanism
 
 RATE_TOLERANCE = 1e-12
 ROUNDING, LOOSEST = 1e-14, 1e-8

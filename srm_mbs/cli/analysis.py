@@ -22,7 +22,7 @@ from srm_mbs.cli.output import (
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
-    from srm_mbs.model.mechanism import Mechanism
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 Hold = Annotated[

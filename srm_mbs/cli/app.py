@@ -288,10 +288,10 @@ def info(model: Model) -> None:
         typer.echo()
         table(drive_rows(mechanism), ("drive", "law", "moves", "values"))
     notes = (*mechanism.notes, *mechanism.structure.notes)
-    from srm_mbs._kernel import missing
+    from srm_mbs._kernel import missing, remedy
 
     if missing:
-        notes = (*notes, f"the compiled kernel is missing: {missing}")
+        notes = (*notes, f"the compiled kernel is not available: {missing}. {remedy}")
     if notes:
         typer.echo()
     for note in notes:
@@ -329,15 +329,15 @@ app.command()(plot_report.report)
 
 @app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
-    options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...]",
+    options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...] [--backend python]",
     add_help_option=False,
 )
 @reported()
 def benchmark(context: typer.Context) -> None:
     """Compare run time and error with other simulators.
 
-    In a checkout of the source only.  The options are those of
-    'python -m benchmarks.work_precision'.
+    In a checkout of the source only, and with the compiled kernel unless --backend python asks
+    for the Python reference.  The options are those of 'python -m benchmarks.work_precision'.
     """
     harness = Path("benchmarks", "work_precision", "__main__.py")
     if not harness.is_file():

@@ -24,8 +24,8 @@ from srm_mbs.cli.output import (
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
-    from srm_mbs.model.mechanism import Mechanism
-    from srm_mbs.simulation.result import Solution
+    from srm_mbs.api import Solution
+    from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.visualization.animation.live import LiveView
 
 Image = Annotated[

@@ -13,7 +13,7 @@ from srm_mbs.analysis.equilibrium import Equilibrium
 from srm_mbs.analysis.linearisation import Linearisation
 from srm_mbs.analysis.path_following import FollowedPath
 from srm_mbs.analysis.summary import force_text, position_text, vector_text
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.simulation.energy_balance import EnergyBalance
 
 

@@ -72,7 +72,7 @@ class ObliqueProjection:
         self.size = len(rows)
         self.rank = self.size
         self.sigma = np.inf
-        self.weak = False
+        self.rank_deficient = False
 
     def factor(self, G: FloatArray, B: FloatArray, threshold: float | None) -> None:
         """Factorise G (ny, nx) and B (nx, ny).
@@ -98,7 +98,7 @@ class ObliqueProjection:
             and b_pivots[rank - 1] > floor * self.reference[1]
         ):
             rank -= 1
-        self.rank, self.weak = rank, rank < ny
+        self.rank, self.rank_deficient = rank, rank < ny
         self.order = order[:rank]
         self.R = packed[:rank, :rank]
         self.Q_G = lapack.dorgqr(packed[:, :rank], tau[:rank])[0] if rank else packed[:, :0]
@@ -153,8 +153,8 @@ class DaeTerms:
         return self._p.rank
 
     @property
-    def weak(self) -> bool:
-        return self._p.weak
+    def rank_deficient(self) -> bool:
+        return self._p.rank_deficient
 
     @property
     def held(self) -> bool:
@@ -186,7 +186,7 @@ class DaeTerms:
     def prediction(self) -> FloatArray:
         if self._system.carries_yhat:
             return self.multiplier()
-        if not self.weak:
+        if not self.rank_deficient:
             y = np.linalg.solve(self.G @ self.B, self._gamma())
             return y.astype(np.float64, copy=False)
         return self._system.factor_of(self.multiplier(), self.B)
@@ -194,7 +194,7 @@ class DaeTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return self._p.project(w)
 
-    def gap(self) -> float:
+    def constraint_residual(self) -> float:
         return 0.0
 
     def correction(self) -> FloatArray:
@@ -246,6 +246,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    singularities = None
 
     def __init__(
         self,
@@ -379,7 +380,7 @@ class DaeSystem:
                 measured.factor(G, B, None)
             except EvaluationError:
                 continue
-            if not measured.weak:
+            if not measured.rank_deficient:
                 sizes_seen.append(measured.sizes)
         if 2 * len(sizes_seen) < len(pairs):
             raise InputError(
@@ -454,7 +455,7 @@ class DaeSystem:
         terms = self._terms
         terms.load(t, state, f, B, G)
         terms.predicted = None
-        if self.projection.weak and zone is not None:
+        if self.projection.rank_deficient and zone is not None:
             terms.predicted = zone.predict(t)
             if terms.predicted is None:
                 raise EvaluationError(
@@ -475,7 +476,7 @@ class DaeSystem:
         """0: no state is another one's rate."""
         return np.zeros_like(delta)
 
-    def size(self, delta: FloatArray) -> float:
+    def position_norm(self, delta: FloatArray) -> float:
         """max |dx|; see :class:`~srm_mbs.dynamics.system.System`."""
         return float(np.abs(delta).max())
 
@@ -489,11 +490,11 @@ class DaeSystem:
         """end - start; see :class:`~srm_mbs.dynamics.system.System`."""
         return end - start
 
-    def magnitudes(self, state: FloatArray) -> FloatArray:
+    def state_scale(self, state: FloatArray) -> FloatArray:
         """|x|."""
         return np.abs(state)
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over the typical row of G and the size of x: a relative error of x."""
         g = self.call("g", t, state)
         return float(np.max(np.abs(g) / self.projection.rows)) / max(

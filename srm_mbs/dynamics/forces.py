@@ -26,9 +26,7 @@ from typing import Any, Protocol
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.constraints.rows import (
     COINCIDENT,
     cross,
@@ -50,7 +48,7 @@ from srm_mbs.model.forces import (
     Wrench,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 
 class Evaluator(Protocol):
@@ -356,27 +354,6 @@ class _UserForceEvaluator:
         raise TypeError("the compiled kernel calls back for it")
 
 
-def friction_time(mechanism: Mechanism) -> float:
-    """Shortest time (s) in which friction stops a slow joint of the open tree at q0.
-
-    1 over the largest eigenvalue of M^-1 diag(F)/v_s; infinite without friction.  Steps of
-    explicit schemes stay below a few times it while a joint rests.
-
-    Raises
-    ------
-    EvaluationError
-        If the mass matrix is not positive definite.
-    """
-    model = mechanism.model
-    rough = np.flatnonzero(model.friction)
-    if not rough.size:
-        return np.inf
-    U = cholesky(pin.crba(model, workspace(model), mechanism.q0))
-    roots = np.zeros((model.nv, rough.size), order="F")
-    roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / mechanism.friction_speed)
-    return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)
-
-
 _EVALUATORS = {
     SpringDamper: SpringDamperEvaluator,
     JointTorque: JointTorqueEvaluator,
@@ -388,13 +365,10 @@ _EVALUATORS = {
 }
 
 
-def resolved_forces(mechanism: Mechanism) -> ForceKinematics | None:
+@per_model
+def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
     """The force elements of ``mechanism``, resolved once; None if it has none."""
-    forces: ForceKinematics | None = mechanism.derived(
-        "forces",
-        lambda: ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None,
-    )
-    return forces
+    return ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None
 
 
 class ForceKinematics:

@@ -22,8 +22,9 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import EvaluationError, InputError
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_model, per_start
 
 ROTATION_PER_STEP = 1.5
 """Rotation in one step (rad) that step-size control aims at; dexp^-1 is exact to round-off."""
@@ -155,6 +156,35 @@ def dexp_inverse(joint: GroupJoint, u: FloatArray, v: FloatArray) -> FloatArray:
     return out
 
 
+@per_model
+def _groups(mechanism: MechanismData) -> tuple[GroupJoint, ...]:
+    return group_joints(mechanism.model)
+
+
+@per_model
+def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
+    """Index into q of each velocity component (nv,), -1 where q is not a vector space there."""
+    index = np.full(mechanism.model.nv, -1)
+    for joint in list(mechanism.model.joints)[1:]:
+        if joint.nq == joint.nv:
+            index[joint.idx_v : joint.idx_v + joint.nv] = range(joint.idx_q, joint.idx_q + joint.nq)
+    return index
+
+
+@per_model
+def _wound_angles(mechanism: MechanismData) -> IndexArray:
+    """Velocity indices of the joints whose angle is (cos, sin)."""
+    joints = list(mechanism.model.joints)[1:]
+    return np.array([j.idx_v for j in joints if (j.nq, j.nv) == (2, 1)], dtype=int)
+
+
+@per_start
+def _caps(mechanism: Mechanism) -> FloatArray:
+    """Largest size (2 nv,) that a component of a state counts as in :meth:`Manifold.magnitudes`."""
+    unit = mechanism.structure.units.coordinate
+    return np.concatenate([unit, np.full(mechanism.model.nv, np.inf)])
+
+
 class Manifold:
     """The state space of ``mechanism``, as :class:`~srm_mbs.dynamics.system.System` asks for it."""
 
@@ -163,19 +193,14 @@ class Manifold:
         self.model = model = mechanism.model
         self.nq, self.nv = model.nq, model.nv
         self.tangent_size = 2 * self.nv
-        self._groups: tuple[GroupJoint, ...] = mechanism.derived(
-            "groups", lambda: group_joints(self.model)
-        )
+        self._groups = _groups(mechanism)
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
-        self._position_of: IndexArray = mechanism.derived("position_of", self._vector_coordinates)
+        self._position_of = _vector_coordinates(mechanism)
 
     @cached_property
     def _caps(self) -> FloatArray:
-        caps: FloatArray = self.mechanism.at_start(
-            "caps", lambda: np.concatenate([self._unit, np.full(self.nv, np.inf)])
-        )
-        return caps
+        return _caps(self.mechanism)
 
     @cached_property
     def _planar(self) -> tuple[GroupJoint, ...]:
@@ -183,24 +208,7 @@ class Manifold:
 
     @cached_property
     def _turning(self) -> IndexArray:
-        """Velocity indices of the joints whose angle is (cos, sin)."""
-        turning: IndexArray = self.mechanism.derived(
-            "turning",
-            lambda: np.array(
-                [j.idx_v for j in list(self.model.joints)[1:] if (j.nq, j.nv) == (2, 1)], dtype=int
-            ),
-        )
-        return turning
-
-    def _vector_coordinates(self) -> IndexArray:
-        """Index into q of each velocity component, -1 where q is not a vector space there."""
-        index = np.full(self.nv, -1)
-        for joint in list(self.model.joints)[1:]:
-            if joint.nq == joint.nv:
-                index[joint.idx_v : joint.idx_v + joint.nv] = range(
-                    joint.idx_q, joint.idx_q + joint.nq
-                )
-        return index
+        return _wound_angles(self.mechanism)
 
     def chart_constants(self) -> dict[str, Any]:
         """What the compiled kernel needs to know of the manifold, independent of the start."""
@@ -275,11 +283,11 @@ class Manifold:
         out[..., : self.nv] = delta[..., self.nv :]
         return out
 
-    def size(self, delta: FloatArray) -> float:
+    def position_norm(self, delta: FloatArray) -> float:
         """max |dq| over units; see :class:`~srm_mbs.dynamics.system.System`."""
         return float((np.abs(delta[: self.nv]) / self._unit).max())
 
-    def magnitudes(self, state: FloatArray) -> FloatArray:
+    def state_scale(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
 
         Angles are capped at 1 rad so that the accuracy does not decay with winding.

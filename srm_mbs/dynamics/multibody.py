@@ -19,7 +19,7 @@ The forces tau are those of the controller, joint damping and friction, and forc
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -28,17 +28,23 @@ from scipy.linalg import blas
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import LARGE, coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.row_algebra import (
+    GRAPH_ORDER_ABOVE,
+    coordinate_parents,
+    graph_order,
+)
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
-from srm_mbs.dynamics.system import Terms, Zone
+from srm_mbs.dynamics.system import SingularityAnalysis, Terms, Zone
 from srm_mbs.errors import EvaluationError
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import per_model, per_start
 
 _largest = blas.idamax
 
@@ -48,7 +54,7 @@ class OpenTerms:
 
     sigma = np.inf
     rank = 0
-    weak = False
+    rank_deficient = False
     held = False
 
     def __init__(self, nv: int) -> None:
@@ -67,7 +73,7 @@ class OpenTerms:
     def project(self, w: FloatArray) -> FloatArray:
         return np.zeros(self._nv)
 
-    def gap(self) -> float:
+    def constraint_residual(self) -> float:
         return 0.0
 
     def correction(self) -> FloatArray:
@@ -87,16 +93,16 @@ class ClosedTerms:
         self,
         projection: Projection,
         loops: LoopKinematics | DrivenKinematics,
-        gap_scale: FloatArray,
+        residual_scale: FloatArray,
     ) -> None:
         self._p = projection
         self._loops = loops
         self._pushed = loops.pushed if isinstance(loops, DrivenKinematics) else None
-        self._gap_scale = gap_scale
+        self._residual_scale = residual_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
         self.sigma = projection.sigma
-        self.weak = projection.weak
+        self.rank_deficient = projection.rank_deficient
 
     @property
     def rank(self) -> int:
@@ -146,9 +152,9 @@ class ClosedTerms:
         white = p.white_project(w)
         return white if self._pushed is None else white - s * p.normal(self._pushed[p.order])
 
-    def gap(self) -> float:
-        gaps = self._loops.g * self._gap_scale
-        return abs(float(gaps.item(_largest(gaps))))
+    def constraint_residual(self) -> float:
+        residuals = self._loops.g * self._residual_scale
+        return abs(float(residuals.item(_largest(residuals))))
 
     def correction(self) -> FloatArray:
         p = self._p
@@ -268,8 +274,7 @@ class Mechanics(Manifold):
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel
         (:mod:`srm_mbs.integration.kernel`)."""
-        fixed: dict[str, Any] = self.mechanism.derived("constants", self._constants)
-        return fixed | self.constants_of_start()
+        return _constants(self.mechanism) | self.constants_of_start()
 
     def constants_of_start(self) -> dict[str, Any]:
         """Those among :meth:`constants` that depend on the start, or that the model may change."""
@@ -280,7 +285,7 @@ class Mechanics(Manifold):
             "friction": self._friction,
         }
 
-    def _constants(self) -> dict[str, Any]:
+    def constants_of_model(self) -> dict[str, Any]:
         """Those that do not depend on the start."""
         return {
             "loops": [],
@@ -324,13 +329,14 @@ class OpenSystem(Mechanics):
 
     has_constraints = False
     factorisations = 0
+    singularities = None
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self._zero = np.zeros(self.nv)
         self._terms = OpenTerms(self.nv)
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """0: there is no closure."""
         return 0.0
 
@@ -355,6 +361,51 @@ class OpenSystem(Mechanics):
         return self._terms
 
 
+@per_model
+def _kept_rows(mechanism: Mechanism) -> LoopKinematics:
+    """The kept, scaled rows of the closures."""
+    structure = mechanism.structure
+    return LoopKinematics(
+        mechanism.model,
+        mechanism.loops,
+        structure.row_scale,
+        structure.kept,
+        structure.eliminations,
+    )
+
+
+def _rows_in_use(mechanism: Mechanism) -> LoopKinematics | DrivenKinematics:
+    """The kept, scaled rows of closures and drives, with memory of their own."""
+    if not mechanism.drives:
+        return _kept_rows(mechanism).copy_workspace()
+    structure = mechanism.structure
+    return DrivenKinematics(
+        mechanism.model,
+        mechanism.loops,
+        mechanism.drives,
+        mechanism.drive_curves,
+        structure.row_scale,
+        structure.kept,
+        structure.eliminations,
+    )
+
+
+@per_model
+def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
+    """The rows in use along the graph of the loops, if there are many coordinates."""
+    if mechanism.model.nv <= GRAPH_ORDER_ABOVE:  # every pivot order is cheap
+        return ()
+    return graph_order(_rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
+
+
+@per_start
+def _residual_scale(mechanism: Mechanism) -> FloatArray:
+    """Factor (m,) from each scaled row in use to row units."""
+    structure = mechanism.structure
+    unit = constraint_units(mechanism, structure.units)
+    return (structure.row_scale / unit)[structure.kept]
+
+
 class ClosedSystem(Mechanics):
     """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
 
@@ -363,52 +414,19 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
-        self._gap_scale: FloatArray = mechanism.at_start("gap_scale", self._gap_scales)
-        self._order: tuple[int, ...] = mechanism.derived("order", self._graph_order)
+        self._residual_scale = _residual_scale(mechanism)
+        self._order = _graph_order(mechanism)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
-
-    def _graph_order(self) -> tuple[int, ...]:
-        """The rows in use along the graph of the loops, if there are many coordinates."""
-        if self.nv <= LARGE:  # not worth asking for
-            return ()
-        return graph_order(self.loops.pattern(), coordinate_parents(self.model))
-
-    def _resolved_loops(self) -> LoopKinematics:
-        mechanism, structure = self.mechanism, self.structure
-        scale, kept = structure.row_scale, structure.kept
-        return LoopKinematics(self.model, mechanism.loops, scale, kept, structure.eliminations)
-
-    def _gap_scales(self) -> FloatArray:
-        structure = self.structure
-        unit = constraint_units(self.mechanism, structure.units)
-        scale: FloatArray = (structure.row_scale / unit)[structure.kept]
-        return scale
 
     @cached_property
     def loops(self) -> LoopKinematics | DrivenKinematics:
         """The rows of closures and drives that are in use, with memory of their own."""
-        if self._driven is not None:
-            return self._driven
-        resolved: LoopKinematics = self.mechanism.derived("loops", self._resolved_loops)
-        return resolved.copy_workspace()
+        return _rows_in_use(self.mechanism)
 
     @cached_property
     def _driven(self) -> DrivenKinematics | None:
         """Those rows, if there are drives."""
-        mechanism, structure = self.mechanism, self.structure
-        if not mechanism.drives:
-            return None
-        curves = mechanism.drive_curves
-        scale, kept = structure.row_scale, structure.kept
-        return DrivenKinematics(
-            self.model,
-            mechanism.loops,
-            mechanism.drives,
-            curves,
-            scale,
-            kept,
-            structure.eliminations,
-        )
+        return self.loops if isinstance(self.loops, DrivenKinematics) else None
 
     @cached_property
     def _mass_matrix(self) -> FloatArray:
@@ -417,7 +435,7 @@ class ClosedSystem(Mechanics):
 
     @cached_property
     def _terms(self) -> ClosedTerms:
-        return ClosedTerms(self.projection, self.loops, self._gap_scale)
+        return ClosedTerms(self.projection, self.loops, self._residual_scale)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
@@ -426,21 +444,35 @@ class ClosedSystem(Mechanics):
 
     def constants_of_start(self) -> dict[str, Any]:
         """As for open mechanisms, and the scales of the closures."""
-        return super().constants_of_start() | {"gap_scale": self._gap_scale}
+        return super().constants_of_start() | {"gap_scale": self._residual_scale}
 
-    def _constants(self) -> dict[str, Any]:
+    def constants_of_model(self) -> dict[str, Any]:
+        """As for open mechanisms, and the rows of the closures."""
         own = {
             "rows": len(self.loops.g),
             "structural_rank": self.structure.rank,
             "sigma_ref": self.structure.sigma_ref,
             "order": list(self._order),
         }
-        return super()._constants() | self.loops.constants() | own
+        return super().constants_of_model() | self.loops.constants() | own
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Count what the compiled kernel did for this system."""
         super().count(evaluations, factorisations)
         self.projection.factorisations += factorisations
+
+    @cached_property
+    def singularities(self) -> SingularityAnalysis:
+        """Data for the analysis of singular configurations."""
+        mechanism, structure = self.mechanism, self.structure
+        return SingularityAnalysis(
+            mechanism.q0,
+            structure.rank,
+            structure.sigma_ref,
+            structure.units.coordinate,
+            structure.units.rate,
+            partial(geometry_of, mechanism),
+        )
 
     @property
     def factorisations(self) -> int:
@@ -475,9 +507,9 @@ class ClosedSystem(Mechanics):
         terms = self._terms
         terms.v = v
         terms.sigma = projection.sigma
-        terms.weak = projection.weak
+        terms.rank_deficient = projection.rank_deficient
         terms.predicted = None
-        if projection.weak and zone is not None:
+        if projection.rank_deficient and zone is not None:
             terms.predicted = zone.predict(t)
             if terms.predicted is None:
                 if zone.normals is None:
@@ -491,10 +523,10 @@ class ClosedSystem(Mechanics):
                 projection.hold(zone.normals)
         return terms
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""
         g, _ = self.residuals(state, t)
-        return float(np.max(np.abs(g) * self._gap_scale))
+        return float(np.max(np.abs(g) * self._residual_scale))
 
     def _update(self, t: float, q: FloatArray, with_bias: bool = True) -> None:
         """The rows at t and q, for which ``data`` has the kinematics."""
@@ -518,3 +550,8 @@ def make_system(
     if mechanism.structure.rank == 0:
         return OpenSystem(mechanism, controller)
     return ClosedSystem(mechanism, controller)
+
+
+@per_model
+def _constants(mechanism: Mechanism) -> dict[str, Any]:
+    return make_system(mechanism).constants_of_model()

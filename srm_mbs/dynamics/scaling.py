@@ -18,7 +18,7 @@ from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.drives import in_order_of_rows
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 ROUNDING = 1e-12
 """Accelerations below this part of the largest are rounding of zero; and so is a scene diagonal
@@ -48,16 +48,12 @@ class Units:
     rate: float
 
 
-def row_angles(mechanism: Mechanism) -> BoolArray:
+@per_model
+def row_angles(mechanism: MechanismData) -> BoolArray:
     """Which closure rows (rows,) are in rad; the others are in m.
 
     Joint rows are in the unit of their first joint.
     """
-    angles: BoolArray = mechanism.derived("row_angles", lambda: _row_angles(mechanism))
-    return angles
-
-
-def _row_angles(mechanism: Mechanism) -> BoolArray:
     model = mechanism.model
     out: list[bool] = []
     for loop in mechanism.loops:
@@ -100,7 +96,7 @@ def counted_turns(model: pin.Model) -> BoolArray:
     return out
 
 
-def constraint_angles(mechanism: Mechanism) -> BoolArray:
+def constraint_angles(mechanism: MechanismData) -> BoolArray:
     """Which rows (rows,) are in rad, those of the drives after those of the loops."""
     driven = [
         drive.joint is not None and joint_turns(mechanism.model, drive.joint)
@@ -109,7 +105,7 @@ def constraint_angles(mechanism: Mechanism) -> BoolArray:
     return np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
 
 
-def row_dimensions(mechanism: Mechanism) -> tuple[str, ...]:
+def row_dimensions(mechanism: MechanismData) -> tuple[str, ...]:
     """Units that closure errors have, drives included: "m", "rad" or both, in this order."""
     angles = constraint_angles(mechanism)
     return tuple(unit for unit, own in (("m", ~angles), ("rad", angles)) if own.any())
@@ -121,7 +117,7 @@ def _turning(data: pin.Data) -> BoolArray:
     return out
 
 
-def row_units(mechanism: Mechanism, units: Units) -> FloatArray:
+def row_units(mechanism: MechanismData, units: Units) -> FloatArray:
     """Units of the closure rows (rows,): the scene diagonal (m) for lengths, 1 rad for alignments.
 
     A joint row is as large as its largest term, |c_i| times the unit of joint i, so that neither
@@ -140,7 +136,7 @@ def row_units(mechanism: Mechanism, units: Units) -> FloatArray:
     return np.array(out)
 
 
-def constraint_units(mechanism: Mechanism, units: Units) -> FloatArray:
+def constraint_units(mechanism: MechanismData, units: Units) -> FloatArray:
     """Units of all rows (rows,), those of the drives after those of the loops."""
     model = mechanism.model
     driven = [
@@ -152,7 +148,7 @@ def constraint_units(mechanism: Mechanism, units: Units) -> FloatArray:
     return np.concatenate([row_units(mechanism, units), driven])
 
 
-def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Units:
+def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
     model = mechanism.model
     data = workspace(model)
@@ -162,7 +158,7 @@ def coordinate_units(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> Unit
         points.append(data.oMi[joint].translation.copy())
         if model.inertias[joint].mass > 0.0:
             points.append(data.oMi[joint].act(model.inertias[joint].lever))
-    for joint, point in mechanism.derived("anchors", lambda: _anchors(mechanism)):
+    for joint, point in _anchors(mechanism):
         points.append(data.oMi[joint].act(point))
     corners = np.array(points) if points else np.zeros((1, 3))
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
@@ -193,7 +189,8 @@ def _gyration(model: pin.Model) -> float:
     )
 
 
-def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
+@per_model
+def _anchors(mechanism: MechanismData) -> list[tuple[int, FloatArray]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
     found = []
     driven = [anchor for drive in mechanism.drives for anchor in (drive.a, drive.b)]
@@ -206,7 +203,7 @@ def _anchors(mechanism: Mechanism) -> list[tuple[int, FloatArray]]:
     return found
 
 
-def _acceleration_by_forces(mechanism: Mechanism, q: FloatArray) -> FloatArray:
+def _acceleration_by_forces(mechanism: MechanismData, q: FloatArray) -> FloatArray:
     """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
     model = mechanism.model
     forces = resolved_forces(mechanism)

@@ -1,11 +1,12 @@
-"""The contract between a system and the time stepping.
+"""The contract between a system and the time integration.
 
 A *state* is one flat array; a mechanism uses x = (q, v) of length nq + nv.  A *tangent* is an
 array of the size of the system's tangent space; a mechanism uses (dq, dv) of length 2 nv with
-dq in the Lie algebra of the configuration manifold.  Stepping is written once against this
-contract and never looks inside a state.
+dq in the Lie algebra of the configuration manifold.  Integration is written once against this
+contract.  It looks inside a state only where a system offers :attr:`System.singularities`, the
+optional capability of mechanisms with closures.
 
-The state on the closures that is nearest to a given one.
+:func:`onto_closures` moves a state of any system onto its closures.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.errors import EvaluationError
 
 
 @dataclass(frozen=True)
 class Zone:
-    """What a stage needs to know when it falls next to a singular configuration.
+    """How a stage next to a singular configuration is evaluated.
 
     Attributes
     ----------
@@ -28,7 +30,7 @@ class Zone:
         sigma_z: pivots below ``threshold`` (relative to the structural reference) are dropped.
     predict
         t -> (nv,), the multiplier yhat extrapolated from nodes outside the zone; None at times
-        that the nodes say nothing about.
+        too far from the nodes.
     normals : (nv, k) or None
         M-orthonormal normals of the closures at the last node, the weakest last.  A motion that
         lingers, with too little momentum to pass, is held tangential to them.
@@ -40,7 +42,7 @@ class Zone:
 
 
 class Terms(Protocol):
-    """Answers about one evaluated stage, each at its own cost.
+    """The quantities of one evaluated stage, each computed when it is asked for.
 
     Arrays are valid until the system's next ``evaluate``.
     """
@@ -54,16 +56,16 @@ class Terms(Protocol):
         """Number of independent closure rows in use at this stage."""
 
     @property
-    def weak(self) -> bool:
-        """Whether rows were dropped here and the predicted multiplier took their place."""
+    def rank_deficient(self) -> bool:
+        """Whether rows were dropped at this stage, whose part of the multiplier is predicted."""
 
     @property
     def held(self) -> bool:
-        """Whether the normals of the zone took the place of the dropped rows."""
+        """Whether the normals of the zone replace the dropped rows."""
 
     def normals(self) -> FloatArray:
-        """M-orthonormal normals of the closures (nv, rank), the weakest last; (nv, 0) where the
-        motion has a part along them, with drives: it cannot be held tangential then."""
+        """M-orthonormal normals of the closures (nv, rank), the weakest last; (nv, 0) with drives,
+        which move the mechanism along them: it cannot be held tangential then."""
 
     def rate(self) -> FloatArray:
         """Tangent rate (2 nv,): (v, M^-1 f - yhat)."""
@@ -74,7 +76,7 @@ class Terms(Protocol):
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nv,): the M-orthogonal projection of w on the constraint normals."""
 
-    def gap(self) -> float:
+    def constraint_residual(self) -> float:
         """Largest |g|, of all rows, in row units; 0 where there are none."""
 
     def correction(self) -> FloatArray:
@@ -84,7 +86,8 @@ class Terms(Protocol):
         """
 
     def prediction(self) -> FloatArray:
-        """The exact multiplier in the form that sweeps carry: yhat, or y of some DAEs."""
+        """The exact multiplier in the form that sweeps carry: yhat, or y of DAEs with T = I or
+        (GB)^T."""
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         """Tangent rate and new multiplier of one SRM sweep, given the ``previous`` sweep's.
@@ -95,8 +98,49 @@ class Terms(Protocol):
         """
 
 
+@dataclass(frozen=True, eq=False)
+class SingularityAnalysis:
+    """The closures of a mechanism as equations, from which singular configurations are found.
+
+    A state of such a system is x = (q, v), a tangent (dq, dv).
+
+    Attributes
+    ----------
+    q0 : (nq,)
+        Configuration at which the mechanism starts.
+    rank
+        Structural rank of the rows of closures and drives.
+    sigma_reference
+        Usual size of the last structural pivot, by which sigma is divided.
+    coordinate_unit : (nv,)
+        1 rad for angles, the scene diagonal (m) for translations.
+    rate_unit
+        Characteristic rate (1/s).
+    equations
+        (q (nq,), t (s) or None) -> the closure equations with units measured at q, and the laws of
+        the drives as they are at t
+        (:func:`~srm_mbs.dynamics.constraints.geometry.geometry_of`).
+    """
+
+    q0: FloatArray
+    rank: int
+    sigma_reference: float
+    coordinate_unit: FloatArray
+    rate_unit: float
+    equations: Callable[[FloatArray, float | None], ClosureGeometry]
+
+    def geometry(self, q: FloatArray, t: float | None = None) -> ClosureGeometry:
+        """The ``equations`` for the configuration q (nq,) and the time t (s), if it is given."""
+        return self.equations(q, t)
+
+    def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Views (q, v) of a state (nx,), or of states (n, nx)."""
+        nq = len(self.q0)
+        return state[..., :nq], state[..., nq:]
+
+
 class System(Protocol):
-    """What both a mechanism and a DAE offer to the stepping."""
+    """The equations of a mechanism, or of a DAE, as time integration evaluates them."""
 
     has_constraints: bool
     tangent_size: int
@@ -109,6 +153,11 @@ class System(Protocol):
     """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
+
+    @property
+    def singularities(self) -> SingularityAnalysis | None:
+        """Data for the analysis of singular configurations; None without closures, and for DAEs,
+        whose equations are known at single points only."""
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """Factorise at one stage.
@@ -132,8 +181,8 @@ class System(Protocol):
         """
 
     def reachable(self, start: FloatArray, end: FloatArray) -> bool:
-        """Whether ``end`` is within the chart at ``start``, and what is one step further cannot
-        seem to be."""
+        """Whether ``end`` lies within the chart at ``start`` with a margin: no point one step
+        further can seem to lie in it."""
 
     def chart_rate(self, delta: FloatArray, rate: FloatArray) -> FloatArray:
         """Rate of the chart coordinate ``delta`` for the tangent rate at retract(state, delta)."""
@@ -142,22 +191,23 @@ class System(Protocol):
         """Change of the tangent rate that follows from moving the state by ``delta`` alone, the
         accelerations kept: (dv, 0) for a mechanism, whose q' is v."""
 
-    def size(self, delta: FloatArray) -> float:
+    def position_norm(self, delta: FloatArray) -> float:
         """Largest motion of the positions in ``delta``, in units (rad, scene diagonals)."""
 
-    def magnitudes(self, state: FloatArray) -> FloatArray:
+    def state_scale(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""
 
-    def closure_gap(self, t: float, state: FloatArray) -> float:
+    def constraint_residual(self, t: float, state: FloatArray) -> float:
         """Largest closure error at ``state``, in row units (scene diagonals, rad); 0 if open."""
 
     def step_limit(self, state: FloatArray) -> float:
         """Largest step for which the chart stays well inside its domain (s)."""
 
 
-ROUNDS = 30
-CLOSED = 1e-13
-"""Motion (units) of a correction from which the closures are satisfied to rounding."""
+MAX_NEWTON_STEPS = 30
+CLOSURE_TOLERANCE = 1e-13
+"""Largest motion (rad, scene diagonals) of the last Newton step: the closures are then satisfied to
+rounding."""
 
 
 def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
@@ -174,9 +224,9 @@ def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
     """
     if not system.has_constraints:
         return state
-    for _ in range(ROUNDS):
+    for _ in range(MAX_NEWTON_STEPS):
         correction = system.evaluate(t, state).correction()
         state = system.retract(state, -correction)
-        if system.size(correction) < CLOSED:
+        if system.position_norm(correction) < CLOSURE_TOLERANCE:
             return state
     raise EvaluationError("no configuration that closes the loops was found near the one given")

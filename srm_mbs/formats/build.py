@@ -1,27 +1,33 @@
-"""From a description and its URDF to an assembled mechanism."""
+"""From a description and a tree of links and joints to the assembled mechanism."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
-from srm_mbs.dynamics.forces import friction_time
+from srm_mbs.dynamics.constraints.projection import cholesky, whiten
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.description import Description, parse_description
-from srm_mbs.formats.toml.schema import LimitSpringEntry, TorqueEntry, TorsionSpringEntry
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
-from srm_mbs.model.coordinates import set_position, set_rate
-from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
-from srm_mbs.model.validation import check_inertia, undetermined_joint
+from srm_mbs.formats.xml import parse_xml
+from srm_mbs.model.coordinates import write_position, write_rate
+from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.model.validation import check_inertia, check_tree, undetermined_joint
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +38,7 @@ def _joints_that_must_move(description: Description) -> list[tuple[str, Sequence
         *(
             (f"force[{i}].joint", [force.joint])
             for i, force in enumerate(description.force)
-            if isinstance(force, TorqueEntry | TorsionSpringEntry | LimitSpringEntry)
+            if hasattr(force, "joint")
         ),
         *((f"loop[{i}].joints", loop.joints or []) for i, loop in enumerate(description.loop)),
         *((f"drive[{i}].joint", [d.joint]) for i, d in enumerate(description.drive) if d.joint),
@@ -117,16 +123,17 @@ def _without_locked(
     q, v, guess = dict(initial.q), dict(initial.v), dict(initial.guess)
     if not description.lock:
         return model, q, v, guess
-    whole = Mechanism(model)
-    frozen = np.array(whole.q0)
+    check_tree(model)
+    frozen = pin.neutral(model)
     for name in description.lock:
+        joint = model.joints[model.getJointId(name)]
         for where, values in (("initial.q", q), ("initial.guess", guess)):
             if name in values:
                 with _element(where):
-                    set_position(whole, frozen, name, values.pop(name))
+                    write_position(joint, frozen, name, values.pop(name))
         rate = np.zeros(model.nv)
         with _element("initial.v"):
-            set_rate(whole, rate, name, v.pop(name, np.zeros(whole.joint(name).nv)))
+            write_rate(joint, rate, name, v.pop(name, np.zeros(joint.nv)))
         if rate.any():
             raise InputError(
                 f"joint {name!r} is locked but has an initial rate",
@@ -137,31 +144,58 @@ def _without_locked(
     return lock_joints(model, list(description.lock), frozen), q, v, guess
 
 
-def _friction_note(mechanism: Mechanism) -> tuple[str, ...]:
+def friction_time(model: pin.Model, q: FloatArray, friction_speed: float) -> float:
+    """Shortest time (s) in which friction stops a slow joint of the open tree at q (nq,).
+
+    1 over the largest eigenvalue of M^-1 diag(F)/v_s, with the friction speed v_s (rad/s, m/s);
+    infinite without friction.  Steps of explicit schemes stay below a few times it while a joint
+    rests.
+
+    Raises
+    ------
+    EvaluationError
+        If the mass matrix is not positive definite.
+    """
+    rough = np.flatnonzero(model.friction)
+    if not rough.size:
+        return np.inf
+    U = cholesky(pin.crba(model, workspace(model), q))
+    roots = np.zeros((model.nv, rough.size), order="F")
+    roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / friction_speed)
+    return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)
+
+
+def _friction_note(model: pin.Model, q: FloatArray, friction_speed: float) -> tuple[str, ...]:
     try:
-        time = friction_time(mechanism)
+        time = friction_time(model, q, friction_speed)
     except EvaluationError:  # in gimbal lock, which is reported elsewhere
         return ()
     if time == np.inf:
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
-        f"{mechanism.friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
+        f"{friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
         f"{6.0 * time:.0e} s, in proportion to v_s: set it with friction_speed",
     )
 
 
 def unassembled(
-    description: Description, source: Source, notes: Sequence[str] = (), tables: bool = True
+    description: Description,
+    tree: Element,
+    source: Source,
+    notes: Sequence[str] = (),
+    tables: bool = True,
 ) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
     """The mechanism with the guess as its q0, and the held positions and rates by joint.
 
     Parameters
     ----------
-    description, source
-        The parsed description, and the texts it was parsed from.
+    description, tree
+        The checked description, and the root element of its URDF, which is changed.
+    source
+        The texts of both.
     notes
-        Sentences of the translator that wrote them.
+        Sentences of the translator that made them.
     tables
         Whether to read the drives and forces that may need tables from other files.
 
@@ -172,36 +206,37 @@ def unassembled(
     """
     file = source.path
     built = build_urdf(
-        source.urdf, source.urdf_path, source.base, description.lock, description.coupled_joints()
+        tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
     )
     built.model.gravity.linear = np.array(source.gravity)
     _check_joint_names(description, built.model, file)
     model, q, v, guess = _without_locked(description, built.model, file)
     check_inertia(model, source.urdf_path)
     _check_frames(description, model)
-    tree = Mechanism(model)
-    start = np.array(tree.q0)
+    check_tree(model)
+    start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
             with _element(where):
-                set_position(tree, start, name, value)
+                write_position(model.joints[model.getJointId(name)], start, name, value)
     for name, value in v.items():
         with _element("initial.v"):
-            set_rate(tree, np.zeros(model.nv), name, value)
+            write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
+    csv = CsvFolder(Path(file).parent) if tables else None
+    friction_speed = description.friction_speed
     mechanism = Mechanism(
         model,
         description.closures(),
         q0=start,
-        forces=description.force_elements(Path(file).parent if tables else None),
-        drives=description.drives(Path(file).parent) if tables else (),
-        friction_speed=description.friction_speed,
+        forces=description.force_elements(csv),
+        drives=description.drives(csv) if csv else (),
+        friction_speed=friction_speed,
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(*notes, *built.notes),
+        notes=(*notes, *built.notes, *_friction_note(model, start, friction_speed)),
     )
-    mechanism = replace(mechanism, notes=mechanism.notes + _friction_note(mechanism))
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
     return mechanism, q, v
@@ -223,7 +258,8 @@ def rebuild(source: Source) -> Mechanism:
     """The mechanism of a saved run without its drives; its q0 is the guess of the description, not
     assembled."""
     description = parse_description(source.description, source.path)
-    return unassembled(description, source, tables=False)[0]
+    tree = parse_xml(source.urdf, source.urdf_path)
+    return unassembled(description, tree, source, tables=False)[0]
 
 
 def _in_gimbal_lock(source: Source, why: str) -> InputError:
@@ -236,7 +272,9 @@ def _in_gimbal_lock(source: Source, why: str) -> InputError:
     )
 
 
-def assembled(description: Description, source: Source, notes: Sequence[str] = ()) -> Mechanism:
+def assembled(
+    description: Description, tree: Element, source: Source, notes: Sequence[str] = ()
+) -> Mechanism:
     """The mechanism with its loops closed; parameters as in :func:`unassembled`.
 
     Raises
@@ -244,14 +282,14 @@ def assembled(description: Description, source: Source, notes: Sequence[str] = (
     InputError, AssemblyError
         As :func:`srm_mbs.load`.
     """
-    mechanism, q, v = unassembled(description, source, notes)
+    mechanism, q, v = unassembled(description, tree, source, notes)
+    # Assembly analyses this copy, of the guess; the mechanism is analysed at its assembled state.
+    guess = copy(mechanism)
     try:
-        state = assemble(mechanism, q, v)
-        # What was analysed stays if nothing changed; the walk goes along the velocity, too.
-        if np.array_equal(state.q, mechanism.q0) and np.array_equal(state.v, mechanism.v0):
-            mechanism = mechanism.with_state(state.q, state.v)
-        else:  # a fresh mechanism: its structure is analysed from the assembled state
-            mechanism = replace(mechanism, q0=state.q, v0=state.v)
+        state = assemble(guess, q, v)
+        if np.array_equal(state.q, guess.q0) and np.array_equal(state.v, guess.v0):
+            mechanism = guess
+        mechanism = mechanism.with_state(state.q, state.v)
         _ = mechanism.structure
     except AssemblyError as error:
         if description.lock:

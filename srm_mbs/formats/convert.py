@@ -1,22 +1,22 @@
-"""``convert``: a file of any format as our description with its URDF beside it."""
+"""``convert``: a file of any format as a TOML description with its URDF."""
 
 from __future__ import annotations
 
 import logging
 import os
-import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
+from xml.etree.ElementTree import Element
 
 import tomli_w
 
 from srm_mbs.errors import CHECK_WRITING, InputError
 from srm_mbs.formats.build import unassembled
 from srm_mbs.formats.load import Overrides, read
-from srm_mbs.formats.xml import parse_urdf
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ def convert(
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
 
-    What is written is the translation that :func:`srm_mbs.load` makes, not the assembled state.
+    The files contain the translation that :func:`srm_mbs.load` makes, not the assembled state.
 
     Parameters
     ----------
@@ -55,8 +55,9 @@ def convert(
     urdf = description.with_suffix(".urdf")
     reading = read(path, Overrides(cut=tuple(cut)))
     source = reading.source
+    written = _with_meshes_from(reading.tree, source.urdf, Path(source.urdf_path), urdf)
     try:
-        mechanism, _, _ = unassembled(reading.description, source, reading.notes)
+        mechanism, _, _ = unassembled(reading.description, reading.tree, source, reading.notes)
     except InputError as error:
         raise error.located(source.path) from error.__cause__
     inputs = {Path(name).resolve() for name in (path, source.path, source.urdf_path)}
@@ -69,11 +70,10 @@ def convert(
             raise InputError(
                 "the file exists", file=str(target), remedy="Give another name, or --force"
             )
-    entries = tomllib.loads(source.description) | {"urdf": urdf.name}
+    entries = deepcopy(dict(reading.entries)) | {"urdf": urdf.name}
     _move_tables(entries, Path(source.path), description)
-    tree = _with_meshes_from(source.urdf, Path(source.urdf_path), urdf)
     try:
-        urdf.write_text(tree, encoding="utf-8")
+        urdf.write_text(written, encoding="utf-8")
         description.write_text(tomli_w.dumps(entries), encoding="utf-8")
     except OSError as error:
         raise InputError(
@@ -104,9 +104,9 @@ def _move_tables(entries: Any, original: Path, written: Path) -> None:
                 _move_tables(value, original, written)
 
 
-def _with_meshes_from(text: str, original: Path, written: Path) -> str:
-    """The URDF ``text`` with the relative paths of its mesh files as seen from ``written``."""
-    root = parse_urdf(text, str(original))
+def _with_meshes_from(root: Element, text: str, original: Path, written: Path) -> str:
+    """The URDF ``root``, whose text is ``text``, with the relative paths of its mesh files as seen
+    from ``written``."""
     changed = False
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")

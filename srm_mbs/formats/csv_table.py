@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,68 +13,94 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
 
-def _cells(path: Path) -> list[list[str]]:
-    """Lines of a CSV file that are not empty, the header first."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
-        raise InputError(
-            f"the table cannot be read: {error}",
-            file=str(path),
-            remedy="Give a CSV file of numbers",
-        ) from error
-    return rows or [[]]
+@dataclass(frozen=True)
+class CsvTable:
+    """The cells of a CSV file: numbers separated by commas, the first line naming the columns.
+
+    Attributes
+    ----------
+    file
+        Its path, for messages.
+    names
+        Of the columns.
+    rows
+        The cells below the first line; empty lines are left out.
+    """
+
+    file: str
+    names: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def columns(self, names: Sequence[str]) -> FloatArray:
+        """The columns ``names`` (n, k), in that order.
+
+        Raises
+        ------
+        InputError
+            Naming the file, and the line or column that is wrong.
+        """
+        for name in names:
+            if self.names.count(name) != 1:
+                missing = name not in self.names
+                raise InputError(
+                    f"there is no column {name!r}" if missing else f"two columns {name!r}",
+                    file=self.file,
+                    element="first line",
+                    remedy=f"Known: {', '.join(self.names) or 'none'}",
+                )
+        wanted = [self.names.index(name) for name in names]
+        out = np.empty((len(self.rows), len(wanted)))
+        for i, row in enumerate(self.rows):
+            try:
+                if len(row) != len(self.names):
+                    raise ValueError(f"{len(row)} values, {len(self.names)} columns")
+                out[i] = [float(row[k]) for k in wanted]
+            except ValueError as error:
+                raise InputError(
+                    f"row {i + 1} of the table is wrong: {error}",
+                    file=self.file,
+                    remedy="Give one finite number in every column",
+                ) from error
+        return out
 
 
-def table_columns(path: Path) -> tuple[str, ...]:
-    """Names of the columns of a CSV file.
+def read_csv(path: Path) -> CsvTable:
+    """The table in the file ``path``.
 
     Raises
     ------
     InputError
         If it cannot be read.
     """
-    return tuple(cell.strip() for cell in _cells(path)[0])
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            cells = [tuple(row) for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise InputError(
+            f"the table cannot be read: {error}",
+            file=str(path),
+            remedy="Give a CSV file of numbers",
+        ) from error
+    header, *rows = cells or [()]
+    return CsvTable(str(path), tuple(cell.strip() for cell in header), tuple(rows))
 
 
-def read_table(path: Path, columns: Sequence[str]) -> FloatArray:
-    """Columns (n, k) of a CSV file with a header line.
+class CsvFolder:
+    """The CSV files that a description names, each read once.
 
     Parameters
     ----------
-    path
-        The file: numbers separated by commas, the first line naming the columns.
-    columns
-        Names of the wanted columns, in that order.
-
-    Raises
-    ------
-    InputError
-        Naming the file, and the line or column that is wrong.
+    folder
+        Where relative paths begin.
     """
-    file = str(path)
-    rows = _cells(path)
-    header = [cell.strip() for cell in rows[0]]
-    for name in columns:
-        if header.count(name) != 1:
-            raise InputError(
-                f"there is no column {name!r}" if name not in header else f"two columns {name!r}",
-                file=file,
-                element="first line",
-                remedy=f"Known: {', '.join(header) or 'none'}",
-            )
-    wanted = [header.index(name) for name in columns]
-    out = np.empty((len(rows) - 1, len(wanted)))
-    for i, row in enumerate(rows[1:]):
-        try:
-            if len(row) != len(header):
-                raise ValueError(f"{len(row)} values, {len(header)} columns")
-            out[i] = [float(row[k]) for k in wanted]
-        except ValueError as error:
-            raise InputError(
-                f"row {i + 1} of the table is wrong: {error}",
-                file=file,
-                remedy="Give one finite number in every column",
-            ) from error
-    return out
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._read: dict[Path, CsvTable] = {}
+
+    def table(self, name: str) -> CsvTable:
+        """The table of the file ``name``; raises :class:`InputError` as :func:`read_csv` does."""
+        path = self._folder / name
+        if path not in self._read:
+            self._read[path] = read_csv(path)
+        return self._read[path]

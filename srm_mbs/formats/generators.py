@@ -1,4 +1,4 @@
-r"""Mechanisms that come in families: written out as a description and a URDF on demand.
+r"""Families of mechanisms, generated as a description and a URDF.
 
 The N-four-bar is benchmark A02 of the IFToMM Technical Committee for Multibody Dynamics
 (Library of Computational Benchmark Problems): :math:`2N + 1` uniform rods of 1 m and 1 kg,
@@ -28,7 +28,7 @@ WIDTH, DEPTH, EYE_RADIUS, PIN_RADIUS = 0.08, 0.04, 0.065, 0.03  # m, how the rod
 GROUND_LAYER, CRANK_LAYER, COUPLER_LAYERS = 0.075, 0.025, (-0.025, -0.075)  # m, y of drawn parts
 ALONG_Y = "1.5707963267948966 0 0"  # rpy that lays a URDF cylinder along y
 
-MATERIALS = (  # after Okabe and Ito: told apart by colour-blind readers too
+MATERIALS = (  # after Okabe and Ito: colour-blind readers can distinguish them
     ("grey", "0.55 0.57 0.60 1"),
     ("dark", "0.15 0.16 0.18 1"),
     ("blue", "0 0.447 0.698 1"),
@@ -67,7 +67,7 @@ def _description(n: int) -> str:
         "# Benchmark A02 of the IFToMM Library of Computational Benchmark Problems. It starts with",
         "# upright cranks, the first crank tip at 1 m/s in +x.",
         f"# Singular when the cranks are horizontal: then {n + 1} degrees of freedom, not 1.",
-        "# Written by srm_mbs.formats.generators.n_four_bar.",
+        "# Written by srm_mbs.n_four_bar.",
         "format = 1",
         f'name = "n_four_bar_{n}"',
         f'urdf = "../urdf/n_four_bar_{n}.urdf"',
@@ -102,7 +102,7 @@ def _urdf(n: int) -> str:
     lines = [
         '<?xml version="1.0"?>',
         f"<!-- N-four-bar, N = {n} (IFToMM A02); models/n_four_bar_{n}.toml closes its loops.",
-        "     Written by srm_mbs.formats.generators.n_four_bar. -->",
+        "     Written by srm_mbs.n_four_bar. -->",
         f'<robot name="n_four_bar_{n}">',
     ]
     for material, rgba in MATERIALS:
@@ -121,7 +121,7 @@ def _urdf(n: int) -> str:
 
 
 def _ground(n: int) -> list[str]:
-    """Draw the ground: a beam behind the rods and a block at every pivot."""
+    """Draw the ground: a beam beyond the rods and a block at every pivot."""
     beam = f'<box size="{_number(n + 0.4)} {DEPTH} 0.05"/>'
     lines = _visual((n / 2.0, GROUND_LAYER, -0.125), beam, "grey")
     for i in range(n + 1):

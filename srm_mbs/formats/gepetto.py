@@ -14,15 +14,14 @@ from __future__ import annotations
 
 import re
 import reprlib  # of nested anchors and aliases: repr would write out all of them
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf import loops as urdf_loops
-from srm_mbs.formats.xml import parse_urdf
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
 PAIRED = {"closed_loop": "type", "joint_name": "joint_type"}
@@ -33,20 +32,21 @@ AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
 REPLACEABLE = ("revolute", "continuous", "prismatic", "floating", "planar")
 
 
-def recognises(_: Path, text: str) -> bool:
+def recognises(document: Document) -> bool:
     """Whether a text has one of the keys at the beginning of a line."""
-    return re.search(rf"^({'|'.join(KEYS)})\s*:", text, re.MULTILINE) is not None
+    return re.search(rf"^({'|'.join(KEYS)})\s*:", document.text, re.MULTILINE) is not None
 
 
-def translate(text: str, file: str, options: Options) -> Translation:
-    """The URDF beside the YAML ``file``, its joints of the right types, and the closures.
+def translate(document: Document, options: Options) -> Translation:
+    """The URDF beside a YAML file, its joints of the right types, and the closures.
 
     Raises
     ------
     InputError
         Naming the file and key at fault.
     """
-    lists = _read(text, file)
+    file = document.file
+    lists = _read(document.text, file)
     urdf_path = _urdf_beside(Path(file))
     try:
         urdf = urdf_path.read_text(encoding="utf-8-sig")
@@ -56,8 +56,8 @@ def translate(text: str, file: str, options: Options) -> Translation:
             file=str(urdf_path),
             remedy="Put a readable URDF in UTF-8 there",
         ) from error
-    plain = urdf_loops.translate(urdf, str(urdf_path), options)
-    root = parse_urdf(plain.urdf, str(urdf_path))
+    plain = urdf_loops.translate(Document(urdf, str(urdf_path)), options)
+    root = plain.tree
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
     frames = {*joints, *(link.get("name", "") for link in root.findall("link"))}
     fixed = []
@@ -87,9 +87,7 @@ def translate(text: str, file: str, options: Options) -> Translation:
     missing = [name for name in motors if name not in joints]
     if missing:
         notes.append(f"name_mot names no joints of the URDF: {', '.join(missing)}")
-    ET.indent(root)
-    written = ET.tostring(root, encoding="unicode") + "\n"
-    return Translation(written, entries, tuple(notes), urdf_file=str(urdf_path))
+    return Translation(root, "", entries, tuple(notes), urdf_file=str(urdf_path))
 
 
 def _fault(file: str, element: str, problem: str, remedy: str) -> InputError:
@@ -173,7 +171,7 @@ def _urdf_beside(path: Path) -> Path:
 
 
 def _retype(joint: Element, name: str, kind: str, file: str) -> bool:
-    """Give ``joint`` the type that the YAML says; whether it is to be held instead."""
+    """Give ``joint`` the type in the YAML file; True if it is to be locked instead."""
     old = joint.get("type")
     if old not in REPLACEABLE:
         raise _fault(

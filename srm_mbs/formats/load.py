@@ -1,34 +1,31 @@
-"""``load``: from a bundled name or a file of any format to an assembled mechanism.
-
-The mechanisms that come with the package.
-
-``load``: from a bundled name or a file of any format to an assembled mechanism.
-"""
+"""``load``: from the name of a bundled mechanism, or a file of any format, to a mechanism."""
 
 from __future__ import annotations
 
 import json
 import logging
 import re
-import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import tomli_w
 
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.build import assembled, rebuild
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.generators import n_four_bar as _n_four_bar_texts
 from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
-from srm_mbs.formats.toml.description import Description, parse_description
-from srm_mbs.formats.toml.schema import LARGEST
+from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.model.mechanism import Mechanism, Source
+from srm_mbs.model.mechanism import Source
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array
 
 _GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
 
@@ -59,55 +56,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Overrides:
-    """What the caller of :func:`load` wants instead of what the file says; None: nothing."""
+    """Arguments of :func:`load` that replace values of the file; None: the file's."""
 
     gravity: Sequence[float] | None = None
     base: str | None = None
     cut: tuple[str, ...] = ()
 
 
-def read_text(path: Path) -> str:
-    """Text of a file.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is not UTF-8.
-    """
-    try:
-        return path.read_text(encoding="utf-8-sig")  # Windows editors put a mark first
-    except FileNotFoundError as error:
-        raise InputError(
-            "there is no such file", file=str(path), remedy="Check the path"
-        ) from error
-    except UnicodeDecodeError as error:
-        if path.suffix.lower() == ".npz":
-            raise InputError(
-                "it is not the file of a mechanism",
-                file=str(path),
-                remedy="Give a saved run to srm.load_solution, or to srm-mbs plot, play or report",
-            ) from error
-        raise InputError(
-            f"it is not UTF-8 text: {error}", file=str(path), remedy="Save it as UTF-8"
-        ) from error
-    except OSError as error:
-        raise InputError(
-            f"it cannot be read: {error.strerror}",
-            file=str(path),
-            remedy="Give the path of a readable file",
-        ) from error
-    except ValueError as error:  # a null character
-        raise InputError(
-            f"it is not a file name: {error}", file=repr(path), remedy="Correct the path"
-        ) from error
-
-
 def _gravity(value: Any) -> tuple[float, float, float]:
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        array = np.zeros(0)
-    if array.shape != (3,) or not (np.abs(array) <= LARGEST).all():
+    array = finite_array(value, (3,))
+    if array is None or not (np.abs(array) <= LARGEST_MAGNITUDE).all():
         raise InputError(
             f"gravity = {value!r} is not three finite numbers",
             element="gravity",
@@ -116,42 +74,46 @@ def _gravity(value: Any) -> tuple[float, float, float]:
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reading:
     """A file as it was read: what :mod:`srm_mbs.formats.build` takes.
 
     Attributes
     ----------
-    description, source
-        The parsed description, and the texts of it and of its URDF.
+    description, entries
+        The checked description, and its tables.
+    tree
+        Root element of its URDF; building the mechanism changes it.
+    source
+        The texts of both.
     notes
-        Sentences about what was approximated or ignored.
+        Sentences about approximations and ignored elements.
     """
 
     description: Description
+    entries: Mapping[str, Any]
+    tree: Element
     source: Source
     notes: tuple[str, ...] = ()
 
 
-def _reading(
-    own: str,
-    file: str,
+def _translated(
+    own: Document,
+    entries: Mapping[str, Any],
+    description: Description,
     found: Format,
-    text: str,
-    model_path: Path,
+    model: Document,
     overrides: Overrides,
 ) -> Reading:
-    """Translate ``text``, the file that the description ``own`` names, and merge the two."""
-    description = parse_description(own, file)
-    raw = tomllib.loads(own)
-    options = Options(overrides.cut or tuple(description.cut), raw)
-    translation = found.translate(text, str(model_path), options)
+    """Translate ``model``, the file that the description names, and merge the two."""
+    options = Options(overrides.cut or tuple(description.cut), entries)
+    translation = found.translate(model, options)
+    text = own.text
     if translation.entries or found.key != "urdf":
-        entries = merged(
-            tomllib.loads(own), translation.entries, model_path.with_suffix(".urdf").name
-        )
-        own = tomli_w.dumps(entries)
-        description = parse_description(own, file)
+        urdf_name = Path(model.file).with_suffix(".urdf").name
+        entries = merged(entries, translation.entries, urdf_name)
+        text = tomli_w.dumps(entries)
+        description = check_description(entries, own.file)
     base = overrides.base
     base = description.base if base is None else base
     if not isinstance(base, str) or base not in ROOT_JOINTS:
@@ -160,46 +122,51 @@ def _reading(
         )
     gravity = overrides.gravity
     source = Source(
-        description=own,
+        description=text,
         urdf=translation.urdf,
-        urdf_path=translation.urdf_file or str(model_path),
-        path=file,
+        urdf_path=translation.urdf_file or model.file,
+        path=own.file,
         base=base,
         gravity=_gravity(description.gravity if gravity is None else gravity),
         format=found.name,
     )
-    log.debug("%s: read as %s", model_path, found.name)
-    return Reading(description, source, translation.notes)
+    log.debug("%s: read as %s", model.file, found.name)
+    return Reading(description, entries, translation.tree, source, translation.notes)
 
 
-def _of_description(text: str, file: str, overrides: Overrides, urdf: str | None = None) -> Reading:
-    """Read a description given as text; the URDF is read from disk if it is None."""
-    description = parse_description(text, file)
+def _of_description(own: Document, overrides: Overrides, urdf: str | None = None) -> Reading:
+    """Read a description; its model file is read from disk unless ``urdf`` is its text."""
+    description = check_description(own.toml, own.file)
     key, name = description.model_file
-    path = Path(file).parent / name
-    if urdf is None:
+    path = Path(own.file).parent / name
+    if urdf is not None:
+        model = Document(urdf, str(path))
+    else:
         try:
-            urdf = read_text(path)
+            model = Document.read(path)
         except InputError as error:
             raise InputError(
                 f"the {key.upper()} {name!r} cannot be read ({error.problem}: {str(path)!r})",
-                file=file,
+                file=own.file,
                 element=key,
                 remedy="Check the path, which is relative to the description",
             ) from error
-    return _reading(text, file, of_key(key, path, urdf), urdf, path, overrides)
+    found = of_key(key, path, model)
+    return _translated(own, own.toml, description, found, model, overrides)
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:
     if path.is_dir():
         raise InputError("it is a directory", remedy="Give a file in it")
-    text, file = read_text(path), str(path)
-    found = find_format(path, text)
+    document = Document.read(path)
+    found = find_format(path, document)
     if found is DESCRIPTION:
-        return _of_description(text, file, overrides)
+        return _of_description(document, overrides)
+    entries = {"format": 1, "urdf": path.name}
     # A JSON string is a TOML string too.
-    own = f"format = 1\nurdf = {json.dumps(path.name)}\n"
-    return _reading(own, file, found, text, path, overrides)
+    own = Document(f"format = 1\nurdf = {json.dumps(path.name)}\n", document.file)
+    description = check_description(entries, own.file)
+    return _translated(own, entries, description, found, document, overrides)
 
 
 def read(name: str | Path, overrides: Overrides) -> Reading:
@@ -241,8 +208,8 @@ def load(
     ----------
     path
         Name of a bundled mechanism (:func:`bundled_models`; ``n_four_bar_<N>`` for any N), or a
-        file: a ``.toml`` description, or one of the formats of ``docs/formats.md``, which is
-        found out by its content.
+        file: a ``.toml`` description, or one of the formats of ``docs/formats.md``, recognised by
+        its content.
     gravity : (3,) m/s^2
         Instead of the file's.
     base
@@ -260,7 +227,7 @@ def load(
     """
     reading = read(path, Overrides(gravity, base, tuple(cut)))
     try:
-        return assembled(reading.description, reading.source, reading.notes)
+        return assembled(reading.description, reading.tree, reading.source, reading.notes)
     except InputError as error:
         raise error.located(reading.source.path) from error.__cause__
 
@@ -287,7 +254,7 @@ def _generated(n: int, overrides: Overrides) -> Reading:
             + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
         )
     text, urdf = _n_four_bar_texts(n)
-    return _of_description(text, f"n_four_bar_{n}, generated", overrides, urdf)
+    return _of_description(Document(text, f"n_four_bar_{n}, generated"), overrides, urdf)
 
 
 def n_four_bar(n: int) -> Mechanism:
@@ -303,7 +270,7 @@ def n_four_bar(n: int) -> Mechanism:
             f"an N-four-bar needs n >= 1, not {n!r}", element="n", remedy="Give a positive integer"
         )
     reading = _generated(int(n), Overrides())
-    return assembled(reading.description, reading.source)
+    return assembled(reading.description, reading.tree, reading.source)
 
 
 __all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]

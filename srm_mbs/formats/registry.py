@@ -1,26 +1,25 @@
-"""The table of formats: how each is recognised by its content, and who translates it.
+"""The table of formats: how each is recognised by its content, and the function that translates it.
 
 A new format is one more entry of :data:`FORMATS` and a function
-``translate(text, file, options) -> Translation``.
+``translate(document, options) -> Translation``.
 """
 
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from srm_mbs.errors import InputError
 from srm_mbs.formats import gepetto
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.mjcf import reader as mjcf
 from srm_mbs.formats.sdf import reader as sdf
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf import loops
-from srm_mbs.formats.xml import root_tag
 
-Translate = Callable[[str, str, Options], Translation]
+Translate = Callable[[Document, Options], Translation]
 
 
 @dataclass(frozen=True)
@@ -34,43 +33,43 @@ class Format:
     suffixes
         Of its files; they decide only where the content does not.
     recognises
-        Whether a file (path, text) is of this format, by its content.
+        Whether a document is of this format, by its content.
     translate
-        Text, file name for messages, and options to a translation; raises InputError.
+        Document and options to a translation; raises InputError.
     key
         Of a description that names such a file; empty if none does.
     """
 
     name: str
     suffixes: tuple[str, ...]
-    recognises: Callable[[Path, str], bool]
+    recognises: Callable[[Document], bool]
     translate: Translate
     key: str = ""
 
 
-def _rooted(tag: str) -> Callable[[Path, str], bool]:
+def _rooted(tag: str) -> Callable[[Document], bool]:
     """Whether the root element is ``tag``, in any namespace."""
-    return lambda _, text: (root_tag(text) or "").rsplit(":", 1)[-1] == tag
+    return lambda document: (document.root_tag or "").rsplit(":", 1)[-1] == tag
 
 
-def _is_description(_: Path, text: str) -> bool:
-    if not re.search(r"^\s*format\s*=", text, re.MULTILINE):
+def _is_description(document: Document) -> bool:
+    if not re.search(r"^\s*format\s*=", document.text, re.MULTILINE):
         return False
     try:
-        return "format" in tomllib.loads(text)
-    except (ValueError, RecursionError):
+        return "format" in document.toml
+    except InputError:
         return False
 
 
-def _own_words(text: str, file: str, options: Options) -> Translation:
+def _refuse_description(document: Document, options: Options) -> Translation:
     raise InputError(
-        "a description cannot stand for a model file",
-        file=file,
+        "a description cannot be the model file of another",
+        file=document.file,
         remedy="Give the description itself to srm.load",
     )
 
 
-DESCRIPTION = Format("TOML description", (".toml",), _is_description, _own_words)
+DESCRIPTION = Format("TOML description", (".toml",), _is_description, _refuse_description)
 FORMATS: tuple[Format, ...] = (
     DESCRIPTION,
     Format("URDF", (".urdf",), _rooted("robot"), loops.translate, key="urdf"),
@@ -80,7 +79,7 @@ FORMATS: tuple[Format, ...] = (
 )
 
 
-def find_format(path: Path, text: str) -> Format:
+def find_format(path: Path, document: Document) -> Format:
     """The format of a file: by its content or, failing that, its suffix.
 
     Raises
@@ -89,12 +88,12 @@ def find_format(path: Path, text: str) -> Format:
         If it is none that is read.
     """
     for found in FORMATS:
-        if found.recognises(path, text):
+        if found.recognises(document):
             return found
     for found in FORMATS:
         if path.suffix.lower() in found.suffixes:
             return found
-    tag = root_tag(text)
+    tag = document.root_tag
     what = f"a file with the root element <{tag}>" if tag else f"a file of type {path.suffix!r}"
     raise InputError(
         f"{what} is not of a format that is read",
@@ -103,7 +102,7 @@ def find_format(path: Path, text: str) -> Format:
     )
 
 
-def of_key(key: str, path: Path, text: str) -> Format:
+def of_key(key: str, path: Path, document: Document) -> Format:
     """The format of the file that a description names under ``key``.
 
     Raises
@@ -118,9 +117,9 @@ def of_key(key: str, path: Path, text: str) -> Format:
             element=key,
             remedy="Convert the file to one of the formats in docs/formats.md",
         )
-    tag = root_tag(text)
-    if not wanted.recognises(path, text):
-        other = next((known for known in FORMATS if known.recognises(path, text)), None)
+    tag = document.root_tag
+    if not wanted.recognises(document):
+        other = next((known for known in FORMATS if known.recognises(document)), None)
         if other is not None:
             raise InputError(
                 f"{path.name!r} is a {other.name}, not a {wanted.name}",

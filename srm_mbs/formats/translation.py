@@ -1,7 +1,7 @@
-"""What every reader of another format makes: a URDF tree and the entries of our description.
+"""The common form of all formats: a description and a tree of links and joints.
 
-The readers translate; from there on one path leads to the mechanism, whatever the file was, and
-``srm-mbs convert`` writes just this.
+Every reader makes a :class:`Translation`; from there one path leads to the mechanism
+(:mod:`srm_mbs.formats.build`), and ``srm-mbs convert`` writes both as text.
 """
 
 from __future__ import annotations
@@ -9,50 +9,60 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+from xml.etree.ElementTree import Element, indent, tostring
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user wants of a translation.
+    """Wishes of the user about a translation.
 
     Attributes
     ----------
     cut
         Names of the joints at which loops of a graph of joints are to be cut.
     own
-        The description that names the file, as ``tomllib`` gives it; empty if none does.
+        The tables of the description that names the file; empty if none does.
     """
 
     cut: tuple[str, ...] = ()
     own: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Translation:
-    """A file of another format in ours.
+    """A file of any format as a tree and the tables of a description.
 
     Attributes
     ----------
+    tree
+        Root element of a URDF without loops, in the dialect of ``docs/formats.md``; building the
+        mechanism changes it.
     urdf
-        Text of a URDF without loops, in the dialect of ``docs/formats.md``.
+        Its text, by default that of ``tree``.
     entries
-        Keys and values of a description (:mod:`srm_mbs.formats.toml.description`) as ``tomllib``
-        would give them: ``loop``, ``force``, ``initial``, ``base``, ``gravity``, ...; without
-        ``format`` and ``urdf``.
+        Keys and values of a description (:mod:`srm_mbs.formats.toml.schema`) as ``tomllib`` would
+        give them: ``loop``, ``force``, ``initial``, ``base``, ``gravity``, ...; without ``format``
+        and ``urdf``.
     notes
-        Sentences about what was approximated or ignored, and why.
+        Sentences about approximations and ignored elements, with the reason.
     urdf_file
         The file that the URDF came from, if it is another one than that translated.
     """
 
-    urdf: str
+    tree: Element
+    urdf: str = ""
     entries: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
 
+    def __post_init__(self) -> None:
+        if not self.urdf:
+            indent(self.tree)
+            object.__setattr__(self, "urdf", tostring(self.tree, encoding="unicode") + "\n")
+
 
 LISTS = ("lock", "loop", "force", "drive")
-"""Keys of which a description and the file that it names both give some: all of them count."""
+"""Keys whose lists in a description and in the file that it names are joined."""
 TABLES = ("simulation",)
 """Tables that are merged key by key."""
 MODEL_KEYS = ("urdf", "sdf", "mjcf")

@@ -1,6 +1,6 @@
-"""XML of unknown origin: read without entities or external references.
+"""XML of unknown origin, read without entities or external references.
 
-Numbers, words and known names in XML, with errors that name file, element and remedy.
+Numbers, words and known names in it, with errors that name file, element and remedy.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from defusedxml import ElementTree as SafeTree
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.formats.toml.schema import LARGEST
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
@@ -31,26 +31,34 @@ ACTING = (
     "coupling",
     "tendon",
 )
-"""Words in the names of other tools' elements that tell that they act, such as
-``drake:rotor_inertia``."""
-DEEPEST = 300
-"""Most elements in each other."""
+"""Words in the names of other tools' elements that act, such as ``drake:rotor_inertia``."""
+LARGEST_NESTING = 300
+"""Largest depth of nested elements."""
 NAMESPACED = re.compile(r"\{[^}]*\}")
 
 
-class XmlValues:
-    """Reads values of one file; counts what it ignores.
+def parse_numbers(text: str, largest: float = LARGEST_MAGNITUDE) -> list[float] | None:
+    """The numbers in ``text``, separated by spaces; None if there is anything else, or a magnitude
+    above ``largest``."""
+    parts = text.split()
+    if not all(map(NUMBER.fullmatch, parts)):
+        return None
+    values = [float(part) for part in parts]
+    return values if all(abs(value) <= largest for value in values) else None
+
+
+class XmlFile:
+    """One XML file for messages: its faults, and a count of what is ignored in it.
 
     Parameters
     ----------
     file
-        Its name, for messages.
+        Its name.
     """
 
     def __init__(self, file: str) -> None:
         self.file = file
         self._ignored: dict[str, int] = {}
-        self._remarks: dict[str, list[str]] = {}
 
     def fault(self, where: str, problem: str, remedy: str) -> InputError:
         """The error to raise about the element ``where``."""
@@ -60,19 +68,58 @@ class XmlValues:
         """Count something that is left out knowingly, as ``<sensor> element``."""
         self._ignored[what] = self._ignored.get(what, 0) + 1
 
+    def ignored_notes(self) -> tuple[str, ...]:
+        """One sentence for each kind of thing that was ignored."""
+        return tuple(
+            f"{count} {what}(s) do not act and are ignored" for what, count in self._ignored.items()
+        )
+
+    def attribute_numbers(
+        self,
+        node: Element,
+        key: str,
+        count: int,
+        where: str,
+        largest: float = LARGEST_MAGNITUDE,
+    ) -> list[float]:
+        """``count`` finite numbers of attribute ``key``, which is rewritten in one form.
+
+        Raises
+        ------
+        InputError
+            If the attribute is missing or anything else.
+        """
+        text = node.get(key)
+        values = parse_numbers(text or "", largest)
+        if values is None or len(values) != count:
+            tag = node.tag.rsplit("}", 1)[-1]
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
+            raise self.fault(
+                where,
+                f"<{tag}> has no {key!r}"
+                if text is None
+                else f"<{tag} {key}={text!r}> is not {wanted}",
+                f"Write {wanted}",
+            )
+        node.set(key, " ".join(map(repr, values)))
+        return values
+
+
+class XmlValues(XmlFile):
+    """Reads values of one SDF or MJCF file; counts what it ignores."""
+
+    def __init__(self, file: str) -> None:
+        super().__init__(file)
+        self._remarks: dict[str, list[str]] = {}
+
     def remark(self, what: str, where: str) -> None:
-        """Note what was assumed or approximated at ``where``; one sentence lists the places."""
+        """Note an assumption or approximation at ``where``; one sentence lists all places."""
         self._remarks.setdefault(what, []).append(where)
 
     def notes(self) -> tuple[str, ...]:
         """One sentence for each kind of thing that was assumed or ignored."""
-        return (
-            *(f"{what}: {', '.join(where)}" for what, where in self._remarks.items()),
-            *(
-                f"{count} {what}(s) do not act and are ignored"
-                for what, count in self._ignored.items()
-            ),
-        )
+        remarks = (f"{what}: {', '.join(where)}" for what, where in self._remarks.items())
+        return (*remarks, *self.ignored_notes())
 
     def numbers(
         self, text: str | None, count: int | Sequence[int], where: str, what: str
@@ -85,14 +132,14 @@ class XmlValues:
             Saying what stands there instead, if it is anything else.
         """
         counts = (count,) if isinstance(count, int) else tuple(count)
-        parts = (text or "").split()
-        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
-        if len(values) not in counts or not all(abs(value) <= LARGEST for value in values):
+        values = parse_numbers(text or "")
+        if values is None or len(values) not in counts:
             wanted = " or ".join(
                 "a finite number" if n == 1 else f"{n} finite numbers" for n in counts
             )
-            shown = "nothing" if text is None or not parts else repr(" ".join(parts)[:60])
-            raise self.fault(where, f"{what} is {shown}, not {wanted}", f"Write {wanted}")
+            parts = (text or "").split()
+            given = repr(" ".join(parts)[:60]) if parts else "nothing"
+            raise self.fault(where, f"{what} is {given}, not {wanted}", f"Write {wanted}")
         return np.array(values)
 
     def limit(self, text: str, where: str, what: str) -> float:
@@ -120,10 +167,10 @@ class XmlValues:
         """Refuse elements in each other deeper than the readers, which recurse, can follow."""
         level, depth = [root], 0
         while level:
-            if depth > DEEPEST:
+            if depth > LARGEST_NESTING:
                 raise self.fault(
                     f"<{level[0].tag}>",
-                    f"more than {DEEPEST} elements are nested",
+                    f"more than {LARGEST_NESTING} elements are nested",
                     "Write such a long chain as a URDF, which is flat",
                 )
             level = [child for node in level for child in node]
@@ -208,7 +255,7 @@ def root_tag(text: str) -> str | None:
     return match[1] if match else None
 
 
-def parse_urdf(text: str, file: str) -> Element:
+def parse_xml(text: str, file: str) -> Element:
     """Root element of ``text``.
 
     Raises
@@ -222,7 +269,7 @@ def parse_urdf(text: str, file: str) -> Element:
         # Drake's own reader takes <drake:...> without a declaration; expat does not.
         declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
         if declared != text:
-            return parse_urdf(declared, file)
+            return parse_xml(declared, file)
         raise InputError(
             f"this is not well-formed XML: {error}", file=file, remedy="Correct the file there"
         ) from error

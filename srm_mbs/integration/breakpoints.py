@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.dynamics.system import System
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.near_singular import ROUNDING, ZONE_LARGEST
-from srm_mbs.integration.singular_endpoints import LOOK, arrive, start
+from srm_mbs.integration.singular_endpoints import NEAR_SINGULAR_SIGMA, singular_arrival, start
 
 APART = 2e-14
 """Breakpoints closer to each other than this fraction of the run are one: no step is that short."""
@@ -113,7 +113,7 @@ def direct_from(memory: IntegratorState, norm: ErrorNorm, span: float, nv: int) 
     error = np.zeros(2 * nv)
     turning = 3.0 * memory.sigma_slope**2 * norm.one[:nv]
     error[nv:] = span * ROUNDING * (np.abs(memory.rate[nv:]) + turning)
-    weighed = norm(error, norm.weights(memory.magnitude))
+    weighed = norm(error, norm.weights(memory.state_scale))
     return min(ZONE_LARGEST, float(np.sqrt(weighed / ALLOWED)))
 
 
@@ -123,16 +123,16 @@ class SingularProximity:
     Attributes
     ----------
     looked
-        Half the sigma at which that was done last; LOOK far away.
+        Half the sigma at which that was done last; NEAR_SINGULAR_SIGMA far away.
     """
 
     def __init__(self) -> None:
-        self.looked = LOOK
+        self.looked = NEAR_SINGULAR_SIGMA
 
     def matters(self, fresh: IntegratorState, norm: ErrorNorm, span: float, nv: int) -> bool:
         """Whether for ``fresh``, at the start of a piece of length ``span`` (s)."""
-        if fresh.sigma >= LOOK:
-            self.looked = LOOK
+        if fresh.sigma >= NEAR_SINGULAR_SIGMA:
+            self.looked = NEAR_SINGULAR_SIGMA
         if not fresh.sigma < self.looked or not fresh.sigma < direct_from(fresh, norm, span, nv):
             return False
         self.looked = CLOSER * fresh.sigma
@@ -140,7 +140,7 @@ class SingularProximity:
 
 
 def beside_singular(
-    system: OpenSystem | ClosedSystem,
+    system: System,
     method: Method,
     t: float,
     state: FloatArray,
@@ -182,13 +182,13 @@ class BreakpointHandler:
     sample
         Called with (t, state) at the marked breakpoints, before anything is evaluated there.
     arrivals
-        Whether :meth:`arrive` can do anything.
+        Whether :meth:`singular_arrival` can do anything.
     """
 
     def __init__(
         self,
         pieces: SmoothIntervals,
-        system: OpenSystem | ClosedSystem,
+        system: System,
         method: Method,
         norm: ErrorNorm,
         evaluator: Any = None,
@@ -197,9 +197,9 @@ class BreakpointHandler:
         self._system = system
         self._method = method
         self._norm = norm
-        self._evaluator = system if evaluator is None else evaluator
+        self._evaluator: Any = system if evaluator is None else evaluator
         self.sample: Callable[[float, FloatArray], None] | None = None
-        self.arrivals = isinstance(system, ClosedSystem)
+        self.arrivals = system.singularities is not None
         self._index = 0
         self._nearness = SingularProximity()
         self._evaluate_within(0)
@@ -238,7 +238,7 @@ class BreakpointHandler:
         """
         self.enter(self._index + 1, t, state)
         fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
-        if self._nearness.matters(fresh, self._norm, self.end - t, self._system.nv):
+        if self._nearness.matters(fresh, self._norm, self.end - t, self._system.multiplier_size):
             return self._resolved(t, state, fresh)
         return fresh
 
@@ -259,18 +259,19 @@ class BreakpointHandler:
             self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
         )
 
-    def arrive(
+    def singular_arrival(
         self, t: float, state: FloatArray, memory: IntegratorState, index: int | None = None
     ) -> IntegratorState:
         """``memory`` with the multipliers known up to the end of the piece, which lies beside a
-        singular configuration; see :func:`~srm_mbs.integration.singular_endpoints.arrive`.
+        singular configuration; see
+        :func:`~srm_mbs.integration.singular_endpoints.singular_arrival`.
 
         ``index``: of that piece, if the kernel went on to it by itself.
         """
         if index is not None and index != self._index:
             self._index = index
             self._evaluate_within(index)
-        return arrive(self._system, t, state, memory, self._norm, self.end)
+        return singular_arrival(self._system, t, state, memory, self._norm, self.end)
 
     def done(self) -> None:
         """The run is over: the system may be evaluated at any time."""

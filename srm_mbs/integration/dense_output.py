@@ -42,7 +42,7 @@ SLACK = 1e-12
 """Part of the time up to which a run is read beyond its ends, for rounding."""
 
 
-def times_to_read(t: Any, *, scalar: bool = False) -> FloatArray:
+def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
     """``t`` (s) as a new array (k,), or () where a ``scalar`` is allowed.
 
     Raises
@@ -449,7 +449,7 @@ class DenseOutput:
         return np.vstack([rates, self._extra[step]])
 
 
-def wound_angles(
+def unwrapped_angles(
     joint: Any, nq: int, steps: StepData, scheme: ButcherTableau, t: FloatArray, states: FloatArray
 ) -> FloatArray:
     """Angle (n,) rad of a (cos, sin) joint at ``t``, followed through every step of the run.

@@ -1,10 +1,11 @@
-"""The one driver: propose a step, make it, judge it, record it."""
+"""The driver: propose a step, make it, decide on it, record it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
@@ -15,53 +16,53 @@ from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop
+from srm_mbs.integration.messages import (
+    DAE,
+    MECHANISM,
+    ProblemVocabulary,
+    RunFailure,
+    StopReason,
+    failure_message,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
+__all__ = ["DAE", "MECHANISM", "RunRecord", "RunStatus", "integrate"]
+
 SMALLEST_STEP = 1e-14
-"""Steps shorter than this fraction of the run, or than round-off of t, end it."""
-
-
+"""Shortest step, over the length of the run."""
 WATCHED_STEPS = 5000
+"""Steps over which the progress of a run is measured."""
 STANDSTILL = 1e-6
-"""A run that covers less than this part of itself in WATCHED_STEPS steps would need more than
-5e9 of them."""
+"""Part of the run that WATCHED_STEPS steps must cover: a slower one would need 5e9 steps."""
 LARGE_CORRECTION = 1e-3
-"""Below this an end correction closes the loops to its square: nothing to look at."""
-OPEN = 1e-9
-"""Closure error before a correction, in row units, from which it is looked at whether the
-correction closes it."""
-LOST = 1e-2
-"""Closure error after the correction, in row units, from which a run is meaningless."""
-
-BELOW_ROUND_OFF = "a step this short is below the round-off of the time"
-NOT_FINITE = "the state is no longer finite"
+"""Correction at the end of a step, over the unit of the tolerance, from which the closures are
+examined; a smaller one closes them to its square."""
+RESIDUAL_EXAMINED = 1e-9
+"""Constraint residual before a correction, in row units, from which the closures are examined."""
+LARGEST_RESIDUAL = 1e-2
+"""Constraint residual after the correction, in row units, from which a run is meaningless."""
 
 
-@dataclass(frozen=True)
-class ProblemVocabulary:
-    """What messages call the problem: what is singular, what drives it, what to check."""
+class RunStatus(StrEnum):
+    """How a run ended.  Equal to, and printed as, the string of its value."""
 
-    singular: str
-    forces: str
-    goes_on: str
+    RUNNING = "running"
+    FINISHED = "finished"
+    EVENT = "event"
+    """A terminal event ended it."""
+    INTERRUPTED = "interrupted"
+    """By Ctrl-C."""
+    FAILED = "failed"
+    """It could not continue, or a function of the user raised."""
 
-
-MECHANISM = ProblemVocabulary(
-    "The closures are close to a singular configuration",
-    "what acts on the mechanism",
-    "the mechanism can move on from there (solution.q[-1])",
-)
-DAE = ProblemVocabulary(
-    "G B is almost singular there",
-    "its right-hand side",
-    "the problem has a solution from there on (solution.x[-1])",
-)
+    def __repr__(self) -> str:
+        return repr(self.value)
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A step that did not stand: where it started, its length, its error ratio, and why."""
+    """A step that was not accepted: its start, its length, its error ratio, and the decision."""
 
     t: float
     h: float
@@ -78,7 +79,7 @@ class RunRecord:
     Attributes
     ----------
     t0, x0
-        Where it started.
+        Start of the run (s), and the state there (nx,).
     steps
         Accepted steps in order.
     times
@@ -86,7 +87,10 @@ class RunRecord:
     attempts
         Steps that were rejected or redone.
     status
-        ``running``, ``finished``, ``event``, ``interrupted`` or ``failed``.
+        How it ended.
+    stop_reason
+        Of a failed run, why no further step could be made; None where a function of the user
+        raised.
     message
         When, why, and what to try.
     stop
@@ -100,28 +104,45 @@ class RunRecord:
     steps: list[StepResult] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
-    status: str = "running"
+    status: RunStatus = RunStatus.RUNNING
+    stop_reason: StopReason | None = None
     message: str = ""
     stop: float | None = None
     wall_time: float = 0.0
     breaks: list[int] = field(default_factory=list)
 
-    def finished(self, t_end: float) -> None:
+    def mark_finished(self, t_end: float) -> None:
         """Mark it as complete."""
-        self.status = "finished"
+        self.status = RunStatus.FINISHED
         self.message = f"The run reached t = {t_end:.6g} s."
 
-    def ended(self, stop: Stop) -> None:
+    def mark_stopped(self, stop: Stop) -> None:
         """Mark it as ended by a terminal event."""
-        self.status, self.stop, self.message = "event", stop.time, stop.message
+        self.status, self.stop, self.message = RunStatus.EVENT, stop.time, stop.message
 
     def mark_aborted(self, t: float, error: BaseException) -> None:
-        """Mark it as interrupted, or failed because a function of the user did, at ``t``."""
+        """Mark it as interrupted, or failed because a function of the user raised, at ``t``."""
         kept = "verything up to there is kept."
         if isinstance(error, KeyboardInterrupt):
-            self.status, self.message = "interrupted", f"Interrupted at t = {t:.6g} s; e{kept}"
+            self.status = RunStatus.INTERRUPTED
+            self.message = f"Interrupted at t = {t:.6g} s; e{kept}"
         else:
-            self.status, self.message = "failed", f"Stopped at t = {t:.6g} s: {error}. E{kept}"
+            self.status = RunStatus.FAILED
+            self.message = f"Stopped at t = {t:.6g} s: {error}. E{kept}"
+
+    def mark_failed(
+        self,
+        failure: RunFailure,
+        t: float,
+        h: float,
+        sigma: float,
+        adaptive: bool,
+        words: ProblemVocabulary = MECHANISM,
+    ) -> None:
+        """Mark it as failed at ``t`` (s); parameters as for
+        :func:`~srm_mbs.integration.messages.failure_message`."""
+        self.status, self.stop_reason = RunStatus.FAILED, failure.reason
+        self.message = failure_message(failure, t, h, sigma, adaptive, words)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
@@ -162,7 +183,7 @@ def integrate(
     Parameters
     ----------
     system, method, control, norm
-        What is integrated, how, with which step-size control and error norm.
+        The equations, the one-step method, the step-size control and the error norm.
     memory
         From ``method.start`` at ``state``.
     state
@@ -172,11 +193,11 @@ def integrate(
     tick
         Called after every accepted step.
     events
-        Looks for events in every accepted step.
+        Finds events in every accepted step.
     breakpoints
         Where the right-hand side is not smooth; None if it is.
     words
-        What the message of a failure calls the problem.
+        How the message of a failure names the problem.
 
     Returns
     -------
@@ -185,11 +206,10 @@ def integrate(
         ``interrupted`` (Ctrl-C), with everything computed so far.
     """
     record = RunRecord(t0, state.copy())
-    smallest = SMALLEST_STEP * abs(t_end - t0)
     started = time.perf_counter()
     closures = Closures(system, norm)
     t, x = t0, state
-    trouble = ""
+    unevaluated: RunFailure | None = None
     redone = False
     if breakpoints is not None:
         control.set_target_time(breakpoints.end)
@@ -201,41 +221,36 @@ def integrate(
                 record.breaks.append(len(record.times))
                 memory = breakpoints.next(t, x, memory)
                 control.set_target_time(breakpoints.end)
-            limit = min(max_step, system.step_limit(x))
-            proposal = control.propose(t, limit, memory)
-            if proposal.arriving and breakpoints is not None:
-                memory = breakpoints.arrive(t, x, memory)
+            proposal = control.propose(t, min(max_step, system.step_limit(x)), memory)
+            if proposal.singular_arrival and breakpoints is not None:
+                memory = breakpoints.singular_arrival(t, x, memory)
                 continue
             h = proposal.h
-            if not h > max(smallest, 4.0 * np.spacing(abs(t))):
-                if not (record.attempts and record.attempts[-1].t == t):
-                    trouble = BELOW_ROUND_OFF
-                fail(record, t, h, memory, trouble, control.adaptive, words)
-                break
-            if len(record.times) % WATCHED_STEPS == 0 and _stands_still(record, t, t_end):
-                covered = t - record.times[-WATCHED_STEPS]
-                fail(record, t, h, memory, standstill(covered, words), control.adaptive, words)
+            failure = _no_further_step(record, t, h, t_end, unevaluated, words)
+            if failure is not None:
+                record.mark_failed(failure, t, h, memory.sigma, control.adaptive, words)
                 break
             result: StepResult | None
             try:
                 result = method.step(system, t, h, x, memory, norm)
             except EvaluationError as error:
                 result = None
-                trouble = str(error)
-            verdict = control.decide(proposal, result)
+                unevaluated = RunFailure(StopReason.NOT_EVALUATED, str(error))
+            decision = control.decide(proposal, result)
             placement = "redone" if redone else "a priori" if proposal.placed else ""
-            redone = verdict is StepDecision.REPLACED
-            if verdict is not StepDecision.ACCEPTED or result is None:
+            redone = decision is StepDecision.REPLACED
+            if decision is not StepDecision.ACCEPTED or result is None:
                 ratio = np.inf if result is None else result.error_ratio
-                record.attempts.append(Attempt(t, h, ratio, verdict))
-                if not control.adaptive and verdict is StepDecision.REJECTED:
-                    fail(record, t, h, memory, trouble or NOT_FINITE, False, words)
+                record.attempts.append(Attempt(t, h, ratio, decision))
+                if not control.adaptive and decision is StepDecision.REJECTED:
+                    failure = unevaluated or RunFailure.of(StopReason.NOT_FINITE)
+                    record.mark_failed(failure, t, h, memory.sigma, False, words)
                     break
                 continue
-            trouble = ""
-            reason = closures.trouble(result)
-            if reason:
-                fail(record, t, h, memory, reason, control.adaptive, words)
+            unevaluated = None
+            failure = closures.failure(result)
+            if failure is not None:
+                record.mark_failed(failure, t, h, memory.sigma, control.adaptive, words)
                 break
             result.placement = placement
             method.accept(memory, result)
@@ -244,12 +259,12 @@ def integrate(
             record.steps.append(result)
             stop = None if events is None else events.after_step(start, result, t)
             if stop is not None:
-                record.ended(stop)
+                record.mark_stopped(stop)
                 break
             if tick is not None:
                 call_progress(tick, t, h, x)
         else:
-            record.finished(t_end)
+            record.mark_finished(t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
         record.mark_aborted(t, error)
     # An interrupt between the two appends would leave one list longer.
@@ -259,23 +274,41 @@ def integrate(
     return record
 
 
-def standstill(covered: float, words: ProblemVocabulary = MECHANISM) -> str:
-    """What is wrong where WATCHED_STEPS steps covered only ``covered`` (s)."""
-    return (
+def _no_further_step(
+    record: RunRecord,
+    t: float,
+    h: float,
+    t_end: float,
+    unevaluated: RunFailure | None,
+    words: ProblemVocabulary,
+) -> RunFailure | None:
+    """Why the run cannot continue from ``t`` with a step ``h`` (s); None if it can.
+
+    ``unevaluated``: why the last attempt could not be evaluated.
+    """
+    if not h > max(SMALLEST_STEP * abs(t_end - record.t0), 4.0 * np.spacing(abs(t))):
+        if not (record.attempts and record.attempts[-1].t == t):
+            return RunFailure.of(StopReason.ROUND_OFF)
+        return unevaluated or RunFailure.of(StopReason.ERROR_ESTIMATE)
+    made = len(record.times)
+    if made >= WATCHED_STEPS and made % WATCHED_STEPS == 0:
+        covered = t - record.times[-WATCHED_STEPS]
+        if covered < STANDSTILL * (t_end - record.t0):
+            return standstill(covered, words)
+    return None
+
+
+def standstill(covered: float, words: ProblemVocabulary = MECHANISM) -> RunFailure:
+    """The failure of a run whose last WATCHED_STEPS steps covered only ``covered`` (s)."""
+    return RunFailure(
+        StopReason.STANDSTILL,
         f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; {words.forces} changes too "
-        "fast or is not smooth"
+        "fast or is not smooth",
     )
 
 
-def _stands_still(record: RunRecord, t: float, t_end: float) -> bool:
-    """Whether the last steps covered so little that the run would never end."""
-    if len(record.times) < WATCHED_STEPS:
-        return False
-    return t - record.times[-WATCHED_STEPS] < STANDSTILL * (t_end - record.t0)
-
-
 def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
-    """Call ``tick`` with a copy of ``x``; what it raises must not lose the run."""
+    """Call ``tick`` with a copy of ``x``; an exception of it does not lose the run."""
     try:
         tick(t, h, x.copy())
     except Exception as error:
@@ -283,65 +316,31 @@ def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
 
 
 class Closures:
-    """Looks at whether the loops stay closed; almost always without computing anything."""
+    """Examines whether the loops stay closed; almost always without computing anything."""
 
     def __init__(self, system: System, norm: ErrorNorm) -> None:
         self._system = system
         self._large = LARGE_CORRECTION * norm.one
-        self._seen = OPEN
+        self._examined = RESIDUAL_EXAMINED
 
-    def trouble(self, result: StepResult) -> str:
-        """What is wrong with the closures at the end of a step; empty if nothing is."""
+    def failure(self, result: StepResult) -> RunFailure | None:
+        """Why the closures at the end of a step do not hold; None if they do."""
+        residual = result.constraint_residual
         # Far from everything singular, a step within the tolerance has a correction to match.
-        if result.quiet and 0.0 < result.error_ratio <= 1.0 and result.gap <= self._seen:
-            return ""
+        if result.quiet and 0.0 < result.error_ratio <= 1.0 and residual <= self._examined:
+            return None
         if not result.correction.size:
-            return ""
-        large = not (np.abs(result.correction) < self._large).all() or not result.gap < LOST
+            return None
+        large = not (np.abs(result.correction) < self._large).all()
+        large = large or not residual < LARGEST_RESIDUAL
         # With every structural row in use the correction closes all rows, or the rank is wrong.
-        unused = result.zone is None and result.gap > 2.0 * self._seen
+        unused = result.zone is None and residual > 2.0 * self._examined
         if not (large or unused):
-            return ""
-        gap = self._system.closure_gap(result.t + result.h, result.state)
-        if not gap < LOST:
-            return "the step is so long that the loops come apart"
-        if unused and gap > 0.5 * result.gap:
-            return (
-                "closures that seemed to follow from the others open: no motion was found that "
-                "keeps all loops closed and follows all drives, the mechanism is locked there"
-            )
-        self._seen = max(self._seen, result.gap)
-        return ""
-
-
-def fail(
-    record: RunRecord,
-    t: float,
-    h: float,
-    memory: IntegratorState,
-    trouble: str,
-    adaptive: bool,
-    words: ProblemVocabulary = MECHANISM,
-) -> None:
-    """Mark ``record`` as failed at ``t`` with the step ``h`` and say why.
-
-    Parameters
-    ----------
-    memory
-        At ``t``.
-    trouble
-        Why; empty if no step was short enough for the error estimate.
-    adaptive
-        Whether steps follow a tolerance.
-    words
-        What the message calls the problem.
-    """
-    record.status = "failed"
-    reason = trouble or "the error estimate stays above the tolerance however small the step"
-    close = memory.sigma < 0.05
-    near = f" {words.singular} (sigma = {memory.sigma:.1e})." if close else ""
-    record.message = (
-        f"Stopped at t = {t:.6g} s with step {h:.1e} s: {reason}.{near} "
-        f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
-        f"tableau, or check that {words.goes_on}."
-    )
+            return None
+        left = self._system.constraint_residual(result.t + result.h, result.state)
+        if not left < LARGEST_RESIDUAL:
+            return RunFailure.of(StopReason.LOOPS_APART)
+        if unused and left > 0.5 * residual:
+            return RunFailure.of(StopReason.LOCKED)
+        self._examined = max(self._examined, residual)
+        return None

@@ -3,7 +3,10 @@ r"""Events: zeros of functions of time and state, located on the dense output of
 The conventions are those of ``scipy.integrate.solve_ivp``: an event is a callable that returns a
 float; it occurs where that float passes zero; its attribute ``terminal`` (a bool, or a number of
 occurrences) ends the run there, and ``direction`` (> 0 or < 0) counts only zeros passed upwards or
-downwards.  Four points are settled where SciPy leaves them open:
+downwards.  An attribute ``action`` is called at every occurrence that does not end the run
+(:mod:`srm_mbs.simulation.segmented_run`).  :func:`prepare_events` reads these attributes, and
+nothing else does: it makes an :class:`EventFunction` of every callable.  Four points are settled
+where SciPy leaves them open:
 
 * A step is examined at as many equal parts of its dense output as that has polynomial degree
   (3 to 7), and, where the parabola through three neighbouring values comes near zero, at its
@@ -14,11 +17,11 @@ downwards.  Four points are settled where SciPy leaves them open:
 * A zero on the boundary of two steps is one event, passed in the direction in which it was
   reached.
 * A terminal event ends the run with the state of the dense output there; other events are kept up
-  to and including that time.  Those within round-off of it are at that time: what happens at once,
-  by symmetry, has times that differ by rounding, and a run that goes on from there would not count
-  them.
+  to and including that time.  Those within round-off of it are at that time: events that occur at
+  once, by symmetry, have times that differ by rounding, and a run that continues from there would
+  not count them.
 
-The machinery works on states, for mechanisms and DAEs alike::
+The search works on states, for mechanisms and DAEs alike::
 
     watch = EventWatch(system, scheme, prepare_events(events, adapt), state.size)
     record = integrate(..., events=watch)
@@ -33,7 +36,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -46,59 +49,65 @@ from srm_mbs.integration.dense_output import DenseOutput, step_data
 from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
-TOGETHER = 1e-10
-"""A zero within this fraction of the first step after the start counts as lying on it, and within
-this fraction of the last step after the end of a run as lying there."""
-ROUNDING = 16.0 * float(np.finfo(float).eps)
-"""The same over the time itself: two equal zeros come out of the search up to 8 eps each apart."""
-RETURNS = 30
+SAME_TIME_STEP = 1e-10
+"""Times closer than this part of the step are one: a zero so close after the start of a run lies
+on it, and zeros so close after a terminal event lie there."""
+SAME_TIME_ROUNDING = 16.0 * float(np.finfo(float).eps)
+"""The same, over the time itself: the search finds each of two equal zeros to 8 eps."""
+MAX_HALVINGS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
-NEAR_ZERO = 0.5
-"""A vertex is examined if it is nearer to zero than this fraction of its neighbours."""
+VERTEX_VALUE = 0.5
+"""Value of a parabola's vertex, over the smallest of its three values, below which the event is
+evaluated there."""
 
 
 StateFunction = Callable[[float, FloatArray], Any]
 """(t, state) -> a float that passes zero at the event."""
 
 
-def together(t: float, t_new: float) -> float:
-    """Times within the step from ``t`` to ``t_new`` that are closer than this (s) are one."""
-    return max(TOGETHER * (t_new - t), ROUNDING * max(abs(t), abs(t_new)))
+def same_time(t: float, t_new: float) -> float:
+    """Distance (s) below which two times within the step from ``t`` to ``t_new`` are one."""
+    return max(SAME_TIME_STEP * (t_new - t), SAME_TIME_ROUNDING * max(abs(t), abs(t_new)))
 
 
 @dataclass(frozen=True)
 class EventFunction:
-    """An event function and its attributes.
+    """An event function and everything that a run needs to know of it.
 
     Attributes
     ----------
     name
-        How messages call it: the function's name, or its place in the list.
+        Its name in messages: the function's own, or its place in the list.
     function
-        Of (t, state).
+        Of (t, state); before :func:`prepare_events` adapts it, as the user gives it.
     occurrences
         Number of occurrences that ends the run; infinite if it is not terminal.
     direction
         > 0 for zeros passed upwards, < 0 downwards, 0 for both.
+    action
+        Called at each occurrence that does not end the run, with the arguments of the function as
+        the user gives it; None without one.
     acts
-        Whether every occurrence ends the run, because something is to be done there.
+        Whether every occurrence ends the run, or its segment, for the sake of an action.
     departs
         Whether the run starts at an occurrence, from where the value moves away.
     floor
         Size of values that count as zero: of an event that closures hold at zero, the rounding.
-    guard
-        Time after the start of the run up to which a zero lies on it; None for :func:`together`
-        of the first step.  In a segment of a run 0 for zeros that its predecessor did not count.
+    start_tolerance
+        Time (s) after the start of the run up to which a zero lies on it; None for
+        :func:`same_time` of the first step.  In a segment of a run 0 for zeros that its predecessor
+        did not count.
     """
 
     name: str
     function: StateFunction
     occurrences: float
     direction: float
+    action: Callable[..., Any] | None = None
     acts: bool = False
     departs: bool = False
     floor: float = 0.0
-    guard: float | None = None
+    start_tolerance: float | None = None
 
     def __call__(self, t: float, state: FloatArray) -> float:
         """The value at ``t``; ``state`` must not be needed any more, the user may write to it.
@@ -131,12 +140,13 @@ class EventFunction:
 def prepare_events(
     events: Any, adapt: Callable[[Callable[..., Any]], StateFunction]
 ) -> list[EventFunction]:
-    """Events from what a user gives: a callable, or a list of them.
+    """The event functions of a run, from a callable of the user or a list of them.
 
     Parameters
     ----------
     events
-        With the attributes ``terminal`` and ``direction``, both optional.
+        Callables with the attributes ``terminal``, ``direction`` and ``action``, all optional; an
+        :class:`EventFunction` whose function is still as the user gives it keeps its properties.
     adapt
         Makes a function of (t, state) of each callable.
 
@@ -148,12 +158,15 @@ def prepare_events(
     given: Sequence[Any] = [events]
     if not callable(events):
         given = list(events) if isinstance(events, Iterable) else given
-    return [_prepared(event, i, adapt) for i, event in enumerate(given)]
+    prepared = [
+        event if isinstance(event, EventFunction) else _event_function(event, i)
+        for i, event in enumerate(given)
+    ]
+    return [replace(event, function=adapt(event.function)) for event in prepared]
 
 
-def _prepared(
-    event: Any, i: int, adapt: Callable[[Callable[..., Any]], StateFunction]
-) -> EventFunction:
+def _event_function(event: Any, i: int) -> EventFunction:
+    """The user's ``event``, number ``i``, with its attributes."""
     place = f"events[{i}]"
     if not callable(event):
         raise InputError(
@@ -179,15 +192,12 @@ def _prepared(
             remedy="Give 1 (upwards), -1 (downwards) or 0 (both)",
         )
     label = place if name == "<lambda>" else repr(name)
-    acts, departs = (bool(getattr(event, name, False)) for name in ("acts", "departs"))
-    floor, guard = float(getattr(event, "floor", 0.0)), getattr(event, "guard", None)
-    return EventFunction(
-        label, adapt(event), occurrences, _number(direction), acts, departs, floor, guard
-    )
+    action = getattr(event, "action", None)
+    return EventFunction(label, event, occurrences, _number(direction), action)
 
 
 def acting(events: Any) -> bool:
-    """Whether any of what a user gives as events has an action."""
+    """Whether any of the user's events has an action."""
     given = [events] if callable(events) else events
     return isinstance(given, Iterable) and any(
         getattr(event, "action", None) is not None for event in given
@@ -204,7 +214,7 @@ def _number(value: Any) -> float:
 
 @dataclass(frozen=True)
 class Stop:
-    """What ended a run: the time of the terminal event, and a sentence that names it."""
+    """The end of a run by a terminal event: its time (s), and a sentence that names it."""
 
     time: float
     message: str
@@ -288,7 +298,7 @@ class EventWatch:
             self._values[i] = values[-1]
         if not found:
             return None
-        return self._record(sorted(found), dense, together(t, t_new))
+        return self._record(sorted(found), dense, same_time(t, t_new))
 
     def _departing(
         self, i: int, dense: DenseOutput, nodes: list[tuple[float, float]]
@@ -297,7 +307,7 @@ class EventWatch:
         still has the sign with which it departs, if it returns to zero that soon; else None."""
         event, (t, _), (after, value) = self._events[i], *nodes[:2]
         length = after - t
-        for _ in range(RETURNS):
+        for _ in range(MAX_HALVINGS):
             length *= 0.5
             now = _value_at(event, dense, t + length)
             if now * value < 0.0:
@@ -310,10 +320,10 @@ class EventWatch:
         event = self._events[i]
         earliest = -math.inf
         if nodes[0][0] == self._start and not event.departs:
-            guard = event.guard
-            if guard is None:
-                guard = together(self._start, nodes[-1][0])
-            earliest = self._start + guard
+            tolerance = event.start_tolerance
+            if tolerance is None:
+                tolerance = same_time(self._start, nodes[-1][0])
+            earliest = self._start + tolerance
         zeros = []
         for left, right in pairwise(nodes):
             before, now = self._signs[i], event.sign(right[1])
@@ -369,7 +379,11 @@ def _with_vertices(
             continue
         vertex = -0.25 * (c - a) / curvature
         lowest = sign * (b - curvature * vertex**2)
-        if abs(vertex) < 1.0 and vertex != 0.0 and lowest < NEAR_ZERO * min(abs(a), abs(b), abs(c)):
+        if (
+            abs(vertex) < 1.0
+            and vertex != 0.0
+            and lowest < VERTEX_VALUE * min(abs(a), abs(b), abs(c))
+        ):
             at = t + vertex * (t_next - t)
             extra.append((at, _value_at(event, dense, at)))
     return sorted([*nodes, *extra]) if extra else nodes

@@ -1,143 +1,124 @@
-"""What the message of a run says about its methods' limits.
+"""Sentences of a run's message: why it stopped, and where its motion may be wrong.
 
-Whether the sweeps of a DAE that carry y damp their constraint errors.
-
-Their terms in 1/eps make of a constraint error d
-
-    d' = -G B T d/eps,    T = I or (GB)^T,
-
-so that a step multiplies it by R(-h mu/eps) for every eigenvalue mu of G B T, with the stability
-function R of the scheme.  With T = (GB)^-1 all mu are 1.
+:class:`StopReason` is the reason for programs; the sentence beside it is for readers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
 
-import numpy as np
+from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
 
-from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.errors import EvaluationError
-from srm_mbs.integration.driver import RunRecord
-from srm_mbs.integration.methods.base import ErrorNorm, StepResult, SweepNode
-from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.regularisation import real_stability_limit, stability_function
-
-LOOKED_AT = 10
-"""Steps before a failure whose sweeps are looked at."""
-ROUNDING = 1e-9
-"""Part of the largest eigenvalue that is rounding of the others."""
+NEAR_SINGULAR_SIGMA = 0.05
+"""sigma below which the message of a failure names the singular configuration."""
+TIMES_LISTED = 5
+"""Times listed in a sentence, at most."""
 
 
-def instability(
-    system: DaeSystem,
-    scheme: ButcherTableau,
-    record: RunRecord,
-    begun: Sequence[SweepNode],
-    eps: Callable[[float], float] | None,
+class StopReason(Enum):
+    """Why a run could not continue."""
+
+    ERROR_ESTIMATE = "the error estimate stays above the tolerance however small the step"
+    ROUND_OFF = "a step this short is below the round-off of the time"
+    STANDSTILL = "many steps covered almost no time"
+    NOT_EVALUATED = "a stage could not be evaluated"
+    NOT_FINITE = "the state is no longer finite"
+    LOOPS_APART = "the step is so long that the loops come apart"
+    LOCKED = (
+        "closures that seemed to follow from the others open: no motion was found that keeps all "
+        "loops closed and follows all drives, the mechanism is locked there"
+    )
+
+
+@dataclass(frozen=True)
+class RunFailure:
+    """Why a run could not continue: the reason, and a sentence for the message of the run."""
+
+    reason: StopReason
+    sentence: str
+
+    @classmethod
+    def of(cls, reason: StopReason) -> RunFailure:
+        """With the sentence of the reason itself."""
+        return cls(reason, reason.value)
+
+
+@dataclass(frozen=True)
+class ProblemVocabulary:
+    """Names of the problem in messages: what is singular, what drives it, what to check."""
+
+    singular: str
+    forces: str
+    goes_on: str
+
+
+MECHANISM = ProblemVocabulary(
+    "The closures are close to a singular configuration",
+    "what acts on the mechanism",
+    "the mechanism can move on from there (solution.q[-1])",
+)
+DAE = ProblemVocabulary(
+    "G B is almost singular there",
+    "its right-hand side",
+    "the problem has a solution from there on (solution.x[-1])",
+)
+
+
+def failure_message(
+    failure: RunFailure,
+    t: float,
+    h: float,
+    sigma: float,
+    adaptive: bool,
+    words: ProblemVocabulary = MECHANISM,
 ) -> str:
-    """A sentence that says why the sweeps of a failed run are unstable; empty if they are not.
+    """The message of a run that failed.
 
     Parameters
     ----------
-    record
-        The run.
-    begun
-        Where the sweeps stood at its start.
-    eps
-        The regularisation (s) of a step; None if it is not known.
+    t, h
+        Where it stopped, and the length of the last step that was tried (s).
+    sigma
+        sigma there.
+    adaptive
+        Whether steps follow a tolerance.
+    words
+        Names of the problem.
     """
-    cases: list[tuple[float, float, float, SweepNode]] = []
-    nodes, t = begun, record.t0
-    for result in record.steps[-LOOKED_AT:]:
-        nodes, t = result.sweeps, result.t + result.h
-        cases += [(t, result.h, node.eps, node) for node in nodes if node.eps > 0.0]
-    if record.attempts and record.attempts[-1].t == t and eps is not None:
-        h = record.attempts[-1].h
-        cases += [(t, h, eps(h), node) for node in nodes]
-    worst, sentence = 1.0 + ROUNDING, ""
-    for t, h, size, node in reversed(cases):
-        try:
-            damped = system.damping(t, node.state)
-        except EvaluationError:
-            continue
-        largest = float(np.abs(damped).max())
-        lowest = float(damped.real.min())
-        if lowest < -ROUNDING * largest:
-            return (
-                f" At t = {t:.6g} G B has an eigenvalue of {lowest:.3g} (real part), and T = I "
-                'drives sweeps away from the constraints along it: use T = "transpose" or '
-                '"inverse".'
-            )
-        growth = max(abs(stability_function(scheme, -h * mu / size)) for mu in damped.tolist())
-        if growth > worst:
-            worst, radius = growth, h * largest / size
-            sentence = (
-                f" The sweeps are unstable: at t = {t:.6g} h |G B T|/eps = {radius:.3g} "
-                f"(spectral radius), and {scheme.name} is stable up to "
-                f'{real_stability_limit(scheme):.3g}: use T = "inverse", or a larger eps.'
-            )
-    return sentence
+    near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < NEAR_SINGULAR_SIGMA else ""
+    return (
+        f"Stopped at t = {t:.6g} s with step {h:.1e} s: {failure.sentence}.{near} "
+        f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
+        f"tableau, or check that {words.goes_on}."
+    )
 
 
-TOLD = 5
-"""Times listed."""
-DRIFTED = 10.0
-"""Constraint error over tolerance from which a run says so."""
-
-
-def turns(times: Sequence[float], what: str, remedy: str) -> str:
+def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
     """A sentence naming the times at which the motion may have changed its branch.
 
     Parameters
     ----------
     times
-        Of the guard's suspects (s).
+        The branch guard's suspect times (s).
     what
-        "the velocity turned".
+        What happened there: "the velocity turned".
     remedy
         A sentence.
     """
     if not times:
         return ""
-    listed = ", ".join(f"{t:.6g}" for t in times[:TOLD]) + (", ..." if len(times) > TOLD else "")
+    listed = ", ".join(f"{t:.6g}" for t in times[:TIMES_LISTED]) + (
+        ", ..." if len(times) > TIMES_LISTED else ""
+    )
     return (
         f" Next to singular configurations, up to t = {listed} s, {what} and no shorter step "
         f"mended it: the motion may have changed its branch. {remedy}"
     )
 
 
-def drift(steps: Sequence[StepResult], norm: ErrorNorm) -> str:
-    """A sentence about sweeps that stay off the constraints by more than the tolerance."""
-    worst = max(steps, key=lambda step: step.drift_ratio, default=None)
-    if norm.negligible == 0.0 or worst is None or not worst.drift_ratio > DRIFTED:
-        return ""
-    return (
-        f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times the "
-        f"tolerance (at t = {worst.t + worst.h:.6g} s), which no step-size control mends: sweeps "
-        "are accurate to a power of eps. Use restarted sweeps (restart=True, carry=True), a "
-        "smaller eps, or PSRM."
-    )
-
-
-def passings(steps: Sequence[StepResult]) -> str:
-    """A sentence about the steps that the split form made for sweeps."""
-    times = [step.t for step in steps if step.passing]
-    if not times:
-        return ""
-    return (
-        f" {len(times)} steps next to singular configurations, the first at t = {times[0]:.6g} s, "
-        "are of the split PSRM: rounding would have exceeded the tolerance in sweeps."
-    )
-
-
-def restarts(steps: Sequence[StepResult]) -> str:
-    """A sentence about sweeps with own histories that did not keep them."""
-    times = [step.t for step in steps if step.restarted]
-    if not times:
-        return ""
-    return (
-        f" The sweeps gave up their own histories in {len(times)} steps, first at "
-        f"t = {times[0]:.6g} s: sigma was falling, they were too far off the constraints to tell "
-        "the branch if a singular configuration came, and started again from the accepted state."
-    )
+def method_messages(method: Method, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+    """Sentences of ``method`` about its limits that the accepted ``steps`` of a run met."""
+    own = getattr(method, "run_messages", None)
+    return "" if own is None else str(own(steps, norm))

@@ -1,17 +1,17 @@
-"""Singular passages of a run, found after the fact on its dense output.
+"""Singular configurations that a run passed, or reached without momentum.
 
-The recorded sigmas tell between which stages sigma may have passed zero; where they are blunt, the
-smallest singular values of the closures at the stages do.  There the smallest
-singular value of the closures is followed on the dense output.  A minimum of it is a passage if the
-part of G that loses rank changes sign across it, as it does when the motion goes through, or
-changes altogether, when it leaves on another branch; a motion that turns back, or passes by, keeps
-it.
+Both are found after the run, on its dense output.
 
-Where a run came to a singular configuration without the momentum to pass it.
-
-Several branches of the motion meet at a singular configuration, and momentum chooses one.  A
-motion that comes to rest there, or turns back so close to it that its error could decide, has no
-unique continuation.  The run keeps the branch it came along; what it could not know is listed here.
+* A *crossing* is a passage through a singular configuration.  The recorded sigmas show between
+  which stages sigma may have passed zero; where sigma is not sharp enough (a slender mechanism),
+  the smallest singular values of the closures at the stages do.  There the smallest singular value
+  of the closures is followed on the dense output.  A minimum of it is a crossing if the part of G
+  that loses rank changes sign across it (the motion passes through), or changes altogether (it
+  departs on another branch); where the motion turns back, or passes by, that part stays the same.
+* A *bifurcation* is a singular configuration at which the motion comes to rest, or turns back so
+  close to it that the error of the run could decide.  Several branches meet there; momentum chooses
+  one, and without momentum the continuation is not unique.  The run keeps the branch that it
+  arrived on, and lists the place.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.structure import BLUNT
-from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.local_analysis import (
     Participants,
@@ -34,52 +32,68 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     participants,
     smallest_singular_value,
 )
+from srm_mbs.dynamics.system import SingularityAnalysis, System
 from srm_mbs.integration.dense_output import PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
-SLACK = 1.5
-"""How much faster sigma may change between two stages than it was seen to change around them."""
-NEAR_ZERO = 0.05
-"""Part of the sigmas around that sigma must be able to reach between two stages."""
-LINGERS = 0.05
-"""sigma below which a motion is close to a singular configuration, wherever it comes from."""
-SUBDIVISION = 4
+SLOPE_MARGIN = 1.5
+"""Largest change of sigma per time between two stages, over the largest that was recorded around
+them."""
+VANISHING_SIGMA = 0.05
+"""Part of the sigmas around below which sigma between two stages counts as possibly zero."""
+LINGERING_SIGMA = 0.05
+"""sigma below which a motion is close to a singular configuration, whatever the sigmas around."""
+SAMPLES_PER_INTERVAL = 4
 """Samples on the dense output per interval between two stages."""
-LEFT_AT = 0.02
-"""Part of the largest value of a window from which a minimum has been left."""
-DEEP = 0.5
-"""A minimum must be lower than this part of its neighbours."""
-CERTAIN = 1e-5
-"""Below this part of the values around, a minimum is at a singular configuration; above, one must
+DEPARTED_VALUE = 0.02
+"""Part of the largest singular value of a window above which the motion has left a minimum."""
+MINIMUM_DEPTH = 0.5
+"""Largest value of a minimum, over those at its sides."""
+SINGULAR_VALUE = 1e-5
+"""Part of the values around below which a minimum is at a singular configuration; above, one must
 be found next to it."""
-CLOSE = 0.2
-"""How close, compared with the motion around the minimum."""
-TURNED_BACK = 0.9
-"""Cosine from which what is lost is the same before and after: the motion did not go through."""
-TOUCHES = 1e-6
-"""Below this part of the values around, it touched the singular configuration nevertheless."""
-ALIKE = 2.0
+CLOSE_DISTANCE = 0.2
+"""Largest distance of the singular configuration from a minimum, over the motion around it."""
+TURNED_BACK_COSINE = 0.9
+"""Cosine above which the part of G that loses rank is the same before and after: the motion turned
+back or passed by."""
+TOUCHING_VALUE = 1e-6
+"""Part of the values around below which such a motion touched the singular configuration."""
+VANISHING_TOGETHER = 2.0
 """Singular values up to this multiple of the smallest vanish with it."""
-REFINEMENTS = 12
-WITHIN = 0.3
-"""How far (units) from the dense output the singular configuration is looked for."""
-BESIDE = 0.05
-"""Part of the values around at which the velocity is taken before and after a passage."""
+MAX_REFINEMENTS = 12
+"""Steps of the search for the minimum of a singular value."""
+CROSSING_SEARCH = 0.3
+"""Distance (rad, scene diagonals) from the dense output within which the singular configuration of
+a crossing is looked for."""
+VELOCITY_VALUE = 0.05
+"""Part of the values around at which the velocity is taken before and after a crossing."""
+REVERSAL_SIGMA = 0.02
+"""sigma below which a motion that turns back may have met a bifurcation."""
+UNDECIDED_DISTANCE = 100.0
+"""Distance to the singular configuration (rad, scene diagonals), over rtol, below which the error
+of the run could decide on the branch."""
+WITHOUT_MOMENTUM = 0.01
+"""Part of the largest speed of a run below which it ends without momentum."""
+BIFURCATION_SEARCH = 0.05
+"""Distance (rad, scene diagonals) from the motion within which the singular configuration of a
+bifurcation is looked for."""
+SAMPLES = 21
+"""Samples of the motion next to a bifurcation."""
 
 
 class ConstraintMonitor:
     """The closures and drives along the dense output of a run."""
 
-    def __init__(self, system: ClosedSystem, dense: DenseOutput) -> None:
-        mechanism = system.mechanism
-        self.geometry = geometry_of(mechanism, mechanism.q0)
-        self.rank = mechanism.structure.rank
-        self._system = system
+    def __init__(self, analysis: SingularityAnalysis, dense: DenseOutput) -> None:
+        self.geometry = analysis.geometry(analysis.q0)
+        self.rank = analysis.rank
+        self._analysis = analysis
         self._dense = dense
 
     def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """(q, v) at the times t (k,)."""
-        return [self._system.split(state) for state in self._dense(t)]
+        return [self._analysis.split(state) for state in self._dense(t)]
 
     def place(self, t: float) -> FloatArray:
         """Configuration at t, as the geometry takes it."""
@@ -97,7 +111,7 @@ class ConstraintMonitor:
         The square of the value is a parabola where the motion passes.
         """
         times, squares = t.tolist(), (values**2).tolist()
-        for _ in range(REFINEMENTS):
+        for _ in range(MAX_REFINEMENTS):
             a, b, c = times
             fa, fb, fc = squares
             bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
@@ -122,7 +136,7 @@ class ConstraintMonitor:
 class Crossing:
     """A passage through a singular configuration.
 
-    What is not in the constructor is computed when it is read.
+    Attributes other than those of the constructor are computed when they are read.
 
     Attributes
     ----------
@@ -135,9 +149,9 @@ class Crossing:
     rank
         Smallest number of closure rows in use in that step.
     placement
-        What kept the stages away: ``"a priori"`` (the step was shortened in advance), ``"redone"``
-        (it was redone with another length), ``"zone"`` (a stage came too close and took the
-        predicted multiplier) or ``""``.
+        How the stages were kept away: ``"a priori"`` (the step was shortened in advance),
+        ``"redone"`` (it was redone with another length), ``"zone"`` (a stage came too close and
+        took the predicted multiplier) or ``""``.
     """
 
     time: float
@@ -145,7 +159,7 @@ class Crossing:
     sigma: float
     rank: int
     placement: str
-    _watched: ConstraintMonitor = field(repr=False, compare=False)
+    _monitor: ConstraintMonitor = field(repr=False, compare=False)
     _beside: float = field(repr=False, compare=False)
     _range: tuple[float, float] = field(repr=False, compare=False)
 
@@ -153,14 +167,16 @@ class Crossing:
     def singular(self) -> SingularConfiguration | None:
         """The local analysis at the exactly singular configuration nearest to the passage; None
         if there is none close to it."""
-        watched = self._watched
-        found = nearest_singular(watched.geometry, watched.place(self.time), watched.rank, WITHIN)
-        return None if found is None else analyse_singular(watched.geometry, found, watched.rank)
+        monitor = self._monitor
+        found = nearest_singular(
+            monitor.geometry, monitor.place(self.time), monitor.rank, CROSSING_SEARCH
+        )
+        return None if found is None else analyse_singular(monitor.geometry, found, monitor.rank)
 
     @property
     def configuration(self) -> FloatArray | None:
         """That configuration (nq,)."""
-        return None if self.singular is None else self.singular.q[: self._watched.geometry.model.nq]
+        return None if self.singular is None else self.singular.q[: self._monitor.geometry.model.nq]
 
     @cached_property
     def participants(self) -> Participants:
@@ -168,10 +184,12 @@ class Crossing:
         a drive leads almost up to its dead point."""
         if self.singular is not None:
             return self.singular.participants
-        watched = self._watched
-        left, size, _ = np.linalg.svd(watched.geometry.normalised(watched.place(self.time)))
-        size = size[: watched.rank]
-        return participants(watched.geometry, left[:, : watched.rank][:, size < ALIKE * size[-1]])
+        monitor = self._monitor
+        left, size, _ = np.linalg.svd(monitor.geometry.normalised(monitor.place(self.time)))
+        size = size[: monitor.rank]
+        return participants(
+            monitor.geometry, left[:, : monitor.rank][:, size < VANISHING_TOGETHER * size[-1]]
+        )
 
     @property
     def loops(self) -> tuple[str, ...]:
@@ -190,15 +208,15 @@ class Crossing:
 
     @cached_property
     def _velocities(self) -> tuple[FloatArray | None, FloatArray | None]:
-        """Rates (n,) in units, extrapolated to the passage from before and from behind."""
+        """Rates (n,) in units, extrapolated to the crossing from before and from after it."""
         out: list[FloatArray | None] = []
         for side in (-1.0, 1.0):
             times = self.time + side * self._beside * np.array([1.0, 2.0])
             if not (self._range[0] <= times.min() and times.max() <= self._range[1]):
                 out.append(None)
                 continue
-            (_, near), (_, far) = self._watched.states(times)
-            out.append(self._watched.geometry.rates(2.0 * near - far))
+            (_, near), (_, far) = self._monitor.states(times)
+            out.append(self._monitor.geometry.rates(2.0 * near - far))
         return out[0], out[1]
 
     @cached_property
@@ -206,7 +224,7 @@ class Crossing:
         """Directions (k, n) of the branches."""
         singular = self.singular
         if singular is None:
-            return np.zeros((0, len(self._watched.geometry.unit)))
+            return np.zeros((0, len(self._monitor.geometry.unit)))
         arriving, leaving = self._velocities
         return branch_tangents(singular, leaving if arriving is None else arriving)
 
@@ -218,7 +236,7 @@ class Crossing:
         velocity (:func:`srm_mbs.dynamics.singularities.branches.branch_tangents`).  Empty if they
         are not isolated; of a driven mechanism also where it has freedom besides its drives.
         """
-        tangents = self._tangents[:, : self._watched.geometry.model.nv]
+        tangents = self._tangents[:, : self._monitor.geometry.model.nv]
         size = np.linalg.norm(tangents, axis=1, keepdims=True)
         out: FloatArray = tangents / np.where(size > 0.0, size, 1.0)
         return out
@@ -237,12 +255,12 @@ class Crossing:
 
     @cached_property
     def arrived_on(self) -> int | None:
-        """Index in ``branches`` of the branch before the passage; None if it cannot be told."""
+        """Index in ``branches`` of the branch before the passage; None if unknown."""
         return self._branch_of(self._velocities[0])
 
     @cached_property
     def left_on(self) -> int | None:
-        """Index in ``branches`` of the branch after the passage; None if it cannot be told."""
+        """Index in ``branches`` of the branch after the passage; None if unknown."""
         return self._branch_of(self._velocities[1])
 
     @property
@@ -272,10 +290,10 @@ def _may_vanish(t: FloatArray, sigma: FloatArray, around: int) -> BoolArray:
     slope = np.abs(np.diff(sigma)) / dt
     widest = _largest(slope, around, around)
     size = _largest(sigma, around, around + 1)[:-1]
-    lowest = 0.5 * (sigma[:-1] + sigma[1:] - SLACK * widest * dt)
+    lowest = 0.5 * (sigma[:-1] + sigma[1:] - SLOPE_MARGIN * widest * dt)
     # A run that lingers next to a singular configuration takes steps far below its distance.
-    lingers = np.minimum(sigma[:-1], sigma[1:]) < LINGERS
-    out: BoolArray = (lowest < NEAR_ZERO * size) | lingers
+    lingers = np.minimum(sigma[:-1], sigma[1:]) < LINGERING_SIGMA
+    out: BoolArray = (lowest < VANISHING_SIGMA * size) | lingers
     return out
 
 
@@ -293,7 +311,7 @@ def _windows(t: FloatArray, marked: BoolArray) -> list[FloatArray]:
     grown[:-1] |= marked[1:]
     grown[1:] |= marked[:-1]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], grown.astype(int), [0]])))
-    fractions = np.arange(SUBDIVISION) / SUBDIVISION
+    fractions = np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
     out = []
     for first, last in zip(edges[::2], edges[1::2]):
         nodes = t[first : last + 1]
@@ -307,7 +325,7 @@ def _minima(values: FloatArray) -> list[tuple[int, int, int]]:
 
     Small minima between the same sides are one: dense output is rough where steps are tiny.
     """
-    level = max(LEFT_AT * float(values.max()), 1e-12)
+    level = max(DEPARTED_VALUE * float(values.max()), 1e-12)
     found: dict[tuple[int, int], int] = {}
     for k in np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] < values[2:])) + 1:
         first, last = k - 1, k + 1
@@ -321,27 +339,28 @@ def _minima(values: FloatArray) -> list[tuple[int, int, int]]:
     return [(first, k, last) for (first, last), k in found.items()]
 
 
-def _turned(
-    watched: ConstraintMonitor, time: float, certain: bool, before: float, after: float
+def _rank_loss_cosine(
+    monitor: ConstraintMonitor, time: float, certain: bool, before: float, after: float
 ) -> float | None:
-    """Cosine between what G has lost at ``time`` as it is ``before`` and ``after``.
+    """Cosine between the parts of G that lose rank at ``time``, as they are ``before`` and
+    ``after`` it (s).
 
-    -1 if the motion went through, 1 if it turned back or passed by, in between if it left on
-    another branch.  None if nothing is lost: unless it is ``certain`` that it is, a singular
+    -1 if the motion passed through, 1 if it turned back or passed by, in between if it departed on
+    another branch.  None if G does not lose rank: unless it is ``certain`` that it does, a singular
     configuration must lie close to the motion, compared with how far that moves.
     """
-    geometry = watched.geometry
-    q, q_before, q_after = (watched.place(t) for t in (time, before, after))
+    geometry = monitor.geometry
+    q, q_before, q_after = (monitor.place(t) for t in (time, before, after))
     if not certain:
-        found = nearest_singular(geometry, q, watched.rank, WITHIN)
+        found = nearest_singular(geometry, q, monitor.rank, CROSSING_SEARCH)
         if found is None:
             return None
         moved = np.linalg.norm(geometry.difference(q_before, q_after))
-        if not np.linalg.norm(geometry.difference(q, found)) < CLOSE * moved:
+        if not np.linalg.norm(geometry.difference(q, found)) < CLOSE_DISTANCE * moved:
             return None
         q = found
     left, size, right = np.linalg.svd(geometry.normalised(q))
-    rank = int(np.sum(size > max(100.0 * size[watched.rank - 1], 1e-9)))
+    rank = int(np.sum(size > max(100.0 * size[monitor.rank - 1], 1e-9)))
     a, b = (
         (left[:, rank:].T @ geometry.normalised(x) @ right[rank:].T).ravel()
         for x in (q_before, q_after)
@@ -358,8 +377,10 @@ def _placement(steps: StepData, i: int) -> str:
     return here or (PLACEMENTS[int(steps.placements[i - 1])] if i else "")
 
 
-def passage_at(watched: ConstraintMonitor, steps: StepData, time: float, beside: float) -> Crossing:
-    """The passage of a run at ``time`` (s), whose velocity is taken ``beside`` (s) it."""
+def crossing_at(
+    monitor: ConstraintMonitor, steps: StepData, time: float, beside: float
+) -> Crossing:
+    """The crossing of a run at ``time`` (s), whose velocity is taken ``beside`` (s) it."""
     i = int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
     return Crossing(
         time,
@@ -367,20 +388,21 @@ def passage_at(watched: ConstraintMonitor, steps: StepData, time: float, beside:
         float(steps.sigmas[i].min()),
         int(steps.ranks[i]),
         _placement(steps, i),
-        watched,
+        monitor,
         beside,
         (float(steps.times[0]), steps.end),
     )
 
 
 def find_crossings(
-    system: OpenSystem | ClosedSystem,
+    system: System,
     scheme: ButcherTableau,
     steps: StepData,
     dense: DenseOutput,
 ) -> tuple[Crossing, ...]:
-    """All passages of a run, in order of time."""
-    if not isinstance(system, ClosedSystem) or not steps.count:
+    """All crossings of a run, in order of time."""
+    analysis = system.singularities
+    if analysis is None or not steps.count:
         return ()
     abscissae = np.append(scheme.c, 1.0)
     t, sigma = _recorded(abscissae, steps)
@@ -388,43 +410,32 @@ def find_crossings(
     t, sigma = t[inside], sigma[inside]
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
-    watched = ConstraintMonitor(system, dense)
-    if system.structure.sigma_ref < BLUNT:
-        sigma = watched.smallest(t)
+    monitor = ConstraintMonitor(analysis, dense)
+    if analysis.sigma_reference < BLUNT:
+        sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
     found: list[Crossing] = []
     for times in _windows(t, _may_vanish(t, sigma, scheme.n_stages)):
-        values = watched.smallest(times)
+        values = monitor.smallest(times)
         scale = float(values.max())
         for first, k, last in _minima(values):
             near = slice(k - 1, k + 2)
-            time, value = watched.minimum(times[near], values[near])
+            time, value = monitor.minimum(times[near], values[near])
             before, after = float(times[first]), float(times[last])
             sides = values[[first, last]]
-            if not value < DEEP * sides.min():
+            if not value < MINIMUM_DEPTH * sides.min():
                 continue
-            turned = _turned(watched, time, value < CERTAIN * scale, before, after)
-            if turned is None or (turned > TURNED_BACK and value > TOUCHES * scale):
+            cosine = _rank_loss_cosine(monitor, time, value < SINGULAR_VALUE * scale, before, after)
+            if cosine is None or (cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale):
                 continue
             slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
-            found.append(passage_at(watched, steps, time, BESIDE * scale / slope))
+            found.append(crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope))
     return tuple(found)
-
-
-LOOKED_AT = 0.02
-"""sigma below which a motion that turns back is looked at."""
-UNDECIDED = 100.0
-"""Distance to the singular configuration (units), over rtol, below which errors could decide."""
-SLOW = 0.01
-"""Part of the largest speed of a run below which its end is without momentum."""
-STANDSTILL_WITHIN = 0.05
-"""How far (units) the singular configuration is looked for."""
-SAMPLES = 21
 
 
 @dataclass(frozen=True)
 class Bifurcation:
-    """A singular configuration that was reached without the momentum to choose a branch.
+    """A singular configuration that a run reached without the momentum to choose a branch.
 
     Attributes
     ----------
@@ -433,46 +444,46 @@ class Bifurcation:
     distance
         Smallest distance to the singular configuration (rad, scene diagonals).
     stopped
-        Whether the run ended there because it could not go on.
+        Whether the run ended there because it could not continue.
     """
 
     start: float
     end: float
     distance: float
     stopped: bool
-    _passage: Crossing = field(repr=False, compare=False)
+    _crossing: Crossing = field(repr=False, compare=False)
 
     @property
     def singular(self) -> SingularConfiguration | None:
         """Its local analysis; None if none was found close to the motion."""
-        return self._passage.singular
+        return self._crossing.singular
 
     @property
     def configuration(self) -> FloatArray | None:
         """The singular configuration (nq,)."""
-        return self._passage.configuration
+        return self._crossing.configuration
 
     @property
     def loops(self) -> tuple[str, ...]:
         """Names of the loops whose rows lose rank there."""
-        return self._passage.loops
+        return self._crossing.loops
 
     @property
     def drives(self) -> tuple[str, ...]:
         """Names of the drives whose rows do so with them."""
-        return self._passage.drives
+        return self._crossing.drives
 
     @property
     def branches(self) -> FloatArray:
         """Velocity directions (k, nv) of the branches that meet there; see
         :attr:`~srm_mbs.integration.singular_passages.Crossing.branches`."""
-        return self._passage.branches
+        return self._crossing.branches
 
     @property
     def kept(self) -> int | None:
-        """Index in ``branches`` of the branch that the run came along and kept; None if it cannot
-        be told."""
-        return self._passage.arrived_on
+        """Index in ``branches`` of the branch that the run came along and kept; None if
+        unknown."""
+        return self._crossing.arrived_on
 
     def __str__(self) -> str:
         span = f"From t = {self.start:.6g} to {self.end:.6g} s the motion stayed"
@@ -481,55 +492,55 @@ class Bifurcation:
         did = "stopped there" if self.stopped else f"kept the one it came along{kept}"
         return (
             f"{span if self.end > self.start else moment} next to a singular "
-            f"configuration of {self._passage.participants} without the "
+            f"configuration of {self._crossing.participants} without the "
             f"momentum to choose one of the {len(self.branches)} branches that meet there: the run "
             f"{did} (solution.bifurcations)"
         )
 
 
-def _turns_back(nq: int, steps: StepData, unit: FloatArray) -> set[int]:
+def _reversals(nq: int, steps: StepData, unit: FloatArray) -> set[int]:
     """Indices of the steps next to a singular configuration in which the motion reverses."""
     v = steps.states[:, nq:] / unit
     reverses = (v[:-1] * v[1:]).sum(axis=1) <= 0.0
-    close = steps.sigmas.min(axis=1) < LOOKED_AT
+    close = steps.sigmas.min(axis=1) < REVERSAL_SIGMA
     return set(np.flatnonzero(reverses & close).tolist())
 
 
 def _slow(nq: int, steps: StepData, unit: FloatArray) -> bool:
-    """Whether the run ends slowly, compared with its fastest: one that cannot go on while it moves
-    has another trouble than its momentum."""
+    """Whether the run ends slowly, compared with its largest speed: one that cannot continue while
+    it moves fails for another reason."""
     speeds = np.linalg.norm(steps.states[:, nq:] / unit, axis=1)
-    return bool(speeds[-1] <= SLOW * speeds.max())
+    return bool(speeds[-1] <= WITHOUT_MOMENTUM * speeds.max())
 
 
 def _ranges(marked: list[int], steps: StepData) -> list[tuple[int, int]]:
-    """First and last of the ``marked`` steps between which the motion does not get away."""
+    """First and last of the ``marked`` steps between which sigma stays small."""
     out: list[tuple[int, int]] = []
     for i in marked:
-        if out and steps.sigmas[out[-1][1] : i + 1].max() < LOOKED_AT:
+        if out and steps.sigmas[out[-1][1] : i + 1].max() < REVERSAL_SIGMA:
             out[-1] = (out[-1][0], i)
         else:
             out.append((i, i))
     return out
 
 
-def _closest(watched: ConstraintMonitor, t: FloatArray) -> float:
-    """When, within the times t (SAMPLES,), sigma is smallest."""
-    sigma = watched.smallest(t)
+def _closest(monitor: ConstraintMonitor, t: FloatArray) -> float:
+    """Time (s) within t (SAMPLES,) at which the smallest singular value is smallest."""
+    sigma = monitor.smallest(t)
     k = int(np.argmin(sigma))
     if 0 < k < SAMPLES - 1:
-        return watched.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])[0]
+        return monitor.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])[0]
     return float(t[k])
 
 
-def _turn(watched: ConstraintMonitor, t: FloatArray) -> float:
-    """When, within the times t (k,), the motion turns back."""
+def _reversal_time(monitor: ConstraintMonitor, t: FloatArray) -> float:
+    """Time (s) within t (k,) at which the motion turns back."""
     from scipy.optimize import brentq
 
-    unit = watched.geometry.coordinate_unit
+    unit = monitor.geometry.coordinate_unit
 
     def rates(times: FloatArray) -> FloatArray:
-        return np.array([v for _, v in watched.states(times)]) / unit
+        return np.array([v for _, v in monitor.states(times)]) / unit
 
     ends = rates(t[[0, -1]])
     direction = ends[0] - ends[1]
@@ -546,7 +557,7 @@ def _turn(watched: ConstraintMonitor, t: FloatArray) -> float:
 
 
 def find_bifurcations(
-    system: OpenSystem | ClosedSystem,
+    system: System,
     steps: StepData,
     dense: DenseOutput,
     rtol: float,
@@ -557,38 +568,39 @@ def find_bifurcations(
     Parameters
     ----------
     failed
-        Whether the run could not go on from its last state.
+        Whether the run could not continue from its last state.
     """
-    if not isinstance(system, ClosedSystem) or not steps.count:
+    analysis = system.singularities
+    if analysis is None or not steps.count:
         return ()
-    if not steps.held.any() and not steps.sigmas.min() < LOOKED_AT:
+    if not steps.held.any() and not steps.sigmas.min() < REVERSAL_SIGMA:
         return ()
     held = set(np.flatnonzero(steps.held).tolist())
-    unit = system.mechanism.structure.units.coordinate
-    turning = _turns_back(system.nq, steps, unit)
+    nq, unit = len(analysis.q0), analysis.coordinate_unit
+    reversals = _reversals(nq, steps, unit)
     last = steps.count - 1
-    stops = failed and steps.sigmas[last].min() < LOOKED_AT and _slow(system.nq, steps, unit)
-    marked = sorted(held | turning | ({last} if stops else set()))
+    stops = failed and steps.sigmas[last].min() < REVERSAL_SIGMA and _slow(nq, steps, unit)
+    marked = sorted(held | reversals | ({last} if stops else set()))
     found: list[Bifurcation] = []
     if not marked:
         return ()
-    watched = ConstraintMonitor(system, dense)
+    monitor = ConstraintMonitor(analysis, dense)
     for first, final in _ranges(marked, steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
         stayed = final > first or first in held
         stopped = bool(stops and final == last)
-        # Where a motion turns back tells whether it had the momentum to pass: it may have passed
-        # and come back within the step.
-        closest = _closest(watched, t) if stayed or stopped else _turn(watched, t)
-        q = watched.place(closest)
-        singular = nearest_singular(watched.geometry, q, watched.rank, STANDSTILL_WITHIN)
+        # A motion may pass and come back within the step: whether it had the momentum to pass
+        # follows from the place of its reversal.
+        closest = _closest(monitor, t) if stayed or stopped else _reversal_time(monitor, t)
+        q = monitor.place(closest)
+        singular = nearest_singular(monitor.geometry, q, monitor.rank, BIFURCATION_SEARCH)
         if singular is None:
             continue
-        distance = float(np.linalg.norm(watched.geometry.difference(singular, q)))
-        if not (stayed or stopped or distance < UNDECIDED * rtol):
+        distance = float(np.linalg.norm(monitor.geometry.difference(singular, q)))
+        if not (stayed or stopped or distance < UNDECIDED_DISTANCE * rtol):
             continue
         begin, end = (float(t[0]), float(t[-1])) if stayed else (closest, closest)
-        # The way it came is told from where the motion was faster.
-        passage = passage_at(watched, steps, begin, float(t[-1] - t[0]) / (final + 1 - first))
-        found.append(Bifurcation(begin, end, distance, stopped, passage))
+        # The branch of arrival is determined where the motion was faster.
+        crossing = crossing_at(monitor, steps, begin, float(t[-1] - t[0]) / (final + 1 - first))
+        found.append(Bifurcation(begin, end, distance, stopped, crossing))
     return tuple(found)

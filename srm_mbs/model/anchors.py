@@ -1,4 +1,4 @@
-"""Anchors: frames fixed on bodies, where closures and forces take hold."""
+"""Anchors: frames fixed on bodies, at which closures, forces and drives act."""
 
 from __future__ import annotations
 
@@ -10,45 +10,15 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
+from srm_mbs.model.numbers import vector
 
 WORLD = "world"
 """Reserved link name: the fixed ground."""
 
 
-def finite_numbers(values: Any, count: int, what: str, remedy: str) -> tuple[float, ...]:
-    """``values`` as a tuple of ``count`` finite floats.
-
-    Raises
-    ------
-    InputError
-        About the element ``what``, with that ``remedy``, if they are anything else.
-    """
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise InputError(
-            f"{what} must be {count} finite numbers, not {values!r}", element=what, remedy=remedy
-        )
-    return tuple(array.tolist())
-
-
-def vector(values: Sequence[float], what: str) -> tuple[float, float, float]:
-    """``values`` as three finite floats.
-
-    Raises
-    ------
-    InputError
-        About the element ``what``, if they are anything else.
-    """
-    x, y, z = finite_numbers(values, 3, what, "Give [x, y, z]")
-    return (x, y, z)
-
-
 @dataclass(frozen=True)
 class Anchor:
-    """A frame fixed on a body: where a closure takes hold.
+    """A frame fixed on a body, at which a closure, force or drive acts.
 
     Parameters
     ----------
@@ -114,12 +84,12 @@ class Anchor:
 
 
 def name_places(element: str, *anchors: Any) -> list[str]:
-    """Links or frames of the anchors that are given; None stands for no anchor.
+    """Names of the links or frames of the anchors that are not None.
 
     Raises
     ------
     InputError
-        About the ``element`` if one is no anchor.
+        About the ``element`` if one is neither an anchor nor None.
     """
     for anchor in anchors:
         if not isinstance(anchor, Anchor | None):
@@ -161,12 +131,12 @@ def resolve_apart(
 def resolve_moving(
     model: pin.Model, anchors: Sequence[Anchor], element: str
 ) -> list[tuple[int, pin.SE3]]:
-    """Points that have a path, each as in :meth:`Anchor.resolve`.
+    """Moving points, each as in :meth:`Anchor.resolve`.
 
     Raises
     ------
     InputError
-        About ``element`` if one is no anchor, is not there, or lies on the ground.
+        About ``element`` if one is no anchor, does not exist, or lies on the ground.
     """
     if isinstance(anchors, Anchor):
         raise InputError(f"{element} is one anchor", element=element, remedy="Give a list of them")

@@ -1,7 +1,4 @@
-r"""Loop closures as immutable descriptions; :mod:`srm_mbs.dynamics.constraints.rows` evaluates
-them.
-
-The types of loop closure, as data.
+r"""Loop closures as immutable data; :mod:`srm_mbs.dynamics.constraints.rows` evaluates them.
 
 A closure ties an anchor frame *a* on one body to an anchor frame *b* on another, or joints to each
 other.  With the position p of a's origin and the rotation R of a's axes, both in b's frame, and the
@@ -16,12 +13,15 @@ four kinds:
 
 A new type made of these is one more entry of :data:`CLOSURE_TYPES`; its Jacobian, its
 :math:`\dot G v`, its reactions and its assembly follow from the kinds of row.
+
+The fields of :class:`LoopClosure` are the one list of the keys of a closure: descriptions
+(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -32,7 +32,8 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import Anchor, finite_numbers, name_places, resolve_apart, vector
+from srm_mbs.model.anchors import Anchor, name_places, resolve_apart
+from srm_mbs.model.numbers import finite_numbers, vector
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -81,8 +82,8 @@ class RowSet:
     alignments : (r, 2, 3) pairs (u in a, n in b) of the alignment rows
     joint_rows : the joint rows
     matched : (c, 3) axes, the same components in a and b, that must coincide with their sign;
-        assembly uses them, because the alignment rows alone also admit the reversed axis.  Where
-        there are none, the alignment rows are all that is asked for
+        assembly uses them, because the alignment rows alone also admit the reversed axis (a
+        type without any, as the universal joint, is its alignment rows alone)
     labels : names of all rows
     """
 
@@ -112,7 +113,8 @@ def _no_axis() -> FloatArray:
 
 @dataclass(frozen=True)
 class ClosureValues:
-    """What the rows of a closure are made of: unit axes (3,), m; types read what they need."""
+    """Constants of the rows of a closure: unit axes (3,) and a length (m), as far as its type has
+    them."""
 
     axis: FloatArray = field(default_factory=_no_axis)
     axis_a: FloatArray = field(default_factory=_no_axis)
@@ -136,7 +138,7 @@ class ClosureType:
     rows
         Its rows.
     summary
-        What it is, in a few words.
+        A short description.
     """
 
     name: str
@@ -150,12 +152,12 @@ def _point(_: ClosureValues) -> RowSet:
     return RowSet(("x", "y", "z"), _XYZ)
 
 
-_TURNS = np.array([[_XYZ[1], _XYZ[2]], [_XYZ[2], _XYZ[0]], [_XYZ[0], _XYZ[1]]])
+_RELATIVE_ROTATION = np.array([[_XYZ[1], _XYZ[2]], [_XYZ[2], _XYZ[0]], [_XYZ[0], _XYZ[1]]])
 """At R = 1 the rates of these alignments are the components of the relative angular velocity."""
 
 
 def _frame(_: ClosureValues) -> RowSet:
-    return RowSet(("x", "y", "z", "rx", "ry", "rz"), _XYZ, _TURNS, _XYZ)
+    return RowSet(("x", "y", "z", "rx", "ry", "rz"), _XYZ, _RELATIVE_ROTATION, _XYZ)
 
 
 def _axis_rows(axis: FloatArray) -> FloatArray:
@@ -171,7 +173,7 @@ def _revolute(values: ClosureValues) -> RowSet:
 
 def _prismatic(values: ClosureValues) -> RowSet:
     across = np.array(perpendicular_basis(values.axis))
-    return RowSet(("normal_1", "normal_2", "rx", "ry", "rz"), across, _TURNS, _XYZ)
+    return RowSet(("normal_1", "normal_2", "rx", "ry", "rz"), across, _RELATIVE_ROTATION, _XYZ)
 
 
 def _cylindrical(values: ClosureValues) -> RowSet:
@@ -260,21 +262,13 @@ CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType(
 """The closures by their type in a description."""
 
 
-_KEYS = {
-    "a": ("an anchor a", 'Give "a = { link = ... }"'),
-    "b": ("an anchor b", 'Give "b = { link = ... }"'),
-    "axis": ("an axis", 'Give "axis = [x, y, z]", in b\'s frame'),
-    "axis_a": ("an axis_a", 'Give "axis_a = [x, y, z]", in a\'s frame'),
-    "axis_b": ("an axis_b", 'Give "axis_b = [x, y, z]", in b\'s frame'),
-    "length": ("a length", 'Give "length = ...", in m'),
-    "joints": ("joints", 'Give "joints = [first, second]"'),
-    "ratio": ("a ratio", 'Give "ratio = ..."'),
-    "coefficients": ("coefficients", 'Give "coefficients = [...]"'),
-    "offset": ("an offset", 'Give "offset = ..."'),
-}
-"""Keys of a closure: in words, and how to give them."""
-_COINCIDENT = 1e-9
-"""Distance, over that of the points from the world's origin, below which it is rounding."""
+COINCIDENCE_TOLERANCE = 1e-9
+"""Distance of two points, over their distance from the world's origin, that is rounding."""
+
+
+def _key(words: str, remedy: str) -> dict[str, str]:
+    """A key of a closure for messages: its name with an article, and how to give it."""
+    return {"words": words, "remedy": remedy}
 
 
 @dataclass(frozen=True)
@@ -296,7 +290,7 @@ class LoopClosure:
         ``universal``: the axes of the cross, in a's and in b's frame; normalised here.
     length
         ``distance``: m; by default the distance in the initial configuration (the guess), which
-        :class:`~srm_mbs.model.mechanism.Mechanism` fills in.
+        :class:`~srm_mbs.dynamics.mechanism.Mechanism` fills in.
     joints
         ``coupling``: names of joints with one degree of freedom.
     ratio, offset
@@ -312,17 +306,33 @@ class LoopClosure:
     """
 
     type: str | ClosureType
-    a: Anchor | None = None
-    b: Anchor | None = None
-    axis: tuple[float, float, float] | None = None
+    a: Anchor | None = field(
+        default=None, metadata=_key("an anchor a", 'Give "a = { link = ... }"')
+    )
+    b: Anchor | None = field(
+        default=None, metadata=_key("an anchor b", 'Give "b = { link = ... }"')
+    )
+    axis: tuple[float, float, float] | None = field(
+        default=None, metadata=_key("an axis", 'Give "axis = [x, y, z]", in b\'s frame')
+    )
     name: str = ""
-    axis_a: tuple[float, float, float] | None = None
-    axis_b: tuple[float, float, float] | None = None
-    length: float | None = None
-    joints: tuple[str, ...] | None = None
-    ratio: float | None = None
-    coefficients: tuple[float, ...] | None = None
-    offset: float | None = None
+    axis_a: tuple[float, float, float] | None = field(
+        default=None, metadata=_key("an axis_a", 'Give "axis_a = [x, y, z]", in a\'s frame')
+    )
+    axis_b: tuple[float, float, float] | None = field(
+        default=None, metadata=_key("an axis_b", 'Give "axis_b = [x, y, z]", in b\'s frame')
+    )
+    length: float | None = field(
+        default=None, metadata=_key("a length", 'Give "length = ...", in m')
+    )
+    joints: tuple[str, ...] | None = field(
+        default=None, metadata=_key("joints", 'Give "joints = [first, second]"')
+    )
+    ratio: float | None = field(default=None, metadata=_key("a ratio", 'Give "ratio = ..."'))
+    coefficients: tuple[float, ...] | None = field(
+        default=None, metadata=_key("coefficients", 'Give "coefficients = [...]"')
+    )
+    offset: float | None = field(default=None, metadata=_key("an offset", 'Give "offset = ..."'))
 
     def __post_init__(self) -> None:
         places = name_places(f"loop {self.name!r}", self.a, self.b)
@@ -335,10 +345,14 @@ class LoopClosure:
                 f"Known: {', '.join(CLOSURE_TYPES)}",
             )
         kind = self.kind
-        for key, (words, remedy) in _KEYS.items():
+        for entry in fields(self):
+            key = entry.name
+            if key in ("type", "name"):
+                continue
             given = getattr(self, key) is not None
             if not given and key in kind.needs:
-                raise self._fault(f"a {self.type_name} closure needs {words}", remedy)
+                problem = f"a {self.type_name} closure needs {entry.metadata['words']}"
+                raise self._fault(problem, entry.metadata["remedy"])
             if given and key not in (*kind.needs, *kind.takes):
                 raise self._fault(f"a {self.type_name} closure takes no {key}", f'Remove "{key}"')
         for key in ("axis", "axis_a", "axis_b"):
@@ -420,7 +434,7 @@ class LoopClosure:
 
     @property
     def kind(self) -> ClosureType:
-        """Its type: what it needs, and its rows."""
+        """Its type."""
         return self.type if isinstance(self.type, ClosureType) else CLOSURE_TYPES[self.type]
 
     @property
@@ -503,7 +517,7 @@ class LoopClosure:
                 )
 
     def measured(self, model: pin.Model, q: FloatArray) -> LoopClosure:
-        """The same closure with a length that was not given taken from the configuration q (nq,).
+        """The same closure, with a length that is not given measured at the configuration q (nq,).
 
         Raises
         ------
@@ -516,7 +530,7 @@ class LoopClosure:
         pin.forwardKinematics(model, data, q)
         a, b = (data.oMi[joint].act(inside.translation) for joint, inside in self.resolve(model))
         length = float(np.linalg.norm(a - b))
-        if length <= _COINCIDENT * max(np.linalg.norm(a), np.linalg.norm(b)):
+        if length <= COINCIDENCE_TOLERANCE * max(np.linalg.norm(a), np.linalg.norm(b)):
             raise self._fault(
                 "its two points coincide in the guess: a distance of 0 has no direction",
                 'Use type = "point" if they are to coincide, or give a length or another guess',

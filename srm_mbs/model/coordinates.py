@@ -1,4 +1,4 @@
-"""Joint values as people write them, and Pinocchio's coordinates.
+"""Conversion between joint values as users write them and Pinocchio's coordinates.
 
 A one-degree joint takes one number (rad or m), also a URDF ``continuous`` joint, which Pinocchio
 stores as (cos, sin).  Other joints take lists in Pinocchio's order: position xyz then quaternion
@@ -15,21 +15,23 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData
+from srm_mbs.model.numbers import finite_array
+
+UNIT_LENGTH_TOLERANCE = 1e-3
+"""Largest deviation from 1 of the length of a quaternion, or (cos, sin) pair, that users give."""
 
 
 def _numbers(value: Any, name: str, accepted: dict[int, str]) -> FloatArray:
-    try:
-        array = np.atleast_1d(np.asarray(value, dtype=float))
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if array.ndim != 1 or not np.isfinite(array).all() or array.size not in accepted:
+    """One number or a list of them as an array, of one of the accepted lengths."""
+    array = finite_array(value)
+    if array is None or array.ndim > 1 or array.size not in accepted:
         wanted = " or ".join(accepted.values())
         raise InputError(f"joint {name!r} cannot take the value {value!r}", remedy=f"Give {wanted}")
-    return array
+    return np.atleast_1d(array)
 
 
-def set_position(mechanism: Mechanism, q: FloatArray, name: str, value: Any) -> None:
+def set_position(mechanism: MechanismData, q: FloatArray, name: str, value: Any) -> None:
     """Write the position ``value`` of joint ``name`` into ``q`` (nq,), in place.
 
     Raises
@@ -37,7 +39,11 @@ def set_position(mechanism: Mechanism, q: FloatArray, name: str, value: Any) -> 
     InputError
         For an unknown joint, or a value of the wrong length or not finite.
     """
-    joint = mechanism.joint(name)
+    write_position(mechanism.joint(name), q, name, value)
+
+
+def write_position(joint: Any, q: FloatArray, name: str, value: Any) -> None:
+    """:func:`set_position` for Pinocchio's joint model ``joint``, called ``name`` in messages."""
     own = slice(joint.idx_q, joint.idx_q + joint.nq)
     if joint.nv == 1:
         angle = _numbers(value, name, {1: "one finite number (rad or m)"})[0]
@@ -54,7 +60,7 @@ def set_position(mechanism: Mechanism, q: FloatArray, name: str, value: Any) -> 
         # The group part is last: a quaternion, or (cos, sin).
         part = slice(array.size - (2 if planar else 4), None)
         length = float(np.linalg.norm(array[part]))
-        if abs(length - 1.0) > 1e-3:
+        if abs(length - 1.0) > UNIT_LENGTH_TOLERANCE:
             raise InputError(
                 f"joint {name!r}: the rotation part of {value!r} has length {length:.6g}",
                 remedy="Give a unit quaternion (x, y, z, w), or a unit (cos, sin) pair",
@@ -63,7 +69,7 @@ def set_position(mechanism: Mechanism, q: FloatArray, name: str, value: Any) -> 
     q[own] = array
 
 
-def set_rate(mechanism: Mechanism, v: FloatArray, name: str, value: Any) -> None:
+def set_rate(mechanism: MechanismData, v: FloatArray, name: str, value: Any) -> None:
     """Write the rate ``value`` of joint ``name`` into ``v`` (nv,), in place.
 
     Raises
@@ -71,12 +77,16 @@ def set_rate(mechanism: Mechanism, v: FloatArray, name: str, value: Any) -> None
     InputError
         For an unknown joint, or a value of the wrong length or not finite.
     """
-    joint = mechanism.joint(name)
-    what = "one finite number (rad/s or m/s)" if joint.nv == 1 else f"{joint.nv} finite numbers"
-    v[joint.idx_v : joint.idx_v + joint.nv] = _numbers(value, name, {joint.nv: what})
+    write_rate(mechanism.joint(name), v, name, value)
 
 
-def coordinate_names(mechanism: Mechanism) -> tuple[str, ...]:
+def write_rate(joint: Any, v: FloatArray, name: str, value: Any) -> None:
+    """:func:`set_rate` for Pinocchio's joint model ``joint``, called ``name`` in messages."""
+    accepted = "one finite number (rad/s or m/s)" if joint.nv == 1 else f"{joint.nv} finite numbers"
+    v[joint.idx_v : joint.idx_v + joint.nv] = _numbers(value, name, {joint.nv: accepted})
+
+
+def coordinate_names(mechanism: MechanismData) -> tuple[str, ...]:
     """A name for each velocity component (nv,): the joint's, or ``joint[i]`` if it has several."""
     names = []
     for name in mechanism.joint_names:
@@ -85,7 +95,7 @@ def coordinate_names(mechanism: Mechanism) -> tuple[str, ...]:
     return tuple(names)
 
 
-def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
+def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexArray:
     """Velocity indices of the joints ``names``, in that order.
 
     Raises
@@ -102,7 +112,7 @@ def joint_coordinates(mechanism: Mechanism, names: Iterable[str]) -> IndexArray:
     return np.array(indices, dtype=int)
 
 
-def position_of(mechanism: Mechanism, q: FloatArray, name: str) -> float:
+def position_of(mechanism: MechanismData, q: FloatArray, name: str) -> float:
     """Position (rad or m) of the one-degree joint ``name`` in q (nq,)."""
     joint = mechanism.joint(name)
     own = q[joint.idx_q : joint.idx_q + joint.nq]

@@ -1,14 +1,17 @@
-"""Drives: motions prescribed over time, and the constraints g(q) = s(t) that they are.
+"""Drives: motions prescribed over time, as the constraints g(q) = s(t).
 
-A drive takes away one degree of freedom; the force that it needs is ``solution.drive_forces``.
+A drive removes one degree of freedom; the force that it exerts is ``solution.drive_forces``.
+The functions at the top collect the laws over time of a mechanism: until when they are defined, and
+where they are not smooth.
 
-Which parts of a mechanism depend on time, until when, and where they are not smooth.
+The fields of :class:`Drive` are the one list of the keys of a drive: descriptions
+(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -60,11 +63,11 @@ def knots_between(laws: Sequence[NamedLaw], t0: float, t_end: float) -> tuple[fl
     return tuple(sorted(knot for knot in times if t0 < knot < t_end))
 
 
-HAS_VALUES = (Table, Polynomial, Sine)
-"""Laws that say where they start, so that they can be meant as positions themselves."""
+LAWS_WITH_VALUES = (Table, Polynomial, Sine)
+"""Laws with a value s(0) of their own, which can prescribe positions."""
 
-NOMINAL = 1e-9
-"""Length (m) of the closure of a driven distance, which the motion of the drive takes off again."""
+NOMINAL_LENGTH = 1e-9
+"""Length (m) of the closure of a driven distance, which the rows of the drive subtract again."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ class Drive:
     joint: str | None = None
     a: Anchor | None = None
     b: Anchor | None = None
-    axis: Sequence[float] | None = None
+    axis: Sequence[float] | None = field(default=None, metadata={"count": 3})
     distance: bool = False
     absolute: bool = False
     name: str = ""
@@ -126,7 +129,7 @@ class Drive:
                 "what is driven is not determined",
                 "Give axis = [x, y, z] or distance = true with a and b, and neither with a joint",
             )
-        if self.absolute and not isinstance(self.law, HAS_VALUES):
+        if self.absolute and not isinstance(self.law, LAWS_WITH_VALUES):
             raise self._fault(
                 f"the law {self.law.type!r} starts from the initial value in any case",
                 "Remove absolute",
@@ -139,11 +142,11 @@ class Drive:
 
     @property
     def closure(self) -> LoopClosure | None:
-        """For a point: the closure whose row g(q) the drive lets move; None for a joint."""
+        """For a point: the closure whose row is g(q); None for a joint."""
         if self.a is None or self.b is None:
             return None
         if self.distance:
-            return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL)
+            return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL_LENGTH)
         x, y, z = self.axis or ()
         return LoopClosure("point_on_plane", self.a, self.b, (x, y, z), self.name)
 
@@ -195,7 +198,7 @@ class Drive:
 
 
 def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
-    """The drives as their rows come after those of the loops: points first, then joints."""
+    """The drives in the order of their rows (after those of the loops): points, then joints."""
     return tuple(sorted(drives, key=lambda drive: drive.joint is not None))
 
 

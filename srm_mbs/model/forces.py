@@ -1,20 +1,18 @@
-"""Force elements as immutable descriptions; :mod:`srm_mbs.dynamics.forces` evaluates them.
+"""Force elements as immutable data; :mod:`srm_mbs.dynamics.forces` evaluates them.
 
-The energy of springs and bushings is part of ``solution.energy``; torques and wrenches have none.
+``solution.energy`` contains the energy of springs and bushings; torques and wrenches have none.
 Torques and wrenches may follow a law over time (:mod:`srm_mbs.model.laws`).
 
-What every force element is; the kinds are in :mod:`srm_mbs.model.forces` and ``user_forces``.
-
-Forces that are Python functions of time and state.
-
-How force elements check the values they are given, and what they say of wrong ones.
+The fields of these classes are the one list of the keys of a force: descriptions
+(:mod:`srm_mbs.formats.toml.schema`), saved runs (:mod:`srm_mbs.simulation.storage`) and tables
+read them, with the units, lengths and bounds that :func:`quantity` gives them.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
@@ -23,13 +21,13 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import Anchor, finite_numbers, name_places, resolve_apart
+from srm_mbs.model.anchors import Anchor, name_places, resolve_apart
 from srm_mbs.model.laws import Law
+from srm_mbs.model.numbers import finite_numbers
 
 
 class ForceElement(ABC):
-    """What acts on the joints or links of a mechanism; the kinds are in
-    :mod:`srm_mbs.model.forces`.
+    """A force on the joints or links of a mechanism.
 
     Attributes
     ----------
@@ -58,7 +56,7 @@ class ForceElement(ABC):
 
 @dataclass(frozen=True)
 class UserForce(ForceElement):
-    """A function of the user's, called at every stage of every step.
+    """A force given by a Python function, which is called at every stage of every step.
 
     It should be smooth; where it is not, give the times as ``breakpoints`` to
     :func:`srm_mbs.simulate`.  The compiled kernel calls back for it, which costs most of its speed.
@@ -113,9 +111,26 @@ class UserForce(ForceElement):
             )
 
 
-def in_unit(unit: str, default: Any) -> Any:
-    """A field with a unit, for tables; "N m, N": that for angles, then that for lengths."""
-    return field(default=default, metadata={"unit": unit})
+def quantity(
+    unit: str, default: Any, *, lowest: float = -np.inf, count: int = 0, needed: bool = False
+) -> Any:
+    """A numerical field of a force element; :func:`take_quantities` checks and stores it.
+
+    Parameters
+    ----------
+    unit
+        For tables; "N m, N": that for angles, then that for lengths.
+    default
+        Its default; None: the element decides.
+    lowest
+        The least value.
+    count
+        Length of a list of numbers; 0: one number.
+    needed
+        Whether a description must give it, because the element refuses the default.
+    """
+    facts = {"unit": unit, "lowest": lowest, "count": count, "needed": needed}
+    return field(default=default, metadata=facts)
 
 
 def fault(force: ForceElement, problem: str, remedy: str) -> InputError:
@@ -150,18 +165,30 @@ def take(force: ForceElement, key: str, count: int = 0, lowest: float = -np.inf)
     return value
 
 
-def take_rates(force: ForceElement, count: int = 0) -> None:
-    """Check stiffness and damping: not negative, not both zero.
+def take_quantities(force: Any) -> None:
+    """Check and store every :func:`quantity` of ``force`` that is not None.
 
     Raises
     ------
     InputError
-        If one is negative or not finite, or both are zero.
+        If one is not finite, too small, or of the wrong length.
     """
-    given = [take(force, key, count, 0.0) for key in ("stiffness", "damping")]
-    if not np.any(given):
+    for key in fields(force):
+        if "unit" in key.metadata and getattr(force, key.name) is not None:
+            take(force, key.name, key.metadata["count"], key.metadata["lowest"])
+
+
+def refuse_without_effect(force: ForceElement, *keys: str) -> None:
+    """Refuse an element whose quantities ``keys`` are all zero.
+
+    Raises
+    ------
+    InputError
+        Naming them.
+    """
+    if not np.any([getattr(force, key) for key in keys]):
         raise fault(
-            force, "stiffness and damping are zero", "Give one of them, or remove the element"
+            force, f"{' and '.join(keys)} are zero", "Give one of them, or remove the element"
         )
 
 
@@ -201,8 +228,8 @@ def take_law(force: ForceElement, count: int) -> bool:
     return True
 
 
-OPEN = 1e30
-"""Limits (rad, m) beyond this are none; Pinocchio has the largest number there."""
+OPEN_LIMIT = 1e30
+"""Joint limits (rad, m) beyond this are open; Pinocchio writes the largest double there."""
 
 
 @dataclass(frozen=True)
@@ -237,21 +264,21 @@ class SpringDamper(ForceElement):
     has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
-    stiffness: float = in_unit("N/m", 0.0)
-    damping: float = in_unit("N s/m", 0.0)
-    rest_length: float | None = in_unit("m", None)
+    stiffness: float = quantity("N/m", 0.0, lowest=0.0)
+    damping: float = quantity("N s/m", 0.0, lowest=0.0)
+    rest_length: float | None = quantity("m", None, lowest=0.0)
     name: str = ""
 
     def __post_init__(self) -> None:
         take_name(self, *name_places(f"force {self.name or self.type!r}", self.a, self.b))
-        take_rates(self)
+        take_quantities(self)
+        refuse_without_effect(self, "stiffness", "damping")
         if self.rest_length is None:
             if self.stiffness:
                 raise fault(
                     self, "a spring needs a rest_length", "Give the length without force, in m"
                 )
             object.__setattr__(self, "rest_length", 0.0)
-        take(self, "rest_length", 0, 0.0)
 
     def check(self, model: pin.Model) -> None:
         resolve_apart(model, self.a, self.b, f"force {self.name!r}")
@@ -281,7 +308,7 @@ class JointTorque(ForceElement):
 
     type: ClassVar[str] = "torque"
     joint: str
-    torque: float | tuple[float, ...] | None = in_unit("N m, N", None)
+    torque: float | tuple[float, ...] | None = quantity("N m, N", None)
     name: str = ""
     law: Law | tuple[Law, ...] | None = None
 
@@ -330,15 +357,15 @@ class TorsionSpring(ForceElement):
     type: ClassVar[str] = "torsion_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = in_unit("N m/rad, N/m", 0.0)
-    damping: float = in_unit("N m s/rad, N s/m", 0.0)
-    rest_angle: float = in_unit("rad, m", 0.0)
+    stiffness: float = quantity("N m/rad, N/m", 0.0, lowest=0.0)
+    damping: float = quantity("N m s/rad, N s/m", 0.0, lowest=0.0)
+    rest_angle: float = quantity("rad, m", 0.0)
     name: str = ""
 
     def __post_init__(self) -> None:
         take_name(self, self.joint)
-        take_rates(self)
-        take(self, "rest_angle")
+        take_quantities(self)
+        refuse_without_effect(self, "stiffness", "damping")
 
     def check(self, model: pin.Model) -> None:
         joint = moving_joint(self, model, self.joint)
@@ -382,8 +409,8 @@ class Wrench(ForceElement):
 
     type: ClassVar[str] = "wrench"
     at: Anchor
-    force: tuple[float, float, float] = in_unit("N", (0.0, 0.0, 0.0))
-    moment: tuple[float, float, float] = in_unit("N m", (0.0, 0.0, 0.0))
+    force: tuple[float, float, float] = quantity("N", (0.0, 0.0, 0.0), count=3)
+    moment: tuple[float, float, float] = quantity("N m", (0.0, 0.0, 0.0), count=3)
     frame: Literal["world", "link"] = "world"
     name: str = ""
     law: Law | tuple[Law, ...] | None = None
@@ -394,10 +421,8 @@ class Wrench(ForceElement):
         if several and not np.any([self.force, self.moment]):
             object.__setattr__(self, "force", (1.0, 1.0, 1.0))
             object.__setattr__(self, "moment", (1.0, 1.0, 1.0))
-        if not np.any([take(self, "force", 3), take(self, "moment", 3)]):
-            raise fault(
-                self, "force and moment are zero", "Give one of them, or remove the element"
-            )
+        take_quantities(self)
+        refuse_without_effect(self, "force", "moment")
         if self.frame not in ("world", "link"):
             raise fault(self, f"there is no frame {self.frame!r}", 'Give "world" or "link"')
 
@@ -443,13 +468,14 @@ class Bushing(ForceElement):
     has_potential: ClassVar[bool] = True
     a: Anchor
     b: Anchor
-    stiffness: Sequence[float] = in_unit("N m/rad, N/m", (0.0,) * 6)
-    damping: Sequence[float] = in_unit("N m s/rad, N s/m", (0.0,) * 6)
+    stiffness: Sequence[float] = quantity("N m/rad, N/m", (0.0,) * 6, lowest=0.0, count=6)
+    damping: Sequence[float] = quantity("N m s/rad, N s/m", (0.0,) * 6, lowest=0.0, count=6)
     name: str = ""
 
     def __post_init__(self) -> None:
         take_name(self, *name_places(f"force {self.name or self.type!r}", self.a, self.b))
-        take_rates(self, 6)
+        take_quantities(self)
+        refuse_without_effect(self, "stiffness", "damping")
 
     def check(self, model: pin.Model) -> None:
         resolve_apart(model, self.a, self.b, f"force {self.name!r}")
@@ -485,21 +511,18 @@ class LimitSpring(ForceElement):
     type: ClassVar[str] = "limit_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = in_unit("N m/rad, N/m", 0.0)
-    damping: float = in_unit("N m s/rad, N s/m", 0.0)
-    lower: float | None = in_unit("rad, m", None)
-    upper: float | None = in_unit("rad, m", None)
-    depth: float | None = in_unit("rad, m", None)
+    stiffness: float = quantity("N m/rad, N/m", 0.0, lowest=0.0, needed=True)
+    damping: float = quantity("N m s/rad, N s/m", 0.0, lowest=0.0)
+    lower: float | None = quantity("rad, m", None)
+    upper: float | None = quantity("rad, m", None)
+    depth: float | None = quantity("rad, m", None)
     name: str = ""
 
     def __post_init__(self) -> None:
         take_name(self, self.joint)
-        take(self, "damping", 0, 0.0)
-        if not take(self, "stiffness", 0, 0.0) > 0.0:
+        take_quantities(self)
+        if not self.stiffness > 0.0:
             raise fault(self, "a limit needs a stiffness", "Give a positive stiffness")
-        for key in ("lower", "upper", "depth"):
-            if getattr(self, key) is not None:
-                take(self, key)
         if self.depth is not None and not self.depth > 0.0:
             raise fault(self, f"depth = {self.depth:g} is not positive", "Give a positive depth")
 
@@ -508,7 +531,9 @@ class LimitSpring(ForceElement):
         joint = moving_joint(self, model, self.joint)
         low = float(model.lowerPositionLimit[joint.idx_q]) if self.lower is None else self.lower
         high = float(model.upperPositionLimit[joint.idx_q]) if self.upper is None else self.upper
-        low, high = (x if abs(x) < OPEN else float(np.copysign(np.inf, x)) for x in (low, high))
+        low, high = (
+            x if abs(x) < OPEN_LIMIT else float(np.copysign(np.inf, x)) for x in (low, high)
+        )
         width = min(high - low, 1.0)
         return low, high, 0.01 * width if self.depth is None else self.depth
 

@@ -1,11 +1,14 @@
-r"""Laws over time: what drives and forces follow, as data that checks itself.
+r"""Laws over time, which drives and forces follow, as data that checks itself.
 
 Every law becomes a :class:`Curve`,
 
     s(t) = sum_j c_ij (t - b_i)^j  on [b_i, b_{i+1})  +  sum_k A_k sin(w_k t + phi_k),
 
-so that both backends evaluate the same numbers.  All of them are twice continuously differentiable;
-where s''' jumps is a knot, on which steps must end to keep the order of a scheme.
+so that both backends evaluate the same numbers.  All laws are twice continuously differentiable.
+Times at which s''' jumps are called knots; steps end there, so that schemes keep their order.
+
+The fields of these classes are the one list of the keys of a law: descriptions
+(:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from srm_mbs.errors import InputError
+from srm_mbs.model.numbers import finite_array
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class Curve:
     Attributes
     ----------
     breaks
-        b_i (s), ascending; the first piece also holds before its start, the last one for ever.
+        b_i (s), ascending; the first piece also holds before b_0, the last one for ever.
     pieces
         c_i: the coefficients of each piece in rising powers, all of one length >= 1.
     sines
@@ -58,17 +62,17 @@ class Curve:
         return value, rate, bend
 
     def piece(self, t: float) -> Curve:
-        """The piece that begins at t (s) or holds there, for ever and since ever."""
+        """The polynomial piece that is active at t (s), extended to all times, with the sines."""
         i = max(bisect_right(self.breaks, t) - 1, 0)
         return Curve((self.breaks[i],), (self.pieces[i],), self.sines)
 
     def shifted(self, by: float) -> Curve:
-        """The same curve ``by`` higher."""
+        """The curve s(t) + ``by``."""
         pieces = tuple((piece[0] + by, *piece[1:]) for piece in self.pieces)
         return Curve(self.breaks, pieces, self.sines)
 
     def constants(self) -> dict[str, Any]:
-        """What the compiled kernel needs of it."""
+        """Breaks (n,), pieces (n, k) and sines (m, 3) as arrays, for the compiled kernel."""
         return {
             "breaks": np.array(self.breaks),
             "pieces": np.array(self.pieces),
@@ -76,7 +80,8 @@ class Curve:
         }
 
 
-ALWAYS = (-math.inf, math.inf)
+ALL_TIMES = (-math.inf, math.inf)
+"""s."""
 
 
 @runtime_checkable
@@ -87,7 +92,7 @@ class Law(Protocol):
     """Its name in a description."""
 
     def curve(self, initial: float = 0.0) -> Curve:
-        """The law itself; ``initial`` is where a law starts that only knows where it leads."""
+        """s(t); ``initial`` is s(0) of laws that prescribe only their target or their speed."""
 
     @property
     def knots(self) -> tuple[float, ...]:
@@ -96,8 +101,8 @@ class Law(Protocol):
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time (s) that it says something about; always by default."""
-        return ALWAYS
+        """First and last time (s) for which it is defined; all times by default."""
+        return ALL_TIMES
 
 
 def _fault(law: Law, problem: str, remedy: str) -> InputError:
@@ -107,27 +112,23 @@ def _fault(law: Law, problem: str, remedy: str) -> InputError:
 def _take(law: Law, key: str, above: float = -math.inf) -> float:
     """Check a number of ``law`` and store it as a float."""
     given = getattr(law, key)
-    usable = isinstance(given, (int, float, np.integer, np.floating)) and not isinstance(
-        given, bool
-    )
-    if not usable or not math.isfinite(given):
+    number = None if isinstance(given, (bool, str)) else finite_array(given, ())
+    if number is None:
         raise _fault(law, f"{key} = {given!r} is not a finite number", f"Give a number for {key}")
-    if not given > above:
+    if not number > above:
         raise _fault(law, f"{key} = {given!r} is too small", f"Give {key} above {above:g}")
-    object.__setattr__(law, key, float(given))
-    return float(given)
+    object.__setattr__(law, key, float(number))
+    return float(number)
 
 
 def _take_list(law: Law, key: str, least: int) -> tuple[float, ...]:
-    """Check a list of numbers of ``law`` and store it as a tuple of floats."""
-    given = getattr(law, key)
+    """Check a list of at least ``least`` numbers of ``law`` and store it as a tuple of floats."""
+    array = finite_array(getattr(law, key), (None,))
     remedy = f"Give a list of at least {least} finite numbers"
-    try:
-        array = np.asarray(given, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise _fault(law, f"{key} is not a list of numbers", remedy) from error
-    if array.ndim != 1 or len(array) < least or not np.isfinite(array).all():
-        raise _fault(law, f"{key} has shape {array.shape} or is not finite", remedy)
+    if array is None:
+        raise _fault(law, f"{key} is not a list of finite numbers", remedy)
+    if len(array) < least:
+        raise _fault(law, f"{key} has shape {array.shape}", remedy)
     values = tuple(array.tolist())
     object.__setattr__(law, key, values)
     return values
@@ -171,7 +172,7 @@ class Sine(Law):
     phase
         rad.
     offset
-        Mean value; a drive, which starts from its initial value, has no use for it.
+        Mean value; without effect on a drive, which starts from its initial value.
 
     Raises
     ------
@@ -236,7 +237,7 @@ class MinimumJerk(Law):
     Parameters
     ----------
     target
-        Where it ends (rad, m): a position, not a distance.
+        Final value (rad, m): a position, not a distance.
     duration
         s, positive.
     start
@@ -261,11 +262,11 @@ class MinimumJerk(Law):
 
     def curve(self, initial: float = 0.0) -> Curve:
         way, T = self.target - initial, self.duration
-        moving = (initial, 0.0, 0.0, 10.0 * way / T**3, -15.0 * way / T**4, 6.0 * way / T**5)
-        still = (0.0,) * 5
+        motion = (initial, 0.0, 0.0, 10.0 * way / T**3, -15.0 * way / T**4, 6.0 * way / T**5)
+        rest = (0.0,) * 5
         return Curve(
             (self.start - 1.0, self.start, self.start + T),
-            ((initial, *still), moving, (self.target, *still)),
+            ((initial, *rest), motion, (self.target, *rest)),
         )
 
     @property

@@ -1,20 +1,17 @@
-"""The description of a mechanism: tree, closures, forces, drives and an initial state.
+"""The data of a mechanism: tree, closures, forces, drives and an initial state.
 
-Nothing here computes; :mod:`srm_mbs.dynamics` evaluates a mechanism.  What is asked of its parts
-together is in :mod:`srm_mbs.model.validation`.  A ``pin.Model`` cannot be frozen: the package
-treats it as constant and never attaches anything to it, and so should you.
-
-Where a mechanism came from, and what its description says besides the mechanism itself.
-
-What follows from a description, made once when it is first asked for, and kept.
+The data check themselves (:mod:`srm_mbs.model.validation` has the checks of the parts together)
+and compute no dynamics; :class:`srm_mbs.Mechanism` adds what follows from them.  A ``pin.Model``
+cannot be frozen: the package treats it as constant and never attaches anything to it, and so should
+you.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import update_wrapper
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -22,8 +19,21 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.drives import NamedLaw, check_covers, knots_between, laws_over_time
+from srm_mbs.model.drives import (
+    Drive,
+    NamedLaw,
+    check_covers,
+    knots_between,
+    laws_over_time,
+    positions,
+)
 from srm_mbs.model.forces import ForceElement
+from srm_mbs.model.laws import Curve
+from srm_mbs.model.pinocchio_constraints import (
+    PinocchioConstraints,
+    closures_from_pinocchio,
+    to_pinocchio,
+)
 from srm_mbs.model.validation import (
     check_names,
     check_tree,
@@ -32,13 +42,6 @@ from srm_mbs.model.validation import (
     checked_start,
     without,
 )
-
-if TYPE_CHECKING:
-    from srm_mbs.dynamics.constraints.mobility import Mobility
-    from srm_mbs.dynamics.constraints.structure import Structure
-    from srm_mbs.model.drives import Drive
-    from srm_mbs.model.laws import Curve
-    from srm_mbs.model.pinocchio_constraints import PinocchioConstraints
 
 
 @dataclass(frozen=True)
@@ -79,32 +82,65 @@ class SimulationDefaults:
     atol: float | None = None
 
 
-class Derivations:
-    """Base of :class:`~srm_mbs.model.mechanism.Mechanism`: what others derive from it, by name."""
+class Results:
+    """Results of functions of one object, by the function that computed them."""
 
-    @cached_property
-    def _derived(self) -> dict[str, Any]:
-        return {}
+    def __init__(self) -> None:
+        self.by_function: dict[Any, Any] = {}
 
-    @cached_property
-    def _of_start(self) -> dict[str, Any]:
-        return {}
 
-    def derived(self, name: str, make: Callable[[], Any]) -> Any:
-        """What follows from the model alone, made once and kept under ``name``.
+class ResultOwner:
+    """Base of :class:`MechanismData`: holds the results of :class:`per_model` and
+    :class:`per_start`."""
 
-        It is shared with every :meth:`with_state`, so it must not depend on the initial state, and
-        nothing may change it.
-        """
-        if name not in self._derived:
-            self._derived[name] = make()
-        return self._derived[name]
+    _model_results: Results
+    _start_results: Results
 
-    def at_start(self, name: str, make: Callable[[], Any]) -> Any:
-        """As :meth:`derived`, for what depends on the initial state as well."""
-        if name not in self._of_start:
-            self._of_start[name] = make()
-        return self._of_start[name]
+
+Owner = TypeVar("Owner", bound=ResultOwner, contravariant=True)
+Result = TypeVar("Result")
+
+
+class _Memoised(Generic[Owner, Result]):
+    """A function of a mechanism whose result is kept with the mechanism; nothing may change it."""
+
+    def __init__(self, function: Callable[[Owner], Result]) -> None:
+        self._function = function
+        update_wrapper(self, function)
+
+    def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
+        raise NotImplementedError
+
+    def __call__(self, mechanism: Owner) -> Result:
+        results = self._results(mechanism)
+        if self not in results:
+            results[self] = self._function(mechanism)
+        return results[self]  # type: ignore[no-any-return]
+
+    def kept(self, mechanism: Owner) -> Result | None:
+        """The result, if it was computed or given before."""
+        return self._results(mechanism).get(self)
+
+    def keep(self, mechanism: Owner, result: Result) -> None:
+        """Use ``result`` instead of computing it."""
+        self._results(mechanism)[self] = result
+
+
+class per_model(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
+    """Decorator: evaluate a function of a mechanism once for it and every ``with_state`` of it.
+
+    The result must not depend on the initial state.
+    """
+
+    def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
+        return mechanism._model_results.by_function
+
+
+class per_start(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
+    """Decorator: evaluate a function of a mechanism once for each initial state."""
+
+    def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
+        return mechanism._start_results.by_function
 
 
 FRICTION_SPEED = 0.01
@@ -112,38 +148,9 @@ FRICTION_SPEED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Mechanism(Derivations):
-    """A mechanism: a Pinocchio tree, the closures of its loops, and an initial state.
-
-    Parameters
-    ----------
-    model
-        The spanning tree, gravity included; ``model.damping`` acts on the joints (N m s/rad,
-        N s/m), and ``model.friction`` F (N m, N) with -F tanh(v / friction_speed).
-    loops
-        Loop closures; names must be unique.  A ``distance`` without a length takes the one at q0.
-    q0 : (nq,), v0 : (nv,)
-        Initial state; by default the neutral configuration at rest.  :func:`srm_mbs.load`
-        assembles it; from a ``pin.Model`` in hand use :func:`srm_mbs.assemble`.
-    forces
-        Force elements (:mod:`srm_mbs.model.forces`); names must be unique.
-    drives
-        Prescribed motions (:class:`srm_mbs.Drive`); names must be unique.
-    friction_speed
-        Speed (rad/s, m/s) over which joint friction changes its sign: it is 76 % of F there.  A
-        joint held by friction creeps below it; small values make the equations stiff.
-    name
-        Name in messages and plots.
-    source, defaults, notes
-        Filled in by :func:`srm_mbs.load`: what the mechanism was read from, the defaults of its
-        description, and what the reader should know (elements that were ignored, and why).
-
-    Raises
-    ------
-    InputError
-        If names repeat, an anchor or the joint of a force, drive or coupling is unknown or cannot
-        take it, a shape does not fit, the joints of the model are not in depth-first order, joint
-        friction is negative, or it has mimic joints, which this version does not simulate.
+class MechanismData(ResultOwner):
+    """The data of a :class:`~srm_mbs.dynamics.mechanism.Mechanism`, which has the documentation of
+    the parameters.
     """
 
     model: pin.Model
@@ -159,6 +166,7 @@ class Mechanism(Derivations):
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        self._forget()
         model = self.model
         set_ = object.__setattr__
         check_tree(model)
@@ -182,7 +190,12 @@ class Mechanism(Derivations):
             drive.check(model)
         set_(self, "friction_speed", checked_friction_speed(model, self.friction_speed))
 
-    def with_loop(self, loop: LoopClosure) -> Mechanism:
+    def _forget(self) -> None:
+        """Begin without results."""
+        object.__setattr__(self, "_model_results", Results())
+        object.__setattr__(self, "_start_results", Results())
+
+    def with_loop(self, loop: LoopClosure) -> Self:
         """The same mechanism with one more closure, for :class:`srm_mbs.Switch`.
 
         Its initial state may violate the closure; a switch brings its own.
@@ -194,7 +207,7 @@ class Mechanism(Derivations):
         """
         return replace(self, loops=(*self.loops, loop))
 
-    def without_loop(self, name: str) -> Mechanism:
+    def without_loop(self, name: str) -> Self:
         """The same mechanism without the closure ``name``.
 
         Raises
@@ -205,7 +218,7 @@ class Mechanism(Derivations):
         return replace(self, loops=without("loop", self.loops, name))
 
     @classmethod
-    def from_pinocchio(cls, model: pin.Model, constraint_models: Any, **options: Any) -> Mechanism:
+    def from_pinocchio(cls, model: pin.Model, constraint_models: Any, **options: Any) -> Self:
         """A mechanism whose closures are Pinocchio's constraint models.
 
         Parameters
@@ -222,18 +235,14 @@ class Mechanism(Derivations):
         InputError
             For a constraint model that is none of its closures.
         """
-        from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
-
         return cls(model, closures_from_pinocchio(model, constraint_models), **options)
 
     def to_pinocchio(self) -> PinocchioConstraints:
         """The closures as Pinocchio's constraint models, as far as it has them: point and frame;
         the others are named."""
-        from srm_mbs.model.pinocchio_constraints import to_pinocchio
+        return to_pinocchio(self.model, self.loops, self.drives)
 
-        return to_pinocchio(self)
-
-    def without_drive(self, name: str) -> Mechanism:
+    def without_drive(self, name: str) -> Self:
         """The same mechanism without the drive ``name``.
 
         Raises
@@ -243,34 +252,45 @@ class Mechanism(Derivations):
         """
         return replace(self, drives=without("drive", self.drives, name))
 
-    def moved(self, q: Any, v: Any) -> Mechanism:
+    def moved(self, q: Any, v: Any) -> Self:
         """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with
-        :meth:`with_state`, drives go on as they were."""
+        :meth:`with_state`, drives continue their motion."""
         changed = self.with_state(q, v)
-        if self.drives:
-            changed.__dict__["drive_curves"] = self.drive_curves
+        return changed.with_drive_curves(self.drive_curves) if self.drives else changed
+
+    def with_state(self, q0: Any, v0: Any) -> Self:
+        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
+        changed = self._at_no_start()
+        changed._take_start(q0, v0)
         return changed
 
-    def with_state(self, q0: Any, v0: Any) -> Mechanism:
-        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
+    def with_drive_curves(self, curves: dict[str, Curve]) -> Self:
+        """The same mechanism, whose driven coordinates follow ``curves`` (by the drive's name)
+        instead of beginning at q0: a motion that began before the initial state."""
+        changed = self._at_no_start()
+        _drive_curves.keep(changed, curves)
+        return changed
+
+    def _at_no_start(self) -> Self:
+        """A copy that shares the results for the model and has none for the start."""
         changed = object.__new__(type(self))
-        changed.__dict__.update(self.__dict__)
-        for kept in ("initial_errors", "drive_curves", "_of_start", "structure"):
-            changed.__dict__.pop(kept, None)
-        changed._take_start(q0, v0)
-        if "structure" in self.__dict__:
-            changed.__dict__["structure"] = self.structure.at(changed)
-        changed.__dict__["_derived"] = self._derived
+        for entry in fields(self):
+            object.__setattr__(changed, entry.name, getattr(self, entry.name))
+        object.__setattr__(changed, "_model_results", self._model_results)
+        object.__setattr__(changed, "_start_results", Results())
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a pickle holds: the fields, the analysis, which other processes then share, and the
-        motion of drives that did not begin with this state."""
-        names = [*(entry.name for entry in fields(self)), "structure", "drive_curves"]
-        return {name: self.__dict__[name] for name in names if name in self.__dict__}
+        """The fields, and the motion of the drives, which may have begun before this state."""
+        state = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return state | {"drive_curves": _drive_curves.kept(self)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
+        self._forget()
+        for entry in fields(self):
+            object.__setattr__(self, entry.name, state[entry.name])
+        if state["drive_curves"] is not None:
+            _drive_curves.keep(self, state["drive_curves"])
         for array in (self.q0, self.v0):
             array.setflags(write=False)
 
@@ -279,41 +299,13 @@ class Mechanism(Derivations):
         object.__setattr__(self, "q0", q0)
         object.__setattr__(self, "v0", v0)
 
-    @cached_property
-    def structure(self) -> Structure:
-        """Rank, redundancy and scales of the closures, found once by the walk of docs/notation.md.
-
-        An upward import: the analysis evaluates the mechanism.
-        """
-        from srm_mbs.dynamics.constraints.structure import analyse
-
-        return analyse(self)
-
-    @property
-    def mobility(self) -> Mobility:
-        """Gruebler counts against the true rank, redundant rows, joints that are stuck or idle.
-
-        An upward import, as for :attr:`structure`.
-        """
-        from srm_mbs.dynamics.constraints.mobility import mobility
-
-        return self.derived("mobility", lambda: mobility(self))  # type: ignore[no-any-return]
-
-    @cached_property
-    def initial_errors(self) -> tuple[FloatArray, FloatArray]:
-        """g - s and G v - s' (rows,) at the initial state, in m and rad, and per second."""
-        from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
-
-        g, c = constraint_errors(self, np.zeros(1), self.q0[None], self.v0[None])
-        return g[0], c[0]
-
     @property
     def constrained(self) -> bool:
         """Whether it has loops or drives."""
         return bool(self.loops or self.drives)
 
     @property
-    def undriven(self) -> Mechanism:
+    def undriven(self) -> Self:
         """The same mechanism without its drives."""
         return replace(self, drives=()) if self.drives else self
 
@@ -332,17 +324,10 @@ class Mechanism(Derivations):
                 remedy="Take mechanism.undriven, and hold or actuate its joints instead",
             )
 
-    @cached_property
+    @property
     def drive_curves(self) -> dict[str, Curve]:
         """The driven coordinate (rad, m) of each drive over time, from where q0 has it."""
-        from srm_mbs.model.drives import positions
-
-        starts = positions(self.model, self.drives, self.q0)
-        return {drive.name: drive.curve(starts[drive.name]) for drive in self.drives}
-
-    @cached_property
-    def _laws(self) -> tuple[NamedLaw, ...]:
-        return laws_over_time(self.drives, self.forces)
+        return _drive_curves(self)
 
     def check_covers(self, t_end: float) -> None:
         """Refuse a run to ``t_end`` (s) that is longer than a table.
@@ -352,27 +337,17 @@ class Mechanism(Derivations):
         InputError
             Naming what has the table.
         """
-        check_covers(self._laws, t_end)
+        check_covers(_laws(self), t_end)
 
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
         """Times (s) between ``t0`` and ``t_end`` at which a part of it that depends on time is not
         smooth: knots of tables, switches of drives.  Runs take no step across them."""
-        return knots_between(self._laws, t0, t_end)
+        return knots_between(_laws(self), t0, t_end)
 
     @property
-    def degrees_of_freedom(self) -> int:
-        """nv minus the structural rank of closures and drives."""
-        return int(self.model.nv) - self.structure.rank
-
-    @property
-    def redundant_rows(self) -> tuple[str, ...]:
-        """Names of the closure rows that are zero wherever the loops are closed; left out."""
-        return self.structure.redundant_rows
-
-    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the moving joints, in Pinocchio's order."""
-        return tuple(self.model.names)[1:]
+        return _joint_names(self)
 
     def joint(self, name: str) -> Any:
         """The Pinocchio joint model of ``name``.
@@ -390,8 +365,24 @@ class Mechanism(Derivations):
 
     def __repr__(self) -> str:
         return (
-            f"Mechanism({self.name!r}, joints={list(self.joint_names)}, "
+            f"{type(self).__name__}({self.name!r}, joints={list(self.joint_names)}, "
             f"loops={[loop.name for loop in self.loops]}, "
             f"forces={[force.name for force in self.forces]}, "
             f"drives={[drive.name for drive in self.drives]})"
         )
+
+
+@per_model
+def _joint_names(mechanism: MechanismData) -> tuple[str, ...]:
+    return tuple(mechanism.model.names)[1:]
+
+
+@per_model
+def _laws(mechanism: MechanismData) -> tuple[NamedLaw, ...]:
+    return laws_over_time(mechanism.drives, mechanism.forces)
+
+
+@per_start
+def _drive_curves(mechanism: MechanismData) -> dict[str, Curve]:
+    starts = positions(mechanism.model, mechanism.drives, mechanism.q0)
+    return {drive.name: drive.curve(starts[drive.name]) for drive in mechanism.drives}

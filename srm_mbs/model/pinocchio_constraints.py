@@ -18,7 +18,7 @@ import pinocchio as pin
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import WORLD, Anchor
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.drives import Drive
 
 _KINDS = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
 _ANCHORS = {pin.PointAnchorConstraintModel: "point", pin.FrameAnchorConstraintModel: "frame"}
@@ -34,16 +34,16 @@ _KNOWN = (
 
 @dataclass(frozen=True)
 class PinocchioConstraints:
-    """What :meth:`srm_mbs.Mechanism.to_pinocchio` found.
+    """Closures of a mechanism in Pinocchio's form: :meth:`srm_mbs.Mechanism.to_pinocchio`.
 
     Attributes
     ----------
     models
         ``pin.StdVec_RigidConstraintModel``, for ``pin.initConstraintDynamics``; in LOCAL frames.
     names
-        The closures that they are, in this order.
+        Names of these closures, in the same order.
     without
-        Names of the closures, and of the drives, for which Pinocchio has none.
+        Names of the closures and drives for which Pinocchio has no constraint model.
     """
 
     models: Any
@@ -51,11 +51,13 @@ class PinocchioConstraints:
     without: tuple[str, ...]
 
 
-def to_pinocchio(mechanism: Mechanism) -> PinocchioConstraints:
-    """See :meth:`srm_mbs.Mechanism.to_pinocchio`."""
-    model = mechanism.model
+def to_pinocchio(
+    model: pin.Model, loops: Sequence[LoopClosure], drives: Sequence[Drive]
+) -> PinocchioConstraints:
+    """The closures of a mechanism as Pinocchio's constraint models; see
+    :meth:`srm_mbs.Mechanism.to_pinocchio`."""
     models, names, without = pin.StdVec_RigidConstraintModel(), [], []
-    for loop in mechanism.loops:
+    for loop in loops:
         if loop.type not in _KINDS or loop.a is None or loop.b is None:
             without.append(loop.name)
             continue
@@ -66,7 +68,7 @@ def to_pinocchio(mechanism: Mechanism) -> PinocchioConstraints:
         rigid.name = loop.name
         models.append(rigid)
         names.append(loop.name)
-    without += [drive.name for drive in mechanism.drives]
+    without += [drive.name for drive in drives]
     return PinocchioConstraints(models, tuple(names), tuple(without))
 
 

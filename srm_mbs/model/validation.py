@@ -1,6 +1,6 @@
-"""What is asked of a mechanism as a whole; its closures, forces and drives check themselves.
+"""Checks of a mechanism as a whole; its closures, forces and drives check themselves.
 
-Whether the inertias of a tree determine its motion.
+A tree must be in Pinocchio's order of joints, and its inertias must determine its motion.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from scipy.linalg.lapack import dpotrf
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import finite_numbers
+from srm_mbs.model.numbers import finite_array, finite_numbers
 
-NO_INERTIA = 1e-13
-"""An articulated inertia below this fraction of the composite one is the rounding of zero."""
+ARTICULATED_INERTIA_TOLERANCE = 1e-13
+"""Articulated inertia, over the composite one, below which it is rounding."""
 
 
 def check_inertia(model: pin.Model, file: str | None = None) -> None:
     """Refuse joints that move no inertia: the equations of motion have no solution.
 
-    ``file`` is what the model was read from.
+    ``file`` is the file that the model was read from.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
     for joint in range(1, model.njoints):
         if not moved[joint].any():
             raise InputError(
-                f"neither {links(joint)} nor anything behind it has inertia",
+                f"neither {links(joint)} nor anything that it carries has inertia",
                 file=file,
                 element=f"joint {model.names[joint]!r}",
                 remedy="Give the moving end of the chain an <inertial>",
@@ -60,7 +60,7 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
     at = undetermined_joint(model, q, file)
     if at is not None:
         raise InputError(
-            f"the joint moves mass ({links(at)} and what is behind it) but no inertia in one "
+            f"the joint moves mass ({links(at)} and what it carries) but no inertia in one "
             "of its directions: its acceleration is not determined",
             file=file,
             element=f"joint {model.names[at]!r}",
@@ -71,8 +71,9 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
 def undetermined_joint(model: pin.Model, q: FloatArray, file: str | None = None) -> int | None:
     """A joint with a direction in which it moves no inertia at q (nq,); None if there is none.
 
-    As one whose axis runs through a point mass, or the outer axes of massless links in line.  The
-    pivots of M, tips first, show it; they are those of the articulated inertias over M_ii.
+    Examples are an axis through a point mass, and the outer axes of massless links in line.  Such
+    joints are found by the pivots of the Cholesky factorisation of M, scaled to a unit diagonal and
+    with the tips of the tree first: they are the articulated inertias over M_ii.
 
     Raises
     ------
@@ -95,7 +96,9 @@ def undetermined_joint(model: pin.Model, q: FloatArray, file: str | None = None)
         failed = int(bad[0])
     else:
         factor, info = dpotrf(scaled, lower=1)
-        small = np.flatnonzero(np.diag(factor)[: info - 1 if info else None] ** 2 < NO_INERTIA)
+        small = np.flatnonzero(
+            np.diag(factor)[: info - 1 if info else None] ** 2 < ARTICULATED_INERTIA_TOLERANCE
+        )
         if not small.size and not info:
             return None
         failed = int(small[0]) if small.size else info - 1
@@ -201,26 +204,23 @@ def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, Float
     InputError
         If a shape does not fit, a number is not finite, or a quaternion is not of unit length.
     """
-    q0 = _frozen_array(q0, (model.nq,), "q0")
+    q0 = _frozen_array(q0, model.nq, "q0")
     if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
         raise InputError(
             "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
             element="q0",
             remedy="Use pinocchio.normalize(model, q0)",
         )
-    return q0, _frozen_array(v0, (model.nv,), "v0")
+    return q0, _frozen_array(v0, model.nv, "v0")
 
 
-def _frozen_array(values: Any, shape: tuple[int, ...], what: str) -> FloatArray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if array.shape != shape or not np.isfinite(array).all():
+def _frozen_array(values: Any, size: int, name: str) -> FloatArray:
+    array = finite_array(values, (size,))
+    if array is None:
         raise InputError(
-            f"{what} has shape {array.shape} or does not consist of finite numbers",
-            element=what,
-            remedy=f"Give {shape[0]} finite numbers",
+            f"{name} does not consist of {size} finite numbers",
+            element=name,
+            remedy=f"Give {size} finite numbers",
         )
     array.setflags(write=False)
     return array

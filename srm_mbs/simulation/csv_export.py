@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import joint_turns, row_dimensions
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ _COMPONENTS = {
 """Columns of joints of several degrees of freedom: positions, velocities."""
 
 
-def write_csv(solution: Solution, path: Path) -> None:
+def write_csv(solution: SimulationResult, path: Path) -> None:
     """Write ``solution`` at its times ``solution.t`` to ``path``; see the module's text.
 
     Raises
@@ -77,7 +77,7 @@ def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
     log.info("written: %s", path)
 
 
-def _columns(solution: Solution) -> dict[str, FloatArray]:
+def _columns(solution: SimulationResult) -> dict[str, FloatArray]:
     """Header and values (n,) of each column."""
     mechanism = solution.mechanism
     positions: dict[str, FloatArray] = {}

@@ -1,11 +1,11 @@
-"""What a run of a DAE returns: states and multipliers, and what is between them."""
+"""Results of runs of index-2 DAEs: states and multipliers, and their dense output."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
-from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read
+from srm_mbs.integration.dense_output import DenseOutput, StepData, checked_output_times
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.base import Method
+from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.simulation.result import RunOutcome, Settings, Statistics
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MULTIPLIER_POINTS = 5
 """Ends of steps through which the multiplier of sweeps is interpolated."""
 
 
-class DaeSolution(RunOutcome):
+class DaeResult(RunOutcome):
     """Result of :func:`srm_mbs.solve_dae`.
 
     Attributes
@@ -70,7 +69,7 @@ class DaeSolution(RunOutcome):
         self.scheme = method.scheme
         self.attempts = attempts
         self.settings = settings
-        self.status = status
+        self.status = RunStatus(status)
         self.message = message
         self.t_events: list[FloatArray] | None = None
         self.x_events: list[FloatArray] | None = None
@@ -108,7 +107,7 @@ class DaeSolution(RunOutcome):
         InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         x, y = self._at(np.atleast_1d(times))
         return (x[0], y[0]) if times.ndim == 0 else (x, y)
 
@@ -143,28 +142,6 @@ class DaeSolution(RunOutcome):
         out: FloatArray = np.linalg.norm(np.array(g).reshape(len(g), self._system.ny), axis=1)
         return out
 
-    def plot(self, path: str | Path | None = None, kind: str = "run") -> Figure:
-        """A picture of the run.
-
-        Parameters
-        ----------
-        path
-            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
-            omitted.
-        kind
-            ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
-
-        Raises
-        ------
-        InputError
-            For an unknown kind or suffix.
-        OSError
-            If the file cannot be written.
-        """
-        from srm_mbs.visualization.plotting import plot_dae
-
-        return plot_dae(self, path, kind)
-
     def to_csv(self, path: str | Path) -> None:
         """Write t, x and y as a table of comma-separated values, one row per time ``t``.
 
@@ -173,8 +150,6 @@ class DaeSolution(RunOutcome):
         path
             File name; ``.csv`` is usual and is not added.
         """
-        from srm_mbs.simulation.csv_export import write_table
-
         columns = {"t": self.t}
         for name, values in (("x", self.x), ("y", self.y)):
             columns |= {f"{name}[{i}]": column for i, column in enumerate(values.T)}

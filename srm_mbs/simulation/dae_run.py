@@ -1,39 +1,48 @@
-"""``solve_dae``: index-2 DAEs with the methods and the stepping of mechanisms."""
+"""Runs of semi-explicit index-2 DAEs, with the methods and the stepping of mechanisms."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
-from srm_mbs.integration.control.branch_guard import RateGuard
-from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import StepDecision, initial_step
+from srm_mbs.errors import ControllerError, EvaluationError, InputError
+from srm_mbs.integration.control.prescribed_times import suspected
+from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.dense_output import step_data
-from srm_mbs.integration.driver import DAE, RunRecord, Tick, integrate
+from srm_mbs.integration.driver import DAE, RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import drift, instability, passings, restarts, turns
-from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method, SweepNode
-from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.messages import branch_changes, method_messages
+from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.methods.thesis.dae_stability import instability
+from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE
-from srm_mbs.simulation.dae_result import DaeSolution
+from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
-    check_progress,
+    LOOSEST_RTOL,
+    TIGHTEST_RTOL,
+    RunOptions,
     checked_atol,
     checked_method,
-    checked_placement,
-    checked_rtol,
-    checked_singular_times,
-    checked_times,
     numbers,
-    positive,
-    step_size_control,
 )
-from srm_mbs.simulation.result import Settings, Statistics, attempt_array
+from srm_mbs.simulation.result import attempt_array
+from srm_mbs.simulation.runner import (
+    chosen_first_step,
+    failed_start,
+    finished,
+    integrate_steps,
+    placed_control,
+    settings,
+    statistics,
+)
+
+Result = TypeVar("Result", bound=DaeResult)
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""
@@ -80,7 +89,7 @@ def _absolute_tolerance(atol: Any, rtol: float, nx: int) -> FloatArray:
 
 
 def _check_start(system: DaeSystem, method: Method, t0: float, x0: FloatArray) -> None:
-    gap = system.closure_gap(t0, x0)
+    gap = system.constraint_residual(t0, x0)
     if not gap <= CONSISTENT:
         raise InputError(
             f"x0 violates g(t0, x0) = 0 by {gap:.1e} (relative error of x)",
@@ -95,82 +104,21 @@ def _check_start(system: DaeSystem, method: Method, t0: float, x0: FloatArray) -
         )
 
 
-def solve_dae(
+def run_dae(
     problem: SemiExplicitDAE,
     t_span: tuple[float, float],
     x0: Any,
-    *,
-    method: str | Method = "psrm",
-    tableau: str | ButcherTableau | None = None,
-    rtol: float = 1e-6,
-    atol: Any = None,
-    step: float | None = None,
-    first_step: float | None = None,
-    max_step: float | None = None,
-    t_eval: Any = None,
-    events: Any = None,
-    placement: str = "automatic",
-    singular_times: Any = (),
-    progress: bool | Tick = False,
-    raise_on_failure: bool = False,
-) -> DaeSolution:
-    """Solve x' = f(t, x) - B(t, x) y, 0 = g(t, x) over ``t_span``.
-
-    The driver, the step-size control and the placement around isolated singularities of G B are
-    those of :func:`srm_mbs.simulate`.
+    options: RunOptions,
+    result_type: type[Result],
+) -> Result:
+    """Solve x' = f(t, x) - B(t, x) y, 0 = g(t, x); see :func:`srm_mbs.solve_dae`.
 
     Parameters
     ----------
-    problem
-        The equations.
-    t_span : (t0, t1)
-        Start and end.
-    x0 : (nx,)
-        Initial state, with g(t0, x0) = 0.
-    method
-        ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
-        (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of
-        G B are passed by the split form, and by sweeps with T = (GB)^-1: restarted ones with
-        ``carry`` at a tolerance of 1e-4 with errors below 2e-4, at 1e-6 below 2e-6
-        (``tests/test_dae.py``); without it they turn off.  Sweeps with own histories, whose first
-        one is off the constraints by O(eps), would leave on another branch of g = 0; next to the
-        singularity they are restarted, and the message says when.  Sweeps that carry y, which is
-        not bounded there, would leave on another branch, however small the step: x' is compared
-        across every passage, and a run with sweeps that took another branch fails there, with a
-        message that names the remedy.
-    tableau
-        Runge-Kutta scheme for a method given by name.
-    rtol
-        Relative tolerance, at most 1e-4.
-    atol
-        Absolute tolerance, a number or (nx,); rtol by default, for states of order one.
-    step
-        Fixed step instead of step-size control.
-    first_step, max_step
-        First and longest step of the step-size control.
-    t_eval : (n,)
-        Times at which the solution is given; by default the ends of the steps.
-    events
-        A function (t, x) -> float or a list of them; an event is where it passes zero.  As in
-        ``scipy.integrate.solve_ivp``, the attribute ``terminal`` of the function (a bool, or a
-        number of occurrences) ends the run there with status ``event``, and ``direction`` (> 0
-        or < 0) counts only zeros passed upwards or downwards
-        (:mod:`srm_mbs.integration.events`).
-    placement
-        How steps are placed around singular points of G B: ``"automatic"``, ``"halved"`` (thesis,
-        2.4.1 (1)) or ``"off"``; as in :func:`srm_mbs.simulate`.
-    singular_times : (k,)
-        Times on which no stage or end of a step may lie (thesis, 2.4.1 (2)).
-    progress
-        True for a progress bar (on a terminal only), or a callable (t, h, x).
-    raise_on_failure
-        Raise :class:`SimulationError` instead of returning a partial solution.
-
-    Returns
-    -------
-    DaeSolution
-        With ``success`` False and everything computed so far if the run could not go on: a
-        function of the problem that raises, or returns what is not finite, included.
+    options
+        As the caller gave them.
+    result_type
+        Class of the result.
 
     Raises
     ------
@@ -185,32 +133,49 @@ def solve_dae(
             element="problem",
             remedy="Give srm.SemiExplicitDAE(f=..., B=..., g=..., G=...)",
         )
-    t0, t_end = _interval(t_span)
-    for value, what in ((step, "step"), (first_step, "first_step"), (max_step, "max_step")):
-        if value is not None:
-            positive(value, what)
-    method = checked_method(method, tableau)
-    rtol = checked_rtol(rtol)
-    times = checked_times(t_eval, t0, t_end)
-    placement = checked_placement(placement)
-    avoided = checked_singular_times(singular_times, t0, t_end)
+    options = _checked_options(t_span, options)
     state = _start(x0)
     norm = ErrorNorm(
-        _absolute_tolerance(atol, rtol, state.size), rtol, NEGLIGIBLE if step is None else 0.0
+        _absolute_tolerance(options.atol, options.rtol, state.size),
+        options.rtol,
+        options.negligible,
     )
-    check_progress(progress, "(t, h, x)")
-    system = DaeSystem(problem, t0, state, t_end, getattr(method, "T", "identity"))
-    _check_start(system, method, t0, state)
+    T = getattr(options.method, "T", "identity")
+    system = DaeSystem(problem, options.t0, state, options.t_end, T)
+    _check_start(system, options.method, options.t0, state)
+    log_start("DAE", options, norm, "python")
+    run = _integrate(system, options, norm, state)
+    result = _collect(system, options, norm, state, run, result_type)
+    log_end("DAE", result)
+    return finished(result, options)
 
-    log_start("DAE", t0, t_end, method, norm, step, "python")
-    watch: EventWatch | None = None
-    if events is not None:
-        prepared = prepare_events(events, lambda event: event)
-        watch = EventWatch(system, method.scheme, prepared, state.size)
-    wrappers: tuple[Placing, ...] = ()
-    begun: tuple[SweepNode, ...] = ()
-    with_sweeps = False
-    carried: list[FloatArray] = []
+
+def _checked_options(t_span: Any, options: RunOptions) -> RunOptions:
+    span = _interval(t_span)
+    method = checked_method(options.method, options.tableau)
+    rtol_range = float(TIGHTEST_RTOL), LOOSEST_RTOL
+    return options.checked(method, rtol_range, span, unit="", arguments="(t, h, x)")
+
+
+@dataclass(eq=False)
+class _DaeRun:
+    """A run, and what its sweeps and its control know of it."""
+
+    record: RunRecord
+    watch: EventWatch | None
+    wrappers: Sequence[ControlWrapper] = ()
+    first_sweeps: tuple[SweepNode, ...] = ()
+
+
+def _integrate(
+    system: DaeSystem, options: RunOptions, norm: ErrorNorm, state: FloatArray
+) -> _DaeRun:
+    """The run; a start that cannot be evaluated ends in its record."""
+    method, t0 = options.method, options.t0
+    run = _DaeRun(RunRecord(t0, state.copy()), None)
+    if options.events is not None:
+        prepared = prepare_events(options.events, lambda event: event)
+        run.watch = EventWatch(system, method.scheme, prepared, state.size)
     try:
         memory = method.start(system, t0, state, norm)
         if memory.sigma < SINGULAR_START:
@@ -219,99 +184,80 @@ def solve_dae(
                 element="x0",
                 remedy="Start beside that point",
             )
-        begun = memory.sweeps
-        with_sweeps = bool(begun)
-        if with_sweeps:
-            carried.append(begun[-1].multiplier)
-
-        def chosen_first_step() -> float:
-            if first_step is not None:
-                return first_step
-            order = method.scheme.controller_order or 1
-            return initial_step(system, state, memory, norm, t_end - t0, order, t0)
-
-        control = step_size_control(method.scheme, t0, t_end, step, chosen_first_step)
-        control, wrappers = placed(control, method.scheme, placement, avoided, t_end, step)
-        if placement == "automatic":
-            unbounded = with_sweeps and not system.carries_yhat
-            guard = RateGuard(control, system, stops=with_sweeps, unbounded=unbounded)
-            control, wrappers = guard, (*wrappers, guard)
-        with progress_of(progress, system, t_end) as tick:
-            record = integrate(
-                system,
-                method,
-                control,
-                norm,
-                memory,
-                state,
-                t0,
-                t_end,
-                max_step=np.inf if max_step is None else max_step,
-                tick=tick,
-                events=watch,
-                words=DAE,
+        run.first_sweeps = sweep_nodes(memory)
+        control, run.wrappers = placed_control(
+            system,
+            options,
+            lambda: chosen_first_step(system, norm, options, memory, state),
+        )
+        with progress_of(options.progress, system, options.t_end) as tick:
+            run.record = integrate_steps(
+                system, options, control, norm, memory, state, tick, run.watch, words=DAE
             )
     except (EvaluationError, ControllerError) as error:
-        record = RunRecord(t0, state.copy())
-        record.status, record.message = "failed", f"Stopped at t = {t0:.6g}: {error}."
-    carried += [result.sweeps[-1].multiplier for result in record.steps if result.sweeps]
-    turned = suspected(wrappers)
-    unstable = ""
-    if record.status == "failed" and with_sweeps and not system.carries_yhat:
-        eps = getattr(method, "regularisation", None)
-        unstable = instability(system, method.scheme, record, begun, eps)
+        run.record = failed_start(t0, state, error)
+    return run
+
+
+def _add_sweep_failure(
+    system: DaeSystem, options: RunOptions, run: _DaeRun, turned: Sequence[float]
+) -> None:
+    """Mark and explain in the record that sweeps were unstable, or took another branch of g = 0."""
+    record, unstable = run.record, ""
+    carries_y = not system.carries_yhat
+    if record.status is RunStatus.FAILED and carries_y:
+        eps = getattr(options.method, "regularisation", None)
+        unstable = instability(system, options.method.scheme, record, run.first_sweeps, eps)
     if unstable:
         if turned:  # that they turned follows from it
-            end = record.times[-1] if record.times else t0
+            end = record.times[-1] if record.times else options.t0
             record.message = f"Stopped at t = {end:.6g}: x' turned. Everything up to there is kept."
         record.message += unstable
-    elif with_sweeps and turned:
-        if record.status != "failed":  # within the passage
-            record.status = "failed"
+    elif turned:
+        if record.status is not RunStatus.FAILED:  # within the passage
+            record.status = RunStatus.FAILED
             record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
-        record.message += " " + (MENDED if system.carries_yhat else CARRIED)
-    elif record.status == "failed" and with_sweeps and not system.carries_yhat:
+        record.message += " " + (CARRIED if carries_y else MENDED)
+    elif record.status is RunStatus.FAILED and carries_y:
         record.message += UNSTABLE
+
+
+def _collect(
+    system: DaeSystem,
+    options: RunOptions,
+    norm: ErrorNorm,
+    state: FloatArray,
+    run: _DaeRun,
+    result_type: type[Result],
+) -> Result:
+    record, method = run.record, options.method
+    sweeps = bool(run.first_sweeps)
+    turned = suspected(run.wrappers)
+    if sweeps:
+        _add_sweep_failure(system, options, run, turned)
     data = step_data(
-        t0, state, record.times, record.steps, method.scheme, system.tangent_size, record.stop
+        options.t0,
+        state,
+        record.times,
+        record.steps,
+        method.scheme,
+        system.tangent_size,
+        record.stop,
     )
-    stats = Statistics(
-        steps=data.count,
-        rejected=sum(a.verdict is StepDecision.REJECTED for a in record.attempts),
-        placements=sum(wrapper.placed for wrapper in wrappers),
-        replaced=sum(wrapper.replaced for wrapper in wrappers),
-        zone_steps=len(data.zones),
-        evaluations=system.evaluations,
-        factorisations=system.factorisations,
-        wall_time=record.wall_time,
-    )
-    solution = DaeSolution(
+    placed = sum(wrapper.placed for wrapper in run.wrappers)
+    replaced = sum(wrapper.replaced for wrapper in run.wrappers)
+    return result_type(
         system,
         method,
         data,
-        carried,
-        t_eval=times,
+        carried_multipliers(run.first_sweeps, record.steps),
+        t_eval=options.t_eval,
         attempts=attempt_array(record.attempts),
-        settings=Settings(
-            type(method).__name__,
-            method.scheme.name,
-            rtol,
-            tuple(norm.atol.tolist()),
-            step,
-            False,
-            placement,
-            tuple(avoided.tolist()),
-        ),
-        events=None if watch is None else watch.found(),
+        settings=settings(options, norm, False, "python"),
+        events=None if run.watch is None else run.watch.found(),
         status=record.status,
         message=record.message
-        + ("" if with_sweeps else turns(turned, "x' turned", MENDED))
-        + restarts(record.steps)
-        + passings(record.steps)
-        + drift(record.steps, norm),
-        stats=stats,
+        + ("" if sweeps else branch_changes(turned, "x' turned", MENDED))
+        + method_messages(method, record.steps, norm),
+        stats=statistics(system, record, data, placed, replaced),
     )
-    log_end("DAE", solution)
-    if raise_on_failure and not solution.success:
-        raise SimulationError(solution.message, solution)
-    return solution

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, Self
 
 import numpy as np
 import pinocchio as pin
@@ -19,15 +20,15 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.integration.dense_output import StepData
 
 NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
 
-ROUNDING = 1e-13
-"""Part of the energies that add up to it which rounding leaves of a sum, with much to spare."""
+RELATIVE_ROUNDING = 1e-13
+"""Bound of the rounding error of a sum of energies, relative to its terms."""
 
 Powers = dict[str, FloatArray]
 """Power (n,) W of each thing that does work, by name."""
@@ -84,14 +85,43 @@ class EnergyBalance:
 _System = OpenSystem | ClosedSystem
 
 
-def _controller(run: Solution, system: _System) -> Powers:
+class BalancedRun(Protocol):
+    """The part of a :class:`~srm_mbs.simulation.result.SimulationResult` that a balance reads."""
+
+    mechanism: Mechanism
+    t: FloatArray
+    q: FloatArray
+    v: FloatArray
+    steps: StepData
+
+    @property
+    def energy(self) -> FloatArray:
+        """Kinetic plus potential energy (n,) J."""
+
+    @property
+    def energy_balance(self) -> EnergyBalance:
+        """The balance at ``t``."""
+
+    @property
+    def drive_forces(self) -> Mapping[str, FloatArray]:
+        """Force of each drive (n,), N or N m."""
+
+    @property
+    def drive_rates(self) -> Mapping[str, FloatArray]:
+        """Prescribed rate of each drive (n,), m/s or rad/s."""
+
+    def at(self, t: Any) -> Self:
+        """The run at other times."""
+
+
+def _controller(run: BalancedRun, system: _System) -> Powers:
     if not system.controlled:
         return {}
     states = zip(run.t, run.q, run.v)
     return {"controller": np.array([system.controlled_force(*x) @ x[2] for x in states])}
 
 
-def _joints(run: Solution, system: _System) -> Powers:
+def _joints(run: BalancedRun, system: _System) -> Powers:
     model = run.mechanism.model
     powers = {}
     if np.any(model.damping):
@@ -101,7 +131,7 @@ def _joints(run: Solution, system: _System) -> Powers:
     return powers
 
 
-def _elements(run: Solution, system: _System) -> Powers:
+def _elements(run: BalancedRun, system: _System) -> Powers:
     """Of springs and bushings what is left when their force at rest is taken off."""
     mechanism = run.mechanism
     model, data = mechanism.model, workspace(mechanism.model)
@@ -124,14 +154,14 @@ def _elements(run: Solution, system: _System) -> Powers:
     }
 
 
-def _drives(run: Solution, system: _System) -> Powers:
+def _drives(run: BalancedRun, system: _System) -> Powers:
     if not run.mechanism.drives:
         return {}
     rates = run.drive_rates
     return {f"drive {name}": force * rates[name] for name, force in run.drive_forces.items()}
 
 
-TERMS: tuple[Callable[[Solution, _System], Powers], ...] = (
+TERMS: tuple[Callable[[BalancedRun, _System], Powers], ...] = (
     _controller,
     _joints,
     _elements,
@@ -140,7 +170,7 @@ TERMS: tuple[Callable[[Solution, _System], Powers], ...] = (
 """Everything that does work beside the potentials; what is new is added here."""
 
 
-def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
+def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     """The balance of ``solution`` at its times; ``system`` is the one that made it.
 
     Raises
@@ -175,16 +205,16 @@ def energy_balance(solution: Solution, system: _System) -> EnergyBalance:
 
 
 def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
-    """What rounding may leave (J) of these energies, whose zero is where potentials cancel."""
+    """Rounding error (J) of sums of these energies, whose zero is where potentials cancel."""
     model = mechanism.model
     mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
     weight = mass * float(np.linalg.norm(model.gravity.linear))
     largest = float(np.abs(energies).max(initial=0.0))
-    return float(ROUNDING * (weight * mechanism.structure.units.length + largest))
+    return float(RELATIVE_ROUNDING * (weight * mechanism.structure.units.length + largest))
 
 
 def joined_balance(
-    segments: Sequence[Solution], parts: Sequence[Solution], order: IndexArray | None
+    segments: Sequence[BalancedRun], parts: Sequence[BalancedRun], order: IndexArray | None
 ) -> EnergyBalance:
     """The balance of a run of several segments, with what happened between them as ``events``.
 

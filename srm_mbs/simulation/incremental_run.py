@@ -1,6 +1,6 @@
-"""Runs that are kept alive and go on piece by piece, on either backend; nothing is recorded.
+"""Incremental runs for :class:`srm_mbs.Simulator`: they continue call by call and record nothing.
 
-What :class:`srm_mbs.simulation.simulator.Simulator` drives.
+:class:`KernelRun` is made by the compiled kernel, :class:`ReferenceRun` by the Python reference.
 """
 
 from __future__ import annotations
@@ -16,23 +16,27 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import SingularProximity, beside_singular, smooth_intervals
-from srm_mbs.integration.control.prescribed_times import Placing
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl, initial_step
-from srm_mbs.integration.driver import integrate
+from srm_mbs.integration.control.step_size import (
+    ControlWrapper,
+    StepDecision,
+    StepSizeControl,
+    initial_step,
+)
+from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
-from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.singular_endpoints import start
+from srm_mbs.simulation.options import RunOptions
 
 MakeControl = Callable[[float], tuple[StepSizeControl, Any]]
 """First step (s) -> step-size control, and the wrappers in it that count."""
 LAST_GOOD = "The state is the last good one"
 
 
-class _Live:
-    """What runs of both backends share.
+class _IncrementalRun:
+    """Base of the runs of both backends.
 
     Attributes
     ----------
@@ -47,16 +51,17 @@ class _Live:
         self,
         system: OpenSystem | ClosedSystem,
         held: HeldForce,
-        method: Method,
         norm: ErrorNorm,
+        options: RunOptions,
         evaluator: Any,
     ) -> None:
-        self.system, self.method, self.norm = system, method, norm
+        self.system, self.norm, self.options = system, norm, options
+        self.method: Method = options.method
         self._held = held
         self._evaluator = evaluator
 
     def _first(self, t: float, state: FloatArray, span: float) -> tuple[IntegratorState, float]:
-        """Memory at ``state``, and the length of the first step of ``span`` (s)."""
+        """Integrator state at ``state``, and the length of the first step of ``span`` (s)."""
         memory = start(self.system, self.method, t, state, self.norm, np.inf, self._evaluator)
         order = self.method.scheme.controller_order or 1
         first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
@@ -75,44 +80,41 @@ class _Live:
         )
 
 
-class KernelRun(_Live):
+class KernelRun(_IncrementalRun):
     """A run of the compiled kernel.
 
     Parameters
     ----------
     system, held
         The mechanism, under what is held.
-    method, norm, step, max_step, placement
-        As for :class:`~srm_mbs.integration.kernel.run.CompiledRun`.
+    norm, options
+        Error norm and checked options.
     """
 
     def __init__(
         self,
         system: OpenSystem | ClosedSystem,
         held: HeldForce,
-        method: PSRM,
         norm: ErrorNorm,
-        step: float | None,
-        max_step: float,
-        placement: str,
+        options: RunOptions,
     ) -> None:
         kernel_system = make_kernel_system(system)
-        super().__init__(system, held, method, norm, Evaluator(system, kernel_system))
+        super().__init__(system, held, norm, options, Evaluator(system, kernel_system))
         nothing = np.zeros(2 * system.nv)
         state = np.zeros(system.nq + system.nv)
         pieces = smooth_intervals(nothing[:0], nothing[:0], 0.0, 1.0)
         self._kernel_system = kernel_system
         self._run = CompiledRun(
             kernel_system,
-            method,
+            options.method,
             norm,
             IntegratorState(nothing, 1.0, nothing),
             state,
             pieces,
-            step=step,
+            step=options.step,
             first_step=1.0,
-            max_step=max_step,
-            placed=placement,
+            max_step=options.longest_step,
+            placed=options.placement,
         )
         self._go_on = self._run.go_on
 
@@ -138,7 +140,7 @@ class KernelRun(_Live):
         first: float,
         last: float,
         force: FloatArray,
-        anew: bool,
+        forces_jumped: bool,
         grid: float,
     ) -> str:
         """Go on to ``end`` (s); empty, or why that is not possible.
@@ -149,7 +151,7 @@ class KernelRun(_Live):
             Times (s) within which the system is evaluated.
         force : (nv,)
             Acts from here on.
-        anew
+        forces_jumped
             Whether other forces may have jumped.
         grid
             Length of fixed steps (s); 0 with step-size control.
@@ -159,7 +161,7 @@ class KernelRun(_Live):
         ValueError
             If ``force`` has another shape, or is not finite.
         """
-        reason = self._go_on(end, first, last, force, anew, grid, CHUNK)
+        reason = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
         self._held.only(force)  # snapshots need it, too
         if reason == FINISHED:
             return ""
@@ -175,10 +177,8 @@ class KernelRun(_Live):
         if reason == FINISHED:
             return ""
         run = self._run
-        why = why_stopped(reason, self.system, run) or (
-            "the error estimate stays above the tolerance however small the step"
-        )
-        return f"Stopped at t = {run.t:.6g} s with step {run.h:.1e} s: {why}. {LAST_GOOD}."
+        why = why_stopped(reason, self.system, run)
+        return f"Stopped at t = {run.t:.6g} s with step {run.h:.1e} s: {why.sentence}. {LAST_GOOD}."
 
     def snapshot(self) -> Any:
         """Everything that the next step depends on."""
@@ -206,15 +206,15 @@ class KernelRun(_Live):
         }
 
 
-class ReferenceRun(_Live):
+class ReferenceRun(_IncrementalRun):
     """A run of the Python reference.
 
     Parameters
     ----------
     system, held
         The mechanism, under what is held.
-    method, norm, max_step
-        As for :func:`~srm_mbs.integration.driver.integrate`.
+    norm, options
+        Error norm and checked options.
     make_control
         Makes its step-size control.
     """
@@ -223,16 +223,14 @@ class ReferenceRun(_Live):
         self,
         system: OpenSystem | ClosedSystem,
         held: HeldForce,
-        method: Method,
         norm: ErrorNorm,
-        max_step: float,
+        options: RunOptions,
         make_control: MakeControl,
     ) -> None:
-        super().__init__(system, held, method, norm, system)
+        super().__init__(system, held, norm, options, system)
         self._make_control = make_control
-        self._max_step = max_step
         self._control: StepSizeControl
-        self._wrappers: tuple[Placing, ...] = ()
+        self._wrappers: tuple[ControlWrapper, ...] = ()
         self._memory: IntegratorState
         self._nearness = SingularProximity()
         self._counted = np.zeros(5, dtype=int)
@@ -255,15 +253,21 @@ class ReferenceRun(_Live):
         return self._nearness.matters(fresh, self.norm, span, self.system.nv)
 
     def go_on(
-        self, end: float, first: float, last: float, force: FloatArray, anew: bool, grid: float
+        self,
+        end: float,
+        first: float,
+        last: float,
+        force: FloatArray,
+        forces_jumped: bool,
+        grid: float,
     ) -> str:
         """See :meth:`KernelRun.go_on`."""
         if force.shape != (self.system.nv,) or not np.isfinite(force).all():
             raise ValueError("not nv finite forces")
-        anew = anew or not np.array_equal(force, self._held.values[-1])
+        forces_jumped = forces_jumped or not np.array_equal(force, self._held.values[-1])
         self._held.only(force)
         self.system.between(first, last)
-        if anew:
+        if forces_jumped:
             try:
                 self._memory = self._renewed(self._memory, end)
             except EvaluationError as error:
@@ -278,16 +282,16 @@ class ReferenceRun(_Live):
             self.state,
             self.t,
             end,
-            max_step=self._max_step,
+            max_step=self.options.longest_step,
         )
         if record.times:
             self.t, self.state = record.times[-1], record.steps[-1].state
         rejected = sum(a.verdict is StepDecision.REJECTED for a in record.attempts)
         zones = sum(step.zone is not None for step in record.steps)
         self._counted += [len(record.times), rejected, 0, 0, zones]
-        if record.status == "interrupted":
+        if record.status is RunStatus.INTERRUPTED:
             raise KeyboardInterrupt
-        return "" if record.status == "finished" else record.message
+        return "" if record.status is RunStatus.FINISHED else record.message
 
     def snapshot(self) -> Any:
         """See :meth:`KernelRun.snapshot`."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +18,8 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names
-from srm_mbs.simulation.segmented_result import SegmentedSolution
-
-if TYPE_CHECKING:
-    from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.segmented_result import SegmentedResult
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,7 @@ class MobilityMap:
     distance: FloatArray
     participation: FloatArray
     coordinates: tuple[str, ...]
-    _solution: Solution = field(repr=False)
+    _solution: SimulationResult = field(repr=False)
 
     @cached_property
     def changes(self) -> tuple[MobilityChange, ...]:
@@ -82,16 +79,16 @@ class MobilityMap:
         return _changes(self._solution)
 
 
-def mobility_map(solution: Solution) -> MobilityMap:
+def mobility_map(solution: SimulationResult) -> MobilityMap:
     """Degrees of freedom, rank and what can move at the times of ``solution``; see
-    :meth:`srm_mbs.simulation.result.Solution.at` for other times.
+    :meth:`srm_mbs.simulation.result.SimulationResult.at` for other times.
 
     Raises
     ------
     InputError
         For a run of several segments, which may have different mechanisms.
     """
-    if isinstance(solution, SegmentedSolution):
+    if isinstance(solution, SegmentedResult):
         raise InputError(
             "a run with event actions has no single map: its mechanism may change",
             element="solution",
@@ -124,7 +121,7 @@ def mobility_map(solution: Solution) -> MobilityMap:
     )
 
 
-def _changes(solution: Solution) -> tuple[MobilityChange, ...]:
+def _changes(solution: SimulationResult) -> tuple[MobilityChange, ...]:
     if not solution.mechanism.structure.loop_rank:
         return ()
     mechanism = solution.mechanism

@@ -1,6 +1,8 @@
-"""Progress bars: of a run (simulated time, step size, drift), of a sweep; on a terminal only.
+"""Progress and log of runs.
 
-What a run says in the log: how it is made, how it ended, which singular passages it had.
+Progress bars show simulated time, step size and drift of a run, or the cases of a sweep, on a
+terminal only.  The log says how a run is made, how it ended, and which singular configurations it
+passed.
 """
 
 from __future__ import annotations
@@ -10,36 +12,32 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.driver import Tick
-from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.singular_passages import Crossing
-
-if TYPE_CHECKING:
-    from srm_mbs.simulation.dae_result import DaeSolution
-    from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.options import RunOptions
+from srm_mbs.simulation.result import RunOutcome
 
 log = logging.getLogger(__name__)
 
-TOLD = 50
+LISTED_PASSAGES = 50
 """Passages of a run that are listed."""
 
 
-def log_start(
-    name: str, t0: float, t_end: float, method: Method, norm: ErrorNorm, step: float | None, by: str
-) -> None:
-    """The settings of a run of ``name``, which ``by`` computes."""
+def log_start(name: str, options: RunOptions, norm: ErrorNorm, by: str) -> None:
+    """Log the checked options of a run of ``name`` that the backend ``by`` makes."""
     if not log.isEnabledFor(logging.INFO):
         return
+    step, method = options.step, options.method
     size = f"rtol {norm.rtol:g}" if step is None else f"steps of {step:g} s"
     log.info(
         "%s: from t = %g to %g s with %s %s, %s, by the %s",
         name,
-        t0,
-        t_end,
+        options.t0,
+        options.t_end,
         type(method).__name__,
         method.scheme.name,
         size,
@@ -47,7 +45,7 @@ def log_start(
     )
 
 
-def log_end(name: str, solution: Solution | DaeSolution) -> None:
+def log_end(name: str, solution: RunOutcome) -> None:
     """Statistics, and the passages, which are looked for only if they are wanted.
 
     Looking for thousands of them takes seconds: who pressed Ctrl-C has the solution before it.
@@ -70,19 +68,19 @@ def log_end(name: str, solution: Solution | DaeSolution) -> None:
 
 
 def _log_passages(name: str, crossings: Sequence[Crossing]) -> None:
-    for crossing in crossings[:TOLD]:
+    for crossing in crossings[:LISTED_PASSAGES]:
         log.debug(
             "%s: singular configuration of %s passed at t = %.9g s",
             name,
             crossing.participants.names,
             crossing.time,
         )
-    if len(crossings) > TOLD:
-        log.debug("%s: and %d more", name, len(crossings) - TOLD)
+    if len(crossings) > LISTED_PASSAGES:
+        log.debug("%s: and %d more", name, len(crossings) - LISTED_PASSAGES)
 
 
 Counted = Callable[[int, int], object]
-"""Told (done, total)."""
+"""Called with (done, total)."""
 REFRESH = 0.1
 """Seconds between two updates; more often would slow the run."""
 
@@ -90,7 +88,7 @@ REFRESH = 0.1
 def progress_of(
     progress: bool | Tick, system: System, t_end: float
 ) -> AbstractContextManager[Tick | None]:
-    """What the option ``progress`` asks for: the caller's own tick, a bar, or nothing."""
+    """The callback of the option ``progress``: the caller's own, a progress bar, or none."""
     if callable(progress):
         return nullcontext(progress)
     return progress_bar(system, t_end) if progress else nullcontext(None)
@@ -134,7 +132,7 @@ def progress_bar(system: System, t_end: float) -> Iterator[Tick | None]:
             last = now
             detail = f"h = {h:.2e} s"
             if system.has_constraints:
-                detail += f"  drift = {system.closure_gap(t, state):.1e}"
+                detail += f"  drift = {system.constraint_residual(t, state):.1e}"
             draw(t, detail)
 
         yield tick
@@ -142,7 +140,7 @@ def progress_bar(system: System, t_end: float) -> Iterator[Tick | None]:
 
 @contextmanager
 def counting(progress: bool | Counted, what: str, total: int) -> Iterator[Counted | None]:
-    """What is told after each of ``total`` things: the caller's function, a bar, or nothing."""
+    """The callback after each of ``total`` items: the caller's own, a progress bar, or none."""
     if callable(progress):
         yield progress
     elif not progress:

@@ -1,23 +1,27 @@
-"""Checks of the options that ``simulate`` and ``solve_dae`` share."""
+"""Options of a run, and their checks: the one source that runs, results, storage and reruns read.
+
+:class:`RunOptions` is made once, from the arguments of :func:`srm_mbs.simulate`,
+:func:`srm_mbs.solve_dae` or :class:`srm_mbs.Simulator`, and handed on whole.
+"""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, SrmWarning
+from srm_mbs.errors import InputError, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepSizeControl
-from srm_mbs.integration.methods.base import Method
+from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.integration.methods.srm import SRM
+from srm_mbs.integration.methods.thesis.srm import SRM
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""
@@ -42,6 +46,116 @@ METHODS: dict[str, Callable[..., Method]] = {
 }
 """Methods that can be given by name; sweeps that restart, because own histories and step-size
 control do not go together (:class:`srm_mbs.SRM`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunOptions:
+    """Options of a run; :func:`srm_mbs.simulate` explains each.
+
+    As the caller gave them, until :meth:`checked` replaces them by values of their final types.
+    A result keeps them, so that the run can be made again with another accuracy.
+
+    Attributes
+    ----------
+    lost
+        In a loaded run: the options that saved runs do not keep, in words.
+    """
+
+    t_end: Any
+    t0: Any = 0.0
+    q0: Any = None
+    v0: Any = None
+    method: Any = "psrm"
+    tableau: Any = None
+    rtol: Any = 1e-6
+    atol: Any = None
+    step: Any = None
+    first_step: Any = None
+    max_step: Any = None
+    t_eval: Any = None
+    events: Any = None
+    controller: Any = None
+    sample_time: Any = None
+    breakpoints: Any = ()
+    placement: Any = "automatic"
+    singular_times: Any = ()
+    progress: Any = False
+    backend: Any = "auto"
+    raise_on_failure: bool = False
+    lost: tuple[str, ...] = ()
+
+    def checked(
+        self,
+        method: Method,
+        rtol_range: tuple[float, float],
+        span: tuple[float, float],
+        *,
+        unit: str,
+        arguments: str,
+    ) -> RunOptions:
+        """The options with their final types: numbers, arrays, a method object.
+
+        Parameters
+        ----------
+        method
+            The checked method.
+        rtol_range
+            Tightest and loosest relative tolerance that the method can use.
+        span
+            Start and end of the run, checked.
+        unit
+            Unit of times in messages: ``" of seconds"`` or nothing.
+        arguments
+            Arguments of a progress function in messages: ``"(t, h, state)"``.
+
+        Raises
+        ------
+        InputError
+            For the first invalid option.
+        """
+        tightest, loosest = rtol_range
+        t0, t_end = span
+        for name in ("step", "first_step", "max_step"):
+            if getattr(self, name) is not None:
+                positive(getattr(self, name), name, unit)
+        check_progress(self.progress, arguments)
+        return replace(
+            self,
+            t0=t0,
+            t_end=t_end,
+            placement=checked_placement(self.placement),
+            singular_times=checked_singular_times(self.singular_times, t0, t_end),
+            method=method,
+            tableau=None,
+            rtol=checked_rtol(self.rtol, loosest, tightest),
+            t_eval=checked_times(self.t_eval, t0, t_end),
+        )
+
+    @property
+    def longest_step(self) -> float:
+        """``max_step`` (s); infinite if none is given."""
+        return math.inf if self.max_step is None else float(self.max_step)
+
+    @property
+    def negligible(self) -> float:
+        """Part of the tolerance that is not worth an evaluation; 0 for fixed steps."""
+        return NEGLIGIBLE if self.step is None else 0.0
+
+    def repeatable(self) -> RunOptions:
+        """The options that another run of the same motion needs: without start, accuracy, output.
+
+        Results keep these, so that they hold neither progress functions nor further arrays.
+        """
+        given = RunOptions(self.t_end)
+        kept = {name: getattr(self, name) for name in REPEATED}
+        return replace(given, **kept, lost=self.lost)
+
+
+REPEATED = (
+    *("t0", "method", "tableau", "first_step", "max_step", "events", "controller", "sample_time"),
+    *("breakpoints", "placement", "singular_times", "backend"),
+)
+"""Options that a rerun takes over; start, accuracy and output come from elsewhere."""
 
 
 def positive(value: Any, what: str, unit: str = "") -> float:
@@ -121,20 +235,14 @@ def checked_rtol(
     changed."""
     rtol = positive(value, "rtol")
     if rtol > loosest:
-        warnings.warn(
+        warn(
             f"rtol = {rtol:g} is looser than {loosest:g}, from where a step may jump to "
-            f"another branch at a singular configuration: using {loosest:g}",
-            SrmWarning,
-            stacklevel=3,
+            f"another branch at a singular configuration: using {loosest:g}"
         )
         return loosest
     if rtol < tightest:
         where = "" if rtol < TIGHTEST_RTOL else " next to singular configurations of closures"
-        warnings.warn(
-            f"rtol = {rtol:g} is below round-off{where}: using {tightest:.1e}",
-            SrmWarning,
-            stacklevel=3,
-        )
+        warn(f"rtol = {rtol:g} is below round-off{where}: using {tightest:.1e}")
         return tightest
     return rtol
 

@@ -1,20 +1,22 @@
-"""Making a run again with another accuracy, everything else being as it was."""
+"""Reruns: the same run with another accuracy."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from srm_mbs.api import simulate
 from srm_mbs.errors import InputError
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.segmented_result import RESULTS
+from srm_mbs.simulation.segmented_run import run
 
 BEYOND = 0.1
 """How much longer a second run of one that failed may be: it tells whether that one goes on."""
 
 
-def unsupported_reason(solution: Solution) -> str:
+def unsupported_reason(solution: SimulationResult) -> str:
     """Why ``solution`` cannot be made again; empty if it can."""
     request = solution.request
     if request is None:
@@ -25,12 +27,12 @@ def unsupported_reason(solution: Solution) -> str:
 
 
 def rerun(
-    solution: Solution,
+    solution: SimulationResult,
     *,
     rtol: float | None = None,
     step: float | None = None,
     progress: Any = False,
-) -> Solution:
+) -> SimulationResult:
     """The run again, from the same start with the same options but another accuracy.
 
     Functions of the user (controllers, events, forces) are called again.  A run that failed is
@@ -65,15 +67,16 @@ def rerun(
     elif solution.status == "failed":
         t_end = min(t_end, end + BEYOND * max(end - start, BEYOND * (t_end - start)))
     asked = settings.rtol if rtol is None else rtol
-    options = dict(request.options)
-    if settings.backend == "python" and options["backend"] == "auto":
-        options["backend"] = "python"
-    return simulate(
-        solution.mechanism,
-        t_end,
-        **options,
+    backend = request.backend
+    if settings.backend == "python" and backend == "auto":
+        backend = "python"
+    options = replace(
+        request,
+        t_end=t_end,
         rtol=asked,
         atol=np.array(settings.atol) * (asked / settings.rtol),
         step=settings.step if step is None else step,
         progress=progress,
+        backend=backend,
     )
+    return run(solution.mechanism, options, RESULTS)

@@ -1,17 +1,11 @@
-"""What a run returns: states, statistics, and quantities computed when they are read.
-
-What a run records about itself: work done, settings, and the steps that did not stand.
-
-What runs of mechanisms and of DAEs tell about their steps.
-"""
+"""Results of runs: states, statistics, and quantities that are computed when they are read."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +14,16 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.reactions import drive_forces_at, reactions_at
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import InputError
-from srm_mbs.integration.dense_output import DenseOutput, StepData, times_to_read, wound_angles
+from srm_mbs.integration.dense_output import (
+    DenseOutput,
+    StepData,
+    checked_output_times,
+    unwrapped_angles,
+)
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
@@ -30,13 +31,8 @@ from srm_mbs.integration.singular_passages import (
     find_bifurcations,
     find_crossings,
 )
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.visualization.animation.joint_motion import AnimationMixin
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from srm_mbs.simulation.energy_balance import EnergyBalance
+from srm_mbs.simulation.energy_balance import EnergyBalance, energy_balance
+from srm_mbs.simulation.options import RunOptions
 
 
 @dataclass(frozen=True)
@@ -84,38 +80,6 @@ class Settings:
     backend: str = "python"
 
 
-_REPEATED = (
-    *("t0", "method", "tableau", "first_step", "max_step", "events", "controller", "sample_time"),
-    *("breakpoints", "placement", "singular_times", "backend"),
-)
-"""Options of a run that it takes to make it again; those of its start, its accuracy and its output
-are elsewhere."""
-
-
-@dataclass(frozen=True, eq=False)
-class Request:
-    """What a run was asked for, so that it can be made again with another accuracy.
-
-    Attributes
-    ----------
-    t_end
-        End that was asked for (s).
-    options
-        Options of :func:`srm_mbs.simulate`, without start, tolerances, step and output.
-    lost
-        What a saved run does not keep of them, in words.
-    """
-
-    t_end: float
-    options: Mapping[str, Any]
-    lost: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, t_end: float, options: Mapping[str, Any]) -> Request:
-        """From all options of ``simulate``."""
-        return cls(t_end, {name: options[name] for name in _REPEATED})
-
-
 ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
 """A step that did not stand: its start and length (s), error estimate over tolerance, and whether
 it was ``"rejected"`` for its error or ``"replaced"`` because of a singular configuration."""
@@ -128,26 +92,31 @@ def attempt_array(attempts: Iterable[Any]) -> NDArray[np.void]:
 
 
 class RunOutcome:
-    """A run of steps.
+    """Steps, status and statistics, which results of mechanisms and of DAEs have in common.
 
     Attributes
     ----------
     steps
         The accepted steps.
     attempts
-        The attempted ones: structured array with t, h and verdict.
-    status
-        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``.
+        The rejected and redone ones: a structured array of :data:`ATTEMPT`.
+    status, message
+        ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``; when and why.
+    stats, settings
+        :class:`Statistics` and :class:`Settings`.
     """
 
     steps: StepData
     attempts: NDArray[np.void]
-    status: str
+    status: RunStatus
+    message: str
+    stats: Statistics
+    settings: Settings
 
     @property
     def success(self) -> bool:
         """Whether the end, or a terminal event, was reached."""
-        return self.status in ("finished", "event")
+        return self.status in (RunStatus.FINISHED, RunStatus.EVENT)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -169,8 +138,8 @@ class RunOutcome:
         return np.column_stack([chosen["t"], chosen["h"]])
 
 
-class Solution(RunOutcome, AnimationMixin):
-    """Result of :func:`srm_mbs.simulate`.
+class SimulationResult(RunOutcome):
+    """Result of a run of a mechanism; :class:`srm_mbs.Solution` adds pictures and files.
 
     Attributes
     ----------
@@ -192,11 +161,11 @@ class Solution(RunOutcome, AnimationMixin):
         For each event in turn its times (k,) s, and the states (k, nq), (k, nv) there; None if
         no events were given.
     request
-        :class:`~srm_mbs.simulation.result.Request`: what else it takes to make the run again; None
-        if the file that it is from does not say.
+        :class:`~srm_mbs.simulation.options.RunOptions`: what else it takes to make the run again;
+        None if the file that it is from does not say.
     """
 
-    request: Request | None = None
+    request: RunOptions | None = None
 
     def __init__(
         self,
@@ -218,7 +187,7 @@ class Solution(RunOutcome, AnimationMixin):
         self.steps = steps
         self.scheme = scheme
         self.attempts = attempts
-        self.status = status
+        self.status = RunStatus(status)
         self.message = message
         self.stats = stats
         self.settings = settings
@@ -248,7 +217,7 @@ class Solution(RunOutcome, AnimationMixin):
 
     @property
     def held(self) -> HeldForce | None:
-        """What a sampled controller held; None without one."""
+        """Forces that a sampled controller held; None without one."""
         return self._system.held
 
     @property
@@ -268,13 +237,13 @@ class Solution(RunOutcome, AnimationMixin):
         InputError
             If a time lies outside the run, or t has more than one dimension.
         """
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         states = self._dense(np.atleast_1d(times))
         nq = self.mechanism.model.nq
         q, v = states[:, :nq], states[:, nq:]
         return (q[0], v[0]) if times.ndim == 0 else (q, v)
 
-    def at(self, t: Any) -> Solution:
+    def at(self, t: Any) -> Self:
         """The same run read at other times: q, v, drift, energy, reactions, joints.
 
         Parameters
@@ -287,9 +256,9 @@ class Solution(RunOutcome, AnimationMixin):
         InputError
             If a time lies outside the run, or ``t`` has not one dimension.
         """
-        times = times_to_read(t)
+        times = checked_output_times(t)
         self._dense.check(times)
-        run = Solution(
+        run = type(self)(
             self.mechanism,
             self._system,
             self.scheme,
@@ -307,7 +276,7 @@ class Solution(RunOutcome, AnimationMixin):
         return run
 
     @property
-    def segments(self) -> tuple[Solution, ...]:
+    def segments(self) -> tuple[SimulationResult, ...]:
         """The smooth parts of the run: itself, unless events acted on it."""
         return (self,)
 
@@ -330,7 +299,7 @@ class Solution(RunOutcome, AnimationMixin):
             return self.q[:, joint.idx_q], rate
         states = np.hstack([self.q, self.v])
         nq = self.mechanism.model.nq
-        return wound_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
+        return unwrapped_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
 
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
@@ -340,7 +309,7 @@ class Solution(RunOutcome, AnimationMixin):
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:
         """Singular configurations that the run reached without the momentum to choose a branch."""
-        failed = self.status == "failed"
+        failed = self.status is RunStatus.FAILED
         return find_bifurcations(self._system, self.steps, self._dense, self.settings.rtol, failed)
 
     @cached_property
@@ -373,13 +342,6 @@ class Solution(RunOutcome, AnimationMixin):
         rates = [self._system.evaluate(t, x).rate()[nv:].copy() for t, x in zip(self.t, states)]
         return np.array(rates).reshape(len(rates), nv)
 
-    @property
-    def degrees_of_freedom(self) -> NDArray[np.int_]:
-        """Momentary degrees of freedom (n,) at ``t``; more in :func:`srm_mbs.mobility_map`."""
-        from srm_mbs.simulation.mobility import mobility_map
-
-        return mobility_map(self).degrees_of_freedom
-
     @cached_property
     def energy_balance(self) -> EnergyBalance:
         """Energies and the works of everything that acts; see
@@ -390,8 +352,6 @@ class Solution(RunOutcome, AnimationMixin):
         InputError
             For a loaded run that had a controller.
         """
-        from srm_mbs.simulation.energy_balance import energy_balance
-
         self._need_controller("energy balance")
         return energy_balance(self, self._system)
 
@@ -452,79 +412,10 @@ class Solution(RunOutcome, AnimationMixin):
         """
         return self.mechanism.mobility.indeterminate_rows
 
-    def to_csv(self, path: str | Path, t: Any = None) -> None:
-        """Write the motion as a table; see :func:`srm_mbs.simulation.csv_export.write_csv`.
-
-        Parameters
-        ----------
-        path
-            File name; ``.csv`` is usual and is not added.
-        t : (k,) s
-            Times of its rows, in any order; by default ``solution.t``.
-        """
-        from srm_mbs.simulation.csv_export import write_csv
-
-        write_csv(self if t is None else self.at(t), Path(path))
-
-    def save(self, path: str | Path) -> None:
-        """Write everything needed to replay and interpolate the run, description included.
-
-        Parameters
-        ----------
-        path
-            File name; ``.npz`` is usual and is not added.
-        """
-        from srm_mbs.simulation.storage import save_solution
-
-        save_solution(self, Path(path))
-
-    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
-        """A picture of the run; docs/plots.md shows each kind.
-
-        Parameters
-        ----------
-        path
-            Where to save the figure (the suffix decides the format: png, pdf or svg); not saved if
-            omitted.
-        kind
-            ``run``: drift, energy, sigma and step sizes with rejected steps and singular passages
-            marked.  ``state``: positions and rates of joints.  ``balance``: energies, works, and
-            the residual of the energy balance.  ``reactions``: forces and moments in the closures.
-            ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
-            position of joints.  ``path``: paths of points in space.
-        **options
-            ``joints`` of ``state`` and ``phase``: names, by default as many as fit.  ``loops`` of
-            ``reactions``: names; ``rows``: whether to draw the multiplier of each row.  ``points``
-            of ``path``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            Without pyplot: it is on no screen, and need not be closed.
-
-        Raises
-        ------
-        InputError
-            For an unknown kind, option, joint, loop, point or suffix; if the run has not what is
-            to be drawn; for balance and reactions of a loaded run that had a controller.
-        ControllerError, EvaluationError
-            If forces cannot be evaluated again.
-        OSError
-            If the file cannot be written.
-        """
-        from srm_mbs.visualization.plotting import plot_solution
-
-        return plot_solution(self, path, kind, **options)
-
-    def report(self, path: str | Path, **options: Any) -> None:
-        """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`."""
-        from srm_mbs.analysis.report.report import write_report
-
-        write_report(self, Path(path), **options)
-
     def __repr__(self) -> str:
+        first, last = (self.t[0], self.t[-1]) if len(self.t) else (0.0, 0.0)
         return (
-            f"Solution({self.mechanism.name!r}, t={self.t[0] if len(self.t) else 0:.6g}.."
-            f"{self.t[-1] if len(self.t) else 0:.6g} s, {len(self.t)} points, "
-            f"{self.stats.steps} steps, {self.status})"
+            f"Solution({self.mechanism.name!r}, t={first:.6g}..{last:.6g} s, "
+            f"{len(self.t)} points, {self.stats.steps} steps, {self.status}, "
+            f"{self.settings.backend})"
         )

@@ -1,158 +1,197 @@
-"""What a run of a mechanism begins with: its checked start, tolerances, control and callbacks.
+r"""The one runner: check the options, assemble the problem, integrate, collect the result.
 
-Options that mechanisms and DAEs share are checked in :mod:`srm_mbs.simulation.options`.
-
-What a run of a mechanism ends with: its solution, and the sentences of its message.
+Every run goes these four steps, whoever asks for it: :func:`srm_mbs.simulate`, each segment of a
+run with event actions, a rerun with another accuracy; :func:`srm_mbs.solve_dae` and
+:class:`srm_mbs.Simulator` use the same checks, controls and records.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
-from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.dynamics.dae import DaeSystem
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import constraint_units
-from srm_mbs.errors import InputError
-from srm_mbs.integration.control.branch_guard import BranchGuard
-from srm_mbs.integration.control.prescribed_times import Placing, placed, suspected
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
-from srm_mbs.integration.dense_output import DenseOutput
-from srm_mbs.integration.driver import RunRecord
+from srm_mbs.dynamics.system import System
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
+from srm_mbs.integration import driver
+from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals, smooth_intervals
+from srm_mbs.integration.control.prescribed_times import placed, suspected
+from srm_mbs.integration.control.step_size import (
+    ControlWrapper,
+    StepDecision,
+    StepSizeControl,
+    initial_step,
+)
+from srm_mbs.integration.dense_output import DenseOutput, StepData
+from srm_mbs.integration.driver import RunRecord, RunStatus, Tick
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
+from srm_mbs.integration.kernel import driver as kernel_driver
+from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
-from srm_mbs.integration.kernel.system import shared
-from srm_mbs.integration.messages import drift, passings, restarts, turns
-from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.kernel.run import CompiledRun
+from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
+from srm_mbs.integration.messages import (
+    MECHANISM,
+    ProblemVocabulary,
+    branch_changes,
+    method_messages,
+)
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
+from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.model.forces import LimitSpring
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.options import checked_atol, checked_method, step_size_control
-from srm_mbs.simulation.result import Settings, Solution, Statistics, attempt_array
+from srm_mbs.model.mechanism import per_model, per_start
+from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
+from srm_mbs.simulation.options import (
+    RunOptions,
+    check_avoidable,
+    check_embedded,
+    checked_atol,
+    checked_breakpoints,
+    checked_method,
+    checked_samples,
+    checked_span,
+    loosest_rtol,
+    step_size_control,
+    tightest_rtol,
+)
+from srm_mbs.simulation.result import (
+    RunOutcome,
+    Settings,
+    SimulationResult,
+    Statistics,
+    attempt_array,
+)
 
-MENDED = "See solution.crossings; try a smaller rtol or step."
-"""What to do about a passage that may have changed the branch."""
-TOLD = 2
+DESCRIBED_BIFURCATIONS = 2
 """Bifurcations that the message of a run describes."""
-ROUND_OFF = 1e-12
-"""Distance (rad, m) behind a joint limit that is rounding; times |q| where that is above 1."""
-
-
-def assemble_result(
-    mechanism: Mechanism,
-    system: OpenSystem | ClosedSystem,
-    method: Method,
-    record: RunRecord,
-    wrappers: Sequence[Placing],
-    watch: EventWatch | None,
-    t_eval: FloatArray | None,
-    settings: Settings,
-    norm: ErrorNorm,
-    kernel_system: Any,
-) -> Solution:
-    """Arrays and statistics from a run record."""
-    scheme = method.scheme
-    data = record.data(scheme, system.tangent_size)
-    placed = sum(wrapper.placed for wrapper in wrappers)
-    replaced = sum(wrapper.replaced for wrapper in wrappers)
-    suspects = suspected(wrappers)
-    dense: DenseOutput
-    if not isinstance(record, CompiledRecord):
-        dense = DenseOutput(system, scheme, data)
-    else:
-        dense = CompiledDenseOutput(None if shared(system) else kernel_system, system, scheme, data)
-        placed, replaced, suspects = record.placed, record.replaced, record.suspects
-    rejected = [a for a in record.attempts if a.verdict is StepDecision.REJECTED]
-    stats = Statistics(
-        steps=data.count,
-        rejected=len(rejected),
-        placements=placed,
-        replaced=replaced,
-        zone_steps=len(data.zones),
-        evaluations=system.evaluations,
-        factorisations=system.factorisations,
-        wall_time=record.wall_time,
-    )
-    return Solution(
-        mechanism,
-        system,
-        scheme,
-        data,
-        dense=dense,
-        t_eval=t_eval,
-        attempts=attempt_array(record.attempts),
-        events=None if watch is None else watch.found(),
-        status=record.status,
-        message=record.message
-        + turns(suspects, "the velocity turned", MENDED)
-        + restarts(record.steps)
-        + passings(record.steps)
-        + drift(record.steps, norm)
-        + _limits_left(mechanism, dense)
-        + _driven_too_far(mechanism, record),
-        stats=stats,
-        settings=settings,
-    )
-
-
-def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
-    """What else may be the cause where a driven mechanism cannot go on."""
-    if record.status != "failed" or not mechanism.drives:
-        return ""
-    names = ", ".join(drive.name for drive in mechanism.drives)
-    return f" A drive ({names}) may lead where the mechanism cannot follow."
-
-
-def bifurcation_sentences(solution: Solution) -> str:
-    """A sentence for each singular configuration that was reached without momentum."""
-    found = solution.bifurcations
-    more = f" There were {len(found)} of them." if len(found) > TOLD else ""
-    return "".join(f" {bifurcation}." for bifurcation in found[:TOLD]) + more
-
-
-def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatArray]:
-    """Names, indices in q (k,) and limits (2, k) of the one-degree joints that have limits."""
-    model = mechanism.model
-    names, indices, limits = [], [], []
-    sprung = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
-    for name in mechanism.joint_names:
-        joint = mechanism.joint(name)
-        if joint.nq == 1 and name not in sprung:
-            low = float(model.lowerPositionLimit[joint.idx_q])
-            high = float(model.upperPositionLimit[joint.idx_q])
-            if low < high and (np.isfinite(low) or np.isfinite(high)):
-                names.append(name)
-                indices.append(joint.idx_q)
-                limits.append((low, high))
-    return names, np.array(indices, dtype=int), np.array(limits).reshape(-1, 2).T
-
-
-def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
-    """A sentence naming the one-degree joints that left their limits, which do not act."""
-    names, indices, (low, high) = mechanism.derived(
-        "limited_joints", lambda: _limited_joints(mechanism)
-    )
-    if not names:
-        return ""
-    q = dense.nodes()[1][:, indices]
-    # The reductions themselves: their methods cost more than they do here.
-    least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
-    beyond = np.maximum(low - least, largest - high)
-    if not max(beyond.tolist()) > 0.0:
-        return ""
-    # A run that a terminal event ends at a limit has not left it.
-    slack = ROUND_OFF * np.maximum(1.0, np.maximum(-least, largest))
-    left = [names[k] for k in np.flatnonzero(beyond > slack)]
-    return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""
-
-
+LIMIT_ROUNDING = 1e-12
+"""Distance (rad, m) beyond a joint limit that is rounding; times |q| where that is above 1."""
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
+SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
+"""Remedy for a passage that may have changed the branch."""
+
+Result = TypeVar("Result", bound=SimulationResult)
+Outcome = TypeVar("Outcome", bound=RunOutcome)
+
+
+@dataclass(eq=False)
+class Problem:
+    """The initial value problem of a mechanism, ready to be integrated.
+
+    Attributes
+    ----------
+    mechanism
+        With the initial state of the run.
+    options
+        Checked ones.
+    system, norm
+        The equations of motion, and the error norm with the tolerances of the run.
+    state : (nq + nv,)
+        Initial state.
+    intervals
+        Where the right-hand side is smooth.
+    on_kernel
+        Whether the compiled kernel makes the run.
+    held
+        The forces that a sampled controller held; None without one.
+    watch
+        Looks for the events; None without any.
+    """
+
+    mechanism: Mechanism
+    options: RunOptions
+    system: OpenSystem | ClosedSystem
+    norm: ErrorNorm
+    state: FloatArray
+    intervals: SmoothIntervals
+    on_kernel: bool
+    held: HeldForce | None
+    watch: EventWatch | None
+
+
+def run_segment(mechanism: Mechanism, options: RunOptions, result_type: type[Result]) -> Result:
+    """A run without event actions.
+
+    Parameters
+    ----------
+    options
+        From :func:`checked_options`.
+    result_type
+        Class of the result.
+    """
+    problem = assemble_problem(mechanism, options)
+    by = "kernel" if problem.on_kernel else "python"
+    log_start(mechanism.name, options, problem.norm, by)
+    record, wrappers, kernel_system = integrate_problem(problem)
+    result = assemble_result(problem, record, wrappers, kernel_system, result_type)
+    result.request = options.repeatable()
+    result.message += bifurcation_sentences(result)
+    log_end(mechanism.name, result)
+    return result
+
+
+def finished(result: Outcome, options: RunOptions) -> Outcome:
+    """``result``, unless it failed and the caller asked for an exception.
+
+    Raises
+    ------
+    SimulationError
+        With ``raise_on_failure``.
+    """
+    if options.raise_on_failure and not result.success:
+        raise SimulationError(result.message, result)
+    return result
+
+
+# --- check ----------------------------------------------------------------------------------------
+
+
+def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
+    """``options`` of a run of ``mechanism`` with values of their final types.
+
+    Raises
+    ------
+    InputError
+        For the first that is invalid.
+    """
+    check_mechanism(mechanism)
+    t0, t_end = checked_span(options.t0, options.t_end)
+    if options.controller is not None and not callable(options.controller):
+        raise InputError(
+            f"controller = {options.controller!r} cannot be called",
+            element="controller",
+            remedy="Give a function of (t, q, v) that returns the generalised forces",
+        )
+    return checked_accuracy(mechanism, options, t0, t_end)
+
+
+def checked_accuracy(
+    mechanism: Mechanism, options: RunOptions, t0: float, t_end: float
+) -> RunOptions:
+    """The options of steps, tolerances, method and output, checked for a run in [t0, t_end] (s)."""
+    method = mechanism_method(options.method, options.tableau)
+    tightest = tightest_rtol(method.scheme, mechanism.constrained)
+    return options.checked(
+        method,
+        (tightest, loosest_rtol(method)),
+        (t0, t_end),
+        unit=" of seconds",
+        arguments="(t, h, state)",
+    )
 
 
 def check_mechanism(mechanism: Any) -> None:
@@ -177,6 +216,7 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
     return checked
 
 
+@per_start
 def _units_of_states(mechanism: Mechanism) -> FloatArray:
     """The unit of each tangent component (2 nv,)."""
     units = mechanism.structure.units
@@ -186,9 +226,7 @@ def _units_of_states(mechanism: Mechanism) -> FloatArray:
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
     if atol is None:
-        tolerance: FloatArray = rtol * mechanism.at_start(
-            "units of states", lambda: _units_of_states(mechanism)
-        )
+        tolerance: FloatArray = rtol * _units_of_states(mechanism)
         return tolerance
     nv = mechanism.model.nv
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
@@ -211,16 +249,34 @@ def initial_state(
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
 
 
-def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
-    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates; True for
-    any other."""
+@per_start
+def _accepted_times(mechanism: Mechanism) -> set[float]:
+    """Times (s) at which the initial state satisfies closures and drives, as far as checked."""
+    return set()
+
+
+def check_consistent(mechanism: Mechanism, t: float = 0.0) -> None:
+    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates.
+
+    Raises
+    ------
+    InputError
+        Naming the row that is violated most.
+    """
+    accepted = _accepted_times(mechanism)
+    if t not in accepted:
+        _check_errors(mechanism, t)
+        accepted.add(t)
+
+
+def _check_errors(mechanism: Mechanism, t: float) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
     if t == 0.0:
         g, c = mechanism.initial_errors
     else:
         g, c = (e[0] for e in constraint_errors(mechanism, np.array([t]), q0[None], v0[None]))
     if not len(g):
-        return True
+        return
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
     speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
@@ -235,13 +291,42 @@ def check_consistent(mechanism: Mechanism, t: float = 0.0) -> bool:
                 element=what,
                 remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
             )
-    return True
+
+
+# --- assemble the problem -------------------------------------------------------------------------
+
+
+def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
+    """The problem of a run of ``mechanism``.
+
+    Raises
+    ------
+    InputError
+        If the start is inconsistent, a law does not cover the run, or the backend cannot make it.
+    """
+    t0, t_end, method = options.t0, options.t_end, options.method
+    samples = checked_samples(options.sample_time, options.controller, t0, t_end)
+    given = checked_breakpoints(options.breakpoints)
+    times = np.concatenate([given, mechanism.breakpoints(t0, t_end)])
+    intervals = smooth_intervals(times, samples, t0, t_end)
+    check_avoidable(options.singular_times, intervals.ends, t_end - t0)
+    on_kernel = uses_kernel(options.backend, method, options.placement, options.singular_times)
+    mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
+    tolerance = absolute_tolerance(mechanism, options.atol, options.rtol)
+    norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+    held = None if options.sample_time is None else HeldForce()
+    system = make_system(mechanism, options.controller if held is None else held)
+    mechanism.check_covers(t_end)
+    if mechanism.constrained:
+        check_consistent(mechanism, t0)
+    watch = event_watch(options.events, system, method, state)
+    return Problem(mechanism, options, system, norm, state, intervals, on_kernel, held, watch)
 
 
 def event_watch(
     events: Any, system: OpenSystem | ClosedSystem, method: Method, state: FloatArray
 ) -> EventWatch | None:
-    """What looks for the events (t, q, v) -> float; None if none are given."""
+    """The detector of the events (t, q, v) -> float; None if none are given."""
     if events is None:
         return None
 
@@ -254,7 +339,7 @@ def event_watch(
 def sampler(
     system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, kernel_system: Any
 ) -> Callable[[float, FloatArray], None]:
-    """What samples ``controller`` at (t, state), for ``held`` and for the kernel."""
+    """A function (t, state) that samples ``controller`` for ``held`` and for the kernel."""
 
     def sample(t: float, state: FloatArray) -> None:
         force = evaluate_controller(controller, t, *system.split(state))
@@ -266,32 +351,290 @@ def sampler(
 
 
 def placed_control(
-    system: OpenSystem | ClosedSystem,
-    method: Method,
-    step: float | None,
+    system: System,
+    options: RunOptions,
     first_step: Callable[[], float],
-    span: tuple[float, float],
-    placement: str,
-    singular_times: FloatArray,
     arrivals: bool = False,
-) -> tuple[StepSizeControl, Sequence[Placing]]:
+) -> tuple[StepSizeControl, Sequence[ControlWrapper]]:
     """The step-size control of a run, and the wrappers in it that count what they did.
 
-    ``arrivals``: the driver prepares for ends beside singular configurations.
+    Parameters
+    ----------
+    first_step
+        Length (s) of the first step, asked for if the control needs it.
+    arrivals
+        Whether the driver prepares for ends beside singular configurations.
     """
-    scheme = method.scheme
-    t0, t_end = span
-    control = step_size_control(scheme, t0, t_end, step, first_step)
-    control, wrappers = placed(
+    scheme, t_end = options.method.scheme, options.t_end
+    control = step_size_control(scheme, options.t0, t_end, options.step, first_step)
+    placement = options.placement if system.has_constraints else None
+    times = options.singular_times
+    control, wrappers = placed(control, scheme, placement, times, t_end, options.step, arrivals)
+    if placement != "automatic":
+        return control, wrappers
+    guard = branch_guard(control, system, options.method)
+    return guard, (*wrappers, guard)
+
+
+# --- integrate ------------------------------------------------------------------------------------
+
+
+def integrate_problem(problem: Problem) -> tuple[RunRecord, Sequence[ControlWrapper], Any]:
+    """The record of the run, the wrappers of its control, and the kernel's system if there is one.
+
+    Whatever happens on the way ends in the record: a start that cannot be evaluated, too.
+    """
+    system, options, state = problem.system, problem.options, problem.state
+    method, t0 = options.method, options.t0
+    kernel_system: Any = None
+    workspaces = ExitStack()  # stays open if the run raises: its workspace is then not used again
+    try:
+        evaluator: Any = system
+        if problem.on_kernel:
+            kernel_system = workspaces.enter_context(workspace(system))
+            evaluator = Evaluator(system, kernel_system)
+        handler = BreakpointHandler(problem.intervals, system, method, problem.norm, evaluator)
+        if problem.held is not None:
+            handler.sample = sampler(system, problem.held, options.controller, kernel_system)
+            handler.sample(t0, state)
+        memory = start(system, method, t0, state, problem.norm, options.t_end, evaluator)
+
+        def first_step() -> float:
+            return chosen_first_step(evaluator, problem.norm, options, memory, state)
+
+        with progress_of(options.progress, system, options.t_end) as tick:
+            if kernel_system is not None:
+                run = kernel_run(problem, kernel_system, memory, handler.arrivals, first_step)
+                wrappers: Sequence[ControlWrapper] = ()
+                record: RunRecord = kernel_driver.integrate(
+                    system, run, tick=tick, events=problem.watch, passing=handler
+                )
+            else:
+                control, wrappers = placed_control(system, options, first_step, handler.arrivals)
+                record = integrate_steps(
+                    system,
+                    options,
+                    control,
+                    problem.norm,
+                    memory,
+                    state,
+                    tick,
+                    problem.watch,
+                    handler,
+                )
+        handler.done()
+        workspaces.close()
+    except (EvaluationError, ControllerError) as error:
+        return failed_start(t0, state, error, " s"), (), kernel_system
+    return record, wrappers, kernel_system
+
+
+def integrate_steps(
+    system: System,
+    options: RunOptions,
+    control: StepSizeControl,
+    norm: ErrorNorm,
+    memory: IntegratorState,
+    state: FloatArray,
+    tick: Tick | None,
+    watch: EventWatch | None,
+    handler: BreakpointHandler | None = None,
+    words: ProblemVocabulary = MECHANISM,
+) -> RunRecord:
+    """The run with the Python reference; see :func:`srm_mbs.integration.driver.integrate`."""
+    return driver.integrate(
+        system,
+        options.method,
         control,
-        scheme,
-        placement if system.has_constraints else None,
-        singular_times,
-        t_end,
-        step,
-        arrivals,
+        norm,
+        memory,
+        state,
+        options.t0,
+        options.t_end,
+        max_step=options.longest_step,
+        tick=tick,
+        events=watch,
+        breakpoints=handler,
+        words=words,
     )
-    if system.has_constraints and placement == "automatic":
-        guard = BranchGuard(control, system)
-        return guard, (*wrappers, guard)
-    return control, wrappers
+
+
+def kernel_run(
+    problem: Problem,
+    kernel_system: Any,
+    memory: IntegratorState,
+    arrivals: bool,
+    first_step: Callable[[], float],
+) -> CompiledRun:
+    """The run on the compiled kernel, before its first step."""
+    options = problem.options
+    check_embedded(options.method.scheme, options.step)
+    return CompiledRun(
+        kernel_system,
+        options.method,
+        problem.norm,
+        memory,
+        problem.state,
+        problem.intervals,
+        t0=options.t0,
+        step=options.step,
+        first_step=first_step() if options.step is None else 0.0,
+        max_step=options.longest_step,
+        placed=options.placement,
+        arrivals=arrivals,
+    )
+
+
+def chosen_first_step(
+    evaluator: Any,
+    norm: ErrorNorm,
+    options: RunOptions,
+    memory: IntegratorState,
+    state: FloatArray,
+) -> float:
+    """The given first step (s), or the one that the start of the run allows."""
+    if options.first_step is not None:
+        return float(options.first_step)
+    order = options.method.scheme.controller_order or 1
+    span, t0 = options.t_end - options.t0, options.t0
+    if isinstance(evaluator, Evaluator):
+        return evaluator.first_step(state, memory, norm, span, order, t0)
+    return initial_step(evaluator, state, memory, norm, span, order, t0)
+
+
+def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "") -> RunRecord:
+    """The record of a run that could not make its first step."""
+    record = RunRecord(t0, state.copy())
+    record.status = RunStatus.FAILED
+    record.message = f"Stopped at t = {t0:.6g}{unit}: {error}."
+    return record
+
+
+# --- collect --------------------------------------------------------------------------------------
+
+
+def statistics(
+    system: OpenSystem | ClosedSystem | DaeSystem,
+    record: RunRecord,
+    data: StepData,
+    placed: int,
+    replaced: int,
+) -> Statistics:
+    """Counts of a run, ``placed`` and ``replaced`` by its step placement."""
+    return Statistics(
+        steps=data.count,
+        rejected=sum(attempt.verdict is StepDecision.REJECTED for attempt in record.attempts),
+        placements=placed,
+        replaced=replaced,
+        zone_steps=len(data.zones),
+        evaluations=system.evaluations,
+        factorisations=system.factorisations,
+        wall_time=record.wall_time,
+    )
+
+
+def settings(options: RunOptions, norm: ErrorNorm, controlled: bool, backend: str) -> Settings:
+    """The settings of a run that was made with ``options``."""
+    return Settings(
+        type(options.method).__name__,
+        options.method.scheme.name,
+        options.rtol,
+        tuple(norm.atol.tolist()),
+        options.step,
+        controlled,
+        options.placement,
+        tuple(options.singular_times.tolist()),
+        backend,
+    )
+
+
+def assemble_result(
+    problem: Problem,
+    record: RunRecord,
+    wrappers: Sequence[ControlWrapper],
+    kernel_system: Any,
+    result_type: type[Result],
+) -> Result:
+    """Arrays, statistics and message of a run."""
+    system, options, mechanism = problem.system, problem.options, problem.mechanism
+    scheme = options.method.scheme
+    data = record.data(scheme, system.tangent_size)
+    dense: DenseOutput
+    if isinstance(record, CompiledRecord):
+        dense = CompiledDenseOutput(None if shared(system) else kernel_system, system, scheme, data)
+        placed, replaced, suspects = record.placed, record.replaced, record.suspects
+    else:
+        dense = DenseOutput(system, scheme, data)
+        placed = sum(wrapper.placed for wrapper in wrappers)
+        replaced = sum(wrapper.replaced for wrapper in wrappers)
+        suspects = suspected(wrappers)
+    controlled = options.controller is not None or system.calls_forces
+    by = "kernel" if problem.on_kernel else "python"
+    return result_type(
+        mechanism,
+        system,
+        scheme,
+        data,
+        dense=dense,
+        t_eval=options.t_eval,
+        attempts=attempt_array(record.attempts),
+        events=None if problem.watch is None else problem.watch.found(),
+        status=record.status,
+        message=record.message
+        + branch_changes(suspects, "the velocity turned", SMALLER_STEPS)
+        + method_messages(options.method, record.steps, problem.norm)
+        + _limits_left(mechanism, dense)
+        + _driven_too_far(mechanism, record),
+        stats=statistics(system, record, data, placed, replaced),
+        settings=settings(options, problem.norm, controlled, by),
+    )
+
+
+def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
+    """A sentence on drives as a possible cause of a failure; empty without them."""
+    if record.status is not RunStatus.FAILED or not mechanism.drives:
+        return ""
+    names = ", ".join(drive.name for drive in mechanism.drives)
+    return f" A drive ({names}) may lead where the mechanism cannot follow."
+
+
+def bifurcation_sentences(result: SimulationResult) -> str:
+    """A sentence for each singular configuration that was reached without momentum."""
+    found = result.bifurcations
+    more = f" There were {len(found)} of them." if len(found) > DESCRIBED_BIFURCATIONS else ""
+    return "".join(f" {bifurcation}." for bifurcation in found[:DESCRIBED_BIFURCATIONS]) + more
+
+
+@per_model
+def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatArray]:
+    """Names, indices in q (k,) and limits (2, k) of the one-degree joints that have limits."""
+    model = mechanism.model
+    names, indices, limits = [], [], []
+    sprung = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
+    for name in mechanism.joint_names:
+        joint = mechanism.joint(name)
+        if joint.nq == 1 and name not in sprung:
+            low = float(model.lowerPositionLimit[joint.idx_q])
+            high = float(model.upperPositionLimit[joint.idx_q])
+            if low < high and (np.isfinite(low) or np.isfinite(high)):
+                names.append(name)
+                indices.append(joint.idx_q)
+                limits.append((low, high))
+    return names, np.array(indices, dtype=int), np.array(limits).reshape(-1, 2).T
+
+
+def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
+    """A sentence naming the one-degree joints that left their limits, which do not act."""
+    names, indices, (low, high) = _limited_joints(mechanism)
+    if not names:
+        return ""
+    q = dense.nodes()[1][:, indices]
+    # The reductions themselves: their methods cost more than they do here.
+    least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
+    beyond = np.maximum(low - least, largest - high)
+    if not max(beyond.tolist()) > 0.0:
+        return ""
+    # A run that a terminal event ends at a limit has not left it.
+    slack = LIMIT_ROUNDING * np.maximum(1.0, np.maximum(-least, largest))
+    left = [names[k] for k in np.flatnonzero(beyond > slack)]
+    return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
-from srm_mbs.integration.dense_output import StepData, check_within, times_to_read
+from srm_mbs.integration.dense_output import StepData, check_within, checked_output_times
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
-from srm_mbs.simulation.result import Solution, Statistics
-
-if TYPE_CHECKING:
-    from srm_mbs.simulation.energy_balance import EnergyBalance
+from srm_mbs.simulation.energy_balance import EnergyBalance, joined_balance
+from srm_mbs.simulation.result import SimulationResult, Statistics
 
 
-class SegmentedSolution(Solution):
+class SegmentedResult(SimulationResult):
     """Result of a run with event actions: smooth segments on one time axis.
 
     ``t``, ``q`` and ``v`` have two rows at each jump, before and after; dense output, ``t_eval``
@@ -36,7 +34,7 @@ class SegmentedSolution(Solution):
 
     def __init__(
         self,
-        segments: Sequence[Solution],
+        segments: Sequence[SimulationResult],
         *,
         t_eval: FloatArray | None,
         status: str,
@@ -46,19 +44,19 @@ class SegmentedSolution(Solution):
         first = self.segments[0]
         self.mechanism = first.mechanism
         self.scheme, self.settings = first.scheme, first.settings
-        self.status, self.message = status, message
+        self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
         self.stats = _added([segment.stats for segment in self.segments])
         self.t_eval = t_eval
-        self._parts: tuple[Solution, ...] = self.segments
+        self._parts: tuple[SimulationResult, ...] = self.segments
         self._order = np.zeros(0, dtype=int)
         if t_eval is not None:
             t_eval = t_eval[t_eval <= self.segments[-1].steps.end]
             self._read_at(t_eval)
-        self.t = self._rows(lambda part: part.t)
-        self.q = self._rows(lambda part: part.q)
-        self.v = self._rows(lambda part: part.v)
+        self.t = self.rows_of_parts(lambda part: part.t)
+        self.q = self.rows_of_parts(lambda part: part.q)
+        self.v = self.rows_of_parts(lambda part: part.v)
         self.t_events = self.q_events = self.v_events = None
         if first.t_events is not None:
             count = range(len(first.t_events))
@@ -68,7 +66,7 @@ class SegmentedSolution(Solution):
             )
 
     @property
-    def segments(self) -> tuple[Solution, ...]:
+    def segments(self) -> tuple[SimulationResult, ...]:
         """The smooth parts of the run, between the actions of events."""
         return self._segments
 
@@ -82,8 +80,8 @@ class SegmentedSolution(Solution):
         self._order = np.argsort(chosen, kind="stable")
         self._parts = tuple(segment.at(t[index == k]) for k, segment in enumerate(self.segments))
 
-    def _rows(self, read: Callable[[Any], FloatArray]) -> FloatArray:
-        """What ``read`` gives for each segment, in the order of ``t``."""
+    def rows_of_parts(self, read: Callable[[Any], FloatArray]) -> FloatArray:
+        """Rows that ``read`` returns for the segments, in the order of ``t``."""
         rows = np.concatenate([read(part) for part in self._parts])
         rows = rows if self._parts is self.segments else rows[self._order]
         rows.setflags(write=False)
@@ -91,16 +89,16 @@ class SegmentedSolution(Solution):
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output, right-continuous; see :class:`~srm_mbs.Solution`."""
-        times = times_to_read(t, scalar=True)
+        times = checked_output_times(t, scalar=True)
         found = self.at(np.atleast_1d(times))
         return (found.q[0], found.v[0]) if times.ndim == 0 else (found.q, found.v)
 
-    def at(self, t: Any) -> Solution:
+    def at(self, t: Any) -> Self:
         """The same run read at other times; see :meth:`~srm_mbs.Solution.at`."""
-        times = times_to_read(t)
+        times = checked_output_times(t)
         start, end = self.span
         check_within(times, start, end)
-        run = SegmentedSolution(
+        run = type(self)(
             self.segments,
             t_eval=np.clip(times, start, end),
             status=self.status,
@@ -116,7 +114,7 @@ class SegmentedSolution(Solution):
 
     @property
     def held(self) -> HeldForce | None:
-        """What a sampled controller held in the first segment; None without one."""
+        """Forces that a sampled controller held in the first segment; None without one."""
         return self.segments[0].held
 
     @cached_property
@@ -155,28 +153,21 @@ class SegmentedSolution(Solution):
     @cached_property
     def drift(self) -> FloatArray:
         """Closure errors (n, 2), of the closures that were there."""
-        return self._rows(lambda part: part.drift)
+        return self.rows_of_parts(lambda part: part.drift)
 
     @cached_property
     def energy(self) -> FloatArray:
         """Kinetic plus potential energy (n,) J."""
-        return self._rows(lambda part: part.energy)
+        return self.rows_of_parts(lambda part: part.energy)
 
     @cached_property
     def accelerations(self) -> FloatArray:
         """See :attr:`~srm_mbs.Solution.accelerations`."""
-        return self._rows(lambda part: part.accelerations)
-
-    @cached_property
-    def degrees_of_freedom(self) -> Any:
-        """See :attr:`~srm_mbs.Solution.degrees_of_freedom`."""
-        return self._rows(lambda part: part.degrees_of_freedom)
+        return self.rows_of_parts(lambda part: part.accelerations)
 
     @cached_property
     def energy_balance(self) -> EnergyBalance:
         """See :attr:`~srm_mbs.Solution.energy_balance`; what actions change is in ``events``."""
-        from srm_mbs.simulation.energy_balance import joined_balance
-
         order = None if self._parts is self.segments else self._order
         return joined_balance(self.segments, self._parts, order)
 
@@ -224,12 +215,6 @@ class SegmentedSolution(Solution):
         rows = (row for segment in self.segments for row in segment.indeterminate_reactions)
         return tuple(dict.fromkeys(rows))
 
-    def save(self, path: str | Path) -> None:
-        """Write all segments into one file; see :meth:`~srm_mbs.Solution.save`."""
-        from srm_mbs.simulation.storage import save_segments
-
-        save_segments(self, Path(path))
-
 
 def _added(parts: Sequence[Statistics]) -> Statistics:
     names = [field.name for field in fields(Statistics)]
@@ -270,3 +255,18 @@ def _joined(parts: Sequence[StepData]) -> StepData:
             for name in ("rates", "sigmas", "ranks", "error_ratios", "placements", "held")
         },
     )
+
+
+R = TypeVar("R", bound=SimulationResult)
+
+
+@dataclass(frozen=True)
+class ResultTypes(Generic[R]):
+    """Classes of the results that a runner makes: of one segment, and of several."""
+
+    plain: type[R]
+    segmented: Callable[..., R]
+
+
+RESULTS: ResultTypes[SimulationResult] = ResultTypes(SimulationResult, SegmentedResult)
+"""Results without pictures and files."""

@@ -1,32 +1,31 @@
-"""Runs with event actions, segment by segment.
+"""Runs, segment by segment where actions of events change the state or the mechanism.
 
-What happens at events: actions that change the state, or the mechanism.
+:func:`run` is the entry of all runs of mechanisms.  Without actions a run is one segment.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.api import simulate
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
-from srm_mbs.errors import EvaluationError, EventError, InputError, SimulationError
-from srm_mbs.integration.events import EventFunction, prepare_events, together
+from srm_mbs.errors import EvaluationError, EventError, InputError
+from srm_mbs.integration.driver import RunStatus
+from srm_mbs.integration.events import EventFunction, acting, prepare_events, same_time
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.options import checked_times, numbers, positive
-from srm_mbs.simulation.result import Request, Solution
-from srm_mbs.simulation.runner import check_consistent
-from srm_mbs.simulation.segmented_result import SegmentedSolution
+from srm_mbs.simulation.options import RunOptions, numbers, positive
+from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.runner import check_consistent, checked_options, finished, run_segment
+from srm_mbs.simulation.segmented_result import R, ResultTypes
 
 
 class Event:
@@ -174,30 +173,19 @@ LEFT = 1e-12
 """Part of the run too short for another segment."""
 
 
-class _Armed:
-    """An event of the user, (t, q, v) -> float, within one segment."""
-
-    def __init__(
-        self,
-        event: Any,
-        prepared: EventFunction,
-        before: int,
-        departs: bool,
-        floor: float,
-        guard: float | None,
-    ) -> None:
-        self._event = event
-        self.__name__ = prepared.name.strip("'")
-        self.direction = prepared.direction
-        self.left = prepared.occurrences - before
-        self.terminal = int(self.left) if math.isfinite(self.left) else None
-        self.acts = getattr(event, "action", None) is not None
-        self.departs = departs and floor == 0.0
-        self.floor = floor
-        self.guard = guard
-
-    def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
-        return self._event(t, q, v)
+def _in_segment(
+    event: EventFunction, before: int, departs: bool, floor: float, start_tolerance: float | None
+) -> EventFunction:
+    """``event`` of a run as it is in a segment of it, after ``before`` occurrences."""
+    return replace(
+        event,
+        occurrences=event.occurrences - before,
+        action=None,
+        acts=event.action is not None,
+        departs=departs and floor == 0.0,
+        floor=floor,
+        start_tolerance=start_tolerance,
+    )
 
 
 class _Sampled:
@@ -214,96 +202,116 @@ class _Sampled:
         return self._last
 
 
-def simulate_segments(mechanism: Mechanism, t_end: float, options: dict[str, Any]) -> Solution:
-    """:func:`srm_mbs.simulate` with events that have actions.
+def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
+    """Simulate ``mechanism``; see :func:`srm_mbs.simulate`.
 
     Parameters
     ----------
     options
-        All others of ``simulate``.
+        As the caller gave them.
+    types
+        Classes of the result.
+
+    Raises
+    ------
+    InputError
+        For invalid input, before any stepping.
+    SimulationError
+        Only with ``raise_on_failure``.
     """
-    t_end = float(t_end)
-    given = options["events"]
-    events = [given] if callable(given) else list(given)
-    prepared = prepare_events(given, lambda event: lambda t, x: 0.0)
-    if options["t0"] == 0.0 and not (options["q0"] is None and options["v0"] is None):
+    if isinstance(options.events, Iterator):  # they are looked at more than once
+        options = replace(options, events=list(options.events))
+    checked = checked_options(mechanism, options)
+    if acting(options.events):
+        result = _run_segments(mechanism, checked, types)
+    else:
+        result = run_segment(mechanism, checked, types.plain)
+    result.request = options.repeatable()
+    return finished(result, checked)
+
+
+def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
+    """The segments between the actions of events, joined."""
+    t_end = options.t_end
+    prepared = prepare_events(options.events, lambda event: event)
+    names = [event.name.strip("'") for event in prepared]
+    q0, v0 = options.q0, options.v0
+    if options.t0 == 0.0 and not (q0 is None and v0 is None):
         # Drives begin with this state.
-        q0, v0 = options["q0"], options["v0"]
         mechanism = mechanism.with_state(
             mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
         )
-    t_eval = checked_times(options["t_eval"], options["t0"], t_end)
-    asked = options["raise_on_failure"]
-    here = options | {"t_eval": None, "raise_on_failure": False}
-    if options["sample_time"] is not None and callable(options["controller"]):
-        period = positive(options["sample_time"], "sample_time", " of seconds")
-        here["controller"] = _Sampled(options["controller"], period)
-    counts = [0] * len(events)
-    last_times: list[list[float]] = [[] for _ in events]
-    floors = [0.0] * len(events)
-    parts: list[Solution] = []
+    here = replace(options, t_eval=None)
+    if options.sample_time is not None and options.controller is not None:
+        period = positive(options.sample_time, "sample_time", " of seconds")
+        here = replace(here, controller=_Sampled(options.controller, period))
+    counts = [0] * len(prepared)
+    last_times: list[list[float]] = [[] for _ in prepared]
+    floors = [0.0] * len(prepared)
+    parts: list[R] = []
     acted: list[int] = []
-    guards: list[float | None] = [None] * len(events)
-    t = float(options["t0"])
+    start_tolerances: list[float | None] = [None] * len(prepared)
+    t = options.t0
     span = t_end - t
-    status, message = "", ""
-    while not status:
-        armed = [
-            _Armed(event, prepared[i], counts[i], i in acted, floors[i], guards[i])
-            for i, event in enumerate(events)
+    status, message = RunStatus.RUNNING, ""
+    while status is RunStatus.RUNNING:
+        events = [
+            _in_segment(event, counts[i], i in acted, floors[i], start_tolerances[i])
+            for i, event in enumerate(prepared)
         ]
         try:
-            solution = simulate(mechanism, t_end, **here | {"events": armed})
+            part = run_segment(mechanism, replace(here, events=events), types.plain)
         except InputError as error:
             if not parts:
                 raise
-            status, message = "failed", f"Stopped at t = {t:.9g} s: after the action {error}."
+            status = RunStatus.FAILED
+            message = f"Stopped at t = {t:.9g} s: after the action {error}."
             break
         except KeyboardInterrupt:
             if not parts:
                 raise
-            status, message = "interrupted", INTERRUPTED.format(t)
+            status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
             break
-        parts.append(solution)
-        status, message = solution.status, solution.message
-        found = solution.t_events or []
+        parts.append(part)
+        status, message = part.status, part.message
+        found = part.t_events or []
         counts = [n + len(times) for n, times in zip(counts, found)]
-        t = solution.steps.end
+        t = part.steps.end
         due = [i for i, times in enumerate(found) if len(times) and times[-1] == t]
-        if status != "event" or any(len(found[i]) >= armed[i].left for i in due):
+        final = any(len(found[i]) >= events[i].occurrences for i in due)
+        if status is not RunStatus.EVENT or final:
             break
-        acted = [i for i in due if armed[i].acts]
+        acted = [i for i in due if prepared[i].action is not None]
         # What was counted here is not counted again just after; the rest has still to be.
-        near = 2.0 * together(*solution.steps.times[-2:].tolist())
-        guards = [near if len(times) and times[-1] >= t - near else 0.0 for times in found]
+        near = 2.0 * same_time(*part.steps.times[-2:].tolist())
+        start_tolerances = [
+            near if len(times) and times[-1] >= t - near else 0.0 for times in found
+        ]
         try:
-            names = [armed[i].__name__ for i in acted]
-            log.debug("%s: action of %s at t = %.9g s", mechanism.name, ", ".join(names), t)
-            mechanism, q, v = _after(solution, t, [(events[i], armed[i].__name__) for i in acted])
-            switched = mechanism.loops != solution.mechanism.loops
+            acting_events = ", ".join(names[i] for i in acted)
+            log.debug("%s: action of %s at t = %.9g s", mechanism.name, acting_events, t)
+            actions = [(prepared[i].action, names[i]) for i in acted]
+            mechanism, q, v = _after(part, t, actions)
+            switched = mechanism.loops != part.mechanism.loops
             for i in acted:
-                floors[i] = _rounding(events[i], solution) if switched else 0.0
+                floors[i] = _rounding(prepared[i].function, part) if switched else 0.0
                 last_times[i] = [*last_times[i][1 - MANY :], t]
-                _check_chatter(last_times[i], span, armed[i].__name__)
+                _check_chatter(last_times[i], span, names[i])
         except EventError as error:
-            status = "failed"
+            status = RunStatus.FAILED
             message = f"Stopped at t = {t:.9g} s: {error}. Everything up to there is kept."
             break
         except KeyboardInterrupt:
-            status, message = "interrupted", INTERRUPTED.format(t)
+            status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
             break
-        here |= {"t0": t, "q0": q, "v0": v}
-        status = "" if t_end - t > LEFT * span else "finished"
+        here = replace(here, t0=t, q0=q, v0=v)
+        status = RunStatus.RUNNING if t_end - t > LEFT * span else RunStatus.FINISHED
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
-    whole = SegmentedSolution(parts, t_eval=t_eval, status=status, message=message)
-    whole.request = Request.of(t_end, options)
-    if asked and not whole.success:
-        raise SimulationError(message, whole)
-    return whole
+    return types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
 
 
-def _rounding(event: Callable[..., Any], solution: Solution) -> float:
+def _rounding(event: Callable[..., Any], solution: SimulationResult) -> float:
     """Size of the value of an event that new closures hold at zero."""
     rows = zip(solution.t, solution.q, solution.v)
     return HELD * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
@@ -329,9 +337,10 @@ def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
 
 
 def _after(
-    solution: Solution, t: float, actions: list[tuple[Any, str]]
+    solution: SimulationResult, t: float, actions: list[tuple[Any, str]]
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
-    """Mechanism and state after ``actions``, events with their names, at the end of a segment."""
+    """Mechanism and state after ``actions``, given with the names of their events, at the end of a
+    segment."""
     mechanism = solution.mechanism
     nq = mechanism.model.nq
     x = np.concatenate([solution.q[-1], solution.v[-1]])
@@ -343,9 +352,9 @@ def _after(
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
     q, v = x[:nq], x[nq:]
-    for event, name in actions:
+    for action, name in actions:
         try:
-            answer = event.action(t, q.copy(), v.copy())
+            answer = action(t, q.copy(), v.copy())
         except Exception as error:
             raise EventError(f"the action of the event {name!r} raised {error!r}") from error
         if answer is None:
@@ -390,11 +399,11 @@ def _switched(
             remedy="Give a mechanism made from this one, for example with dataclasses.replace",
         )
     new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
-    new.__dict__["drive_curves"] = _curves_from(t, mechanism, new)
+    new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)
-    if system.size(system.difference(given, x)) > SNAPS:
+    if system.position_norm(system.difference(given, x)) > SNAPS:
         check_consistent(new, t)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

@@ -10,38 +10,35 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel.backend import uses_kernel
-from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm, Method
+from srm_mbs.integration.methods.base import ErrorNorm, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.incremental_run import KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
+    RunOptions,
     check_embedded,
-    checked_placement,
-    checked_rtol,
     finite,
-    loosest_rtol,
     positive,
-    tightest_rtol,
 )
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
     absolute_tolerance,
     check_consistent,
     check_mechanism,
-    mechanism_method,
+    checked_accuracy,
     placed_control,
 )
 
 SHORT = 8.0
 """Steps up to this many units of rounding of the time move nothing but the time."""
 LONGER = 1e10
-"""Where a step is longer than its predecessor by this factor, inner steps are chosen anew."""
+"""Where a step is longer than its predecessor by this factor, its length is chosen
+as at a start."""
 NEAR = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 _NONE = np.zeros(0)
@@ -84,50 +81,47 @@ class Simulator:
         backend: str = "auto",
     ) -> None:
         check_mechanism(mechanism)
-        for value, what in ((step, "step"), (max_step, "max_step")):
-            if value is not None:
-                positive(value, what, " of seconds")
-        checked = mechanism_method(method, tableau)
-        rtol = checked_rtol(
-            rtol, loosest_rtol(checked), tightest_rtol(checked.scheme, mechanism.constrained)
+        given = RunOptions(
+            math.inf,
+            method=method,
+            tableau=tableau,
+            rtol=rtol,
+            atol=atol,
+            step=step,
+            max_step=max_step,
+            placement=placement,
+            backend=backend,
         )
-        check_embedded(checked.scheme, step)
+        options = checked_accuracy(mechanism, given, 0.0, math.inf)
+        check_embedded(options.method.scheme, step)
         check_consistent(mechanism)
-        self._mechanism = mechanism
-        self._step = step
-        self._norm = ErrorNorm(
-            absolute_tolerance(mechanism, atol, rtol), rtol, NEGLIGIBLE if step is None else 0.0
+        self._mechanism, self._options = mechanism, options
+        tolerance = absolute_tolerance(mechanism, atol, options.rtol)
+        self._norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+        self._on_kernel = uses_kernel(
+            backend, options.method, options.placement, options.singular_times
         )
-        self._method = checked
-        self._placement = checked_placement(placement)
-        self._max_step = np.inf if max_step is None else float(max_step)
-        self._on_kernel = uses_kernel(backend, checked, self._placement, _NONE)
         self._no_force = np.zeros(mechanism.model.nv)
         self._make()
         self.reset()
 
     def _make(self) -> None:
         """A run of its own."""
-        mechanism, method, norm = self._mechanism, self._method, self._norm
+        mechanism, options, norm = self._mechanism, self._options, self._norm
         held = HeldForce()
         held.only(self._no_force)
         system = make_system(mechanism, held)
         self._system = system
         self._run: KernelRun | ReferenceRun
-        if self._on_kernel and isinstance(method, PSRM):
-            self._run = KernelRun(
-                system, held, method, norm, self._step, self._max_step, self._placement
-            )
+        if self._on_kernel:
+            self._run = KernelRun(system, held, norm, options)
         else:
             self._run = ReferenceRun(
                 system,
                 held,
-                method,
                 norm,
-                self._max_step,
-                lambda first: placed_control(
-                    system, method, self._step, lambda: first, (0.0, np.inf), self._placement, _NONE
-                ),
+                options,
+                lambda first: placed_control(system, options, lambda: first),
             )
         self._nq = mechanism.model.nq
         self._wall_time = 0.0
@@ -137,7 +131,7 @@ class Simulator:
 
     @property
     def mechanism(self) -> Mechanism:
-        """What is simulated."""
+        """The simulated mechanism."""
         return self._mechanism
 
     @property
@@ -245,15 +239,16 @@ class Simulator:
 
     def _grid(self, length: float) -> float:
         """Length of fixed steps that divide ``length`` (s); 0 with step-size control."""
-        return 0.0 if self._step is None else length / math.ceil(length / self._step - 1e-9)
+        step = self._options.step
+        return 0.0 if step is None else length / math.ceil(length / step - 1e-9)
 
     def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> str:
         pieces = smooth_intervals(kinks, _NONE, t, end)
         for k, until in enumerate(pieces.ends.tolist()):
             first, last = float(pieces.first[k]), float(pieces.last[k])
-            anew = k > 0 or first > -math.inf
+            forces_jumped = k > 0 or first > -math.inf
             grid = self._grid(until - self._run.t)
-            trouble = self._run.go_on(until, first, last, force, anew, grid)
+            trouble = self._run.go_on(until, first, last, force, forces_jumped, grid)
             if trouble:
                 return trouble
         return ""

@@ -1,11 +1,8 @@
 """Saved runs: one ``.npz`` with everything needed to interpolate, replay and plot a run.
 
-Arrays are stored as they are; the rest (description, URDF, closures, settings) as one JSON text.
-Nothing is pickled.
-
-What a run was asked for, as saved runs hold it: everything but Python functions.
-
-Saved runs of several segments: the files of the segments in one archive.
+Arrays are stored as they are; the rest (description, URDF, closures, settings, options of the run
+but Python functions) as one JSON text.  Nothing is pickled.  A run of several segments is one
+archive of the files of its segments.
 """
 
 from __future__ import annotations
@@ -14,10 +11,11 @@ import io
 import json
 import logging
 import zipfile
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -26,6 +24,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination
 from srm_mbs.dynamics.constraints.structure import Structure, row_names
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import InputError
@@ -35,29 +34,27 @@ from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel.dense_output import dense_output
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.integration.methods.srm import SRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
+from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Curve, Law
-from srm_mbs.model.mechanism import Mechanism, SimulationDefaults, Source
-from srm_mbs.simulation.result import ATTEMPT, Request, Settings, Solution, Statistics
-from srm_mbs.simulation.segmented_result import SegmentedSolution
-
-if TYPE_CHECKING:
-    from srm_mbs.simulation.result import Solution
+from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.simulation.options import REPEATED, RunOptions
+from srm_mbs.simulation.result import ATTEMPT, Settings, SimulationResult, Statistics
+from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
 _KINDS = {"PSRM": PSRM, "SRM": SRM}
 
 
-def request_entry(solution: Solution) -> dict[str, Any] | None:
-    """The request of a run as JSON, with what is lost by that named."""
+def request_entry(solution: SimulationResult) -> dict[str, Any] | None:
+    """The options of a run as JSON, and the names of those that JSON cannot hold."""
     request = solution.request
     if request is None:
         return None
-    options = dict(request.options)
+    options = {name: getattr(request, name) for name in REPEATED}
     lost = list(request.lost)
     if options.pop("controller") is not None:
         lost.append("the controller")
@@ -81,8 +78,8 @@ def request_entry(solution: Solution) -> dict[str, Any] | None:
     return {"t_end": end, "options": options, "lost": lost}
 
 
-def request_from(entry: dict[str, Any] | None) -> Request | None:
-    """The request in a saved run; None if it has none."""
+def request_from(entry: dict[str, Any] | None) -> RunOptions | None:
+    """The options in a saved run; None if it has none."""
     if entry is None:
         return None
     options = dict(entry["options"]) | {"controller": None, "events": None}
@@ -91,7 +88,7 @@ def request_from(entry: dict[str, Any] | None) -> Request | None:
     if isinstance(options["method"], dict):
         values = dict(options["method"])
         options["method"] = _KINDS[values.pop("kind")](**values)
-    return Request(entry["t_end"], options, tuple(entry["lost"]))
+    return RunOptions(entry["t_end"], **options, lost=tuple(entry["lost"]))
 
 
 log = logging.getLogger(__name__)
@@ -115,9 +112,9 @@ _STEP_ARRAYS = (
 )
 
 
-def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
+def save_solution(solution: SimulationResult, path: Path | IO[bytes]) -> None:
     """Write ``solution`` to ``path``, a file name or an open file; see
-    :meth:`srm_mbs.simulation.result.Solution.save`.
+    :meth:`srm_mbs.Solution.save`.
 
     Raises
     ------
@@ -149,11 +146,9 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
             "name": mechanism.name,
             "source": None if mechanism.source is None else asdict(mechanism.source),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
-            "loops": [asdict(loop) for loop in mechanism.loops],
-            "forces": [
-                {"type": f.type} | _values(f) for f in mechanism.forces if f.type in FORCE_TYPES
-            ],
-            "drives": [_values(drive) for drive in mechanism.drives],
+            "loops": [to_plain(loop) for loop in mechanism.loops],
+            "forces": [force_to_plain(f) for f in mechanism.forces if f.type in FORCE_TYPES],
+            "drives": [to_plain(drive) for drive in mechanism.drives],
             "drive_starts": _drive_starts(solution),
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
@@ -206,41 +201,53 @@ def save_solution(solution: Solution, path: Path | IO[bytes]) -> None:
         log.info("written: %s", path)
 
 
-def _loop(entry: dict[str, Any]) -> LoopClosure:
-    anchors = {side: Anchor(**entry[side]) for side in "ab" if entry[side] is not None}
-    return LoopClosure(**entry | anchors)
+# -- closures, forces and drives: the fields of their classes ---------------------------------
+# An anchor is an object without "type", a law one with its "type"; tuples are lists.
+
+Element = TypeVar("Element")
 
 
-def _entry(value: Any) -> Any:
-    """A description of laws, anchors and numbers as JSON has it; laws with their type."""
+def to_plain(element: Any) -> dict[str, Any]:
+    """The fields of a closure, force or drive as JSON has them."""
+    return {key.name: _plain(getattr(element, key.name)) for key in fields(element)}
+
+
+def force_to_plain(force: ForceElement) -> dict[str, Any]:
+    """:func:`to_plain` of a force, with its type."""
+    return {"type": force.type} | to_plain(force)
+
+
+def from_plain(kind: type[Element], values: Mapping[str, Any]) -> Element:
+    """The element of the class ``kind`` from what :func:`to_plain` made of it."""
+    return kind(**{key: _value(value) for key, value in values.items()})
+
+
+def force_from_plain(values: Mapping[str, Any]) -> ForceElement:
+    """The force from what :func:`force_to_plain` made of it."""
+    rest = {key: _value(value) for key, value in values.items() if key != "type"}
+    return FORCE_TYPES[values["type"]](**rest)
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, Law):
         return {"type": value.type} | asdict(value)  # type: ignore[call-overload]
     if isinstance(value, Anchor):
         return asdict(value)
-    return [_entry(part) for part in value] if isinstance(value, tuple) else value
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
 
 
-def _from_entry(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(_from_entry(part) for part in value)
-    if not isinstance(value, dict):
-        return value
-    if "type" not in value:
-        return Anchor(**value)
-    values = dict(value)
+def _value(plain: Any) -> Any:
+    if isinstance(plain, list):
+        return tuple(map(_value, plain))
+    if not isinstance(plain, Mapping):
+        return plain
+    if "type" not in plain:
+        return Anchor(**plain)
+    values = dict(plain)
     return LAW_TYPES[values.pop("type")](**values)
 
 
-def _values(element: Any) -> dict[str, Any]:
-    return {key.name: _entry(getattr(element, key.name)) for key in fields(element)}
-
-
-def _force(entry: dict[str, Any]) -> ForceElement:
-    values = {key: _from_entry(value) for key, value in entry.items() if key != "type"}
-    return FORCE_TYPES[entry["type"]](**values)
-
-
-def _drive_starts(solution: Solution) -> dict[str, float] | None:
+def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
     """The driven coordinates at t = 0 of a run that starts later: its q0 does not have them."""
     if solution.span[0] == 0.0:
         return None
@@ -255,10 +262,6 @@ def _drive_curves(drives: tuple[Drive, ...], starts: dict[str, float]) -> dict[s
     return curves
 
 
-def _drive(entry: dict[str, Any]) -> Drive:
-    return Drive(**{key: _from_entry(value) for key, value in entry.items()})
-
-
 def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanism:
     if entry["source"] is not None:
         source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
@@ -269,11 +272,11 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         model.loadFromString(entry["model"])
     mechanism = Mechanism(
         model,
-        tuple(_loop(loop) for loop in entry["loops"]),
+        tuple(from_plain(LoopClosure, loop) for loop in entry["loops"]),
         q0=arrays["q0"],
         v0=arrays["v0"],
-        forces=tuple(_force(force) for force in entry["forces"]),
-        drives=tuple(_drive(drive) for drive in entry["drives"]),
+        forces=tuple(force_from_plain(force) for force in entry["forces"]),
+        drives=tuple(from_plain(Drive, drive) for drive in entry["drives"]),
         friction_speed=entry["friction_speed"],
         name=entry["name"],
         source=source,
@@ -281,7 +284,8 @@ def _mechanism(entry: dict[str, Any], arrays: dict[str, FloatArray]) -> Mechanis
         notes=tuple(entry["notes"]),
     )
     if entry.get("drive_starts"):
-        mechanism.__dict__["drive_curves"] = _drive_curves(mechanism.drives, entry["drive_starts"])
+        curves = _drive_curves(mechanism.drives, entry["drive_starts"])
+        return mechanism.with_drive_curves(curves)
     return mechanism
 
 
@@ -338,31 +342,30 @@ def _check_shapes(mechanism: Mechanism, tableau: str, steps: StepData) -> None:
         raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")
 
 
-def load_solution(path: str | Path) -> Solution:
-    """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
+def load_result(path: Path, types: ResultTypes[R]) -> R:
+    """Read a saved run; see :func:`srm_mbs.load_solution`.
 
-    A controller is not saved: reactions of a controlled run cannot be computed afterwards, unless
-    it was sampled; what it held is saved.
+    Parameters
+    ----------
+    types
+        Classes of the result.
 
     Raises
     ------
     InputError
         If the file is missing, is no saved run, or is of another format.
     """
-    pass
-
-    path = Path(path)
-    segments = load_segments(path) if path.is_file() else None
-    return load_plain(path, str(path)) if segments is None else segments
+    segments = load_segments(path, types) if path.is_file() else None
+    return load_plain(path, str(path), types.plain) if segments is None else segments
 
 
-def load_plain(path: Path | IO[bytes], name: str) -> Solution:
+def load_plain(path: Path | IO[bytes], name: str, result_type: type[R]) -> R:
     """A run without segments from a file name or an open file, which messages call ``name``.
 
     Raises
     ------
     InputError
-        As :func:`load_solution`.
+        As :func:`load_result`.
     """
     try:
         opened = path.open("rb") if isinstance(path, Path) else nullcontext(path)
@@ -384,7 +387,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         mechanism = _mechanism(meta["mechanism"], arrays)
         structure = meta["structure"]
         # The analysis of the run itself, so that the dense output is the same to the last bit.
-        mechanism.__dict__["structure"] = Structure(
+        analysis = Structure(
             row_names(mechanism),
             arrays["row_scale"],
             arrays["kept"],
@@ -399,6 +402,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
                 for row, other, factor in arrays.get("eliminations", np.zeros((0, 3))).tolist()
             ),
         )
+        mechanism = mechanism.with_structure(analysis)
         zones = {
             int(index): (
                 float(threshold),
@@ -416,7 +420,7 @@ def load_plain(path: Path | IO[bytes], name: str) -> Solution:
         settings = Settings(**meta["settings"] | tuples)
         system = make_system(mechanism, _held(arrays, mechanism.model.nv))
         scheme = get_tableau(settings.tableau)
-        solution = Solution(
+        solution = result_type(
             mechanism,
             system,
             scheme,
@@ -452,7 +456,7 @@ CONTENTS = "segments.json"
 SEGMENTS_FORMAT = 1
 
 
-def save_segments(solution: SegmentedSolution, path: Path) -> None:
+def save_segments(solution: SegmentedResult, path: Path) -> None:
     """Write ``solution`` to ``path``.
 
     Raises
@@ -478,7 +482,7 @@ def save_segments(solution: SegmentedSolution, path: Path) -> None:
             archive.writestr(f"{k}.npz", kept.getvalue())
 
 
-def load_segments(path: Path) -> Solution | None:
+def load_segments(path: Path, types: ResultTypes[R]) -> R | None:
     """The run in ``path``; None if it is no archive of segments.
 
     Raises
@@ -502,9 +506,11 @@ def load_segments(path: Path) -> Solution | None:
                     remedy=OTHER_VERSION,
                 )
             t_eval = contents["t_eval"]
-            whole = SegmentedSolution(
+            whole = types.segmented(
                 [
-                    load_plain(io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}")
+                    load_plain(
+                        io.BytesIO(archive.read(f"{k}.npz")), f"{path}, segment {k}", types.plain
+                    )
                     for k in range(contents["count"])
                 ],
                 t_eval=None if t_eval is None else np.array(t_eval),

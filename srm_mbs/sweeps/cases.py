@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 
 STARTS = ("q0", "v0", "q", "v")
 """Parameters of the start of a given mechanism."""

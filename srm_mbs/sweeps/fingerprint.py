@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 
 _IGNORED_FIELDS = ("name", "source", "defaults", "notes")
 """Fields of a mechanism that do not influence a run."""

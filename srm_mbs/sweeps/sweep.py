@@ -13,8 +13,8 @@ from queue import SimpleQueue
 from typing import Any
 
 from srm_mbs.api import simulate
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress, checked_span
 from srm_mbs.simulation.runner import mechanism_method

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.api import simulate
+from srm_mbs.api import Solution, simulate
 from srm_mbs.assembly.assemble import assemble
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
 from srm_mbs.sweeps.cases import RESERVED, STARTS
 
 Value = bool | int | float | str | None

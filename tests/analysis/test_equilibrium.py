@@ -152,7 +152,7 @@ def test_an_equilibrium_on_a_singular_configuration_is_reported() -> None:
         found = srm.equilibrium(mechanism, search=search)
         assert found.singular
         np.testing.assert_allclose(np.cos(found.q[0]), 0.0, atol=1e-13)
-        # 4/3 + 4 sin^2 = 16/3 times theta'' = -g cos theta (tests.reduced.slider_crank)
+        # 4/3 + 4 sin^2 = 16/3 times theta'' = -g cos theta (tests.support.reduced.slider_crank)
         np.testing.assert_allclose(found.eigenvalues, 9.81 * 3.0 / 16.0, rtol=1e-8)
         assert found.stable
 

@@ -129,7 +129,7 @@ def test_a_prescribed_crank_turns_uniformly() -> None:
 
     found = srm.inverse_dynamics(mechanism, motion, "crank", t=times)
     theta = 0.3 + w * times
-    # twice tests.reduced.slider_crank, which is divided by 2 kg m^2
+    # twice tests.support.reduced.slider_crank, which is divided by 2 kg m^2
     exact = 2.0 * (4.0 * np.sin(theta) * np.cos(theta) * w**2 + 9.81 * np.cos(theta))
     np.testing.assert_allclose(found.torques[:, 0], exact, atol=1e-10)
     arrays = [times, *(np.array(part) for part in zip(*map(motion, times)))]

@@ -326,8 +326,9 @@ def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]
+    chosen += ["--backend", srm.backend()]
     run = subprocess.run(
-        [sys.executable, "-m", "srm_mbs.cli.app", "benchmark", *arguments, *chosen],
+        [sys.executable, "-m", "srm_mbs.cli", "benchmark", *arguments, *chosen],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -417,7 +418,7 @@ def test_the_reference_of_the_squeezing_mechanism_ends_as_published() -> None:
     assert np.abs(ours - published[andrews.TREE_ORDER]).max() < 2e-9
 
 
-def test_the_readme_gets_one_figure_and_one_table_between_its_marks(
+def test_the_benchmark_page_and_the_readme_get_the_figure_and_a_table_between_their_marks(
     results: Results, tmp_path: Path
 ) -> None:
     # A time that three digits show as 2.87 ms, and as 2.88 ms when four digits were kept before.
@@ -429,25 +430,28 @@ def test_the_readme_gets_one_figure_and_one_table_between_its_marks(
         ],
     )
     page, data, docs = tmp_path / "README.md", tmp_path / "results.json", tmp_path / "docs"
-    page.write_text("# Title\n\n## Measured\n\ntext\n")
     docs.mkdir()
+    whole = docs / "benchmarks.md"
+    for path in (page, whole):
+        path.write_text(f"# Title\n\n{readme.BEGIN}\n{readme.END}\n\ntext\n")
     results.save(data)
     readme.main([str(data), "--docs", str(docs), "--readme", str(page)])
     # Again from the brief results in the documentation.
-    kept, text = docs / "work_precision.json", page.read_text()
+    kept, short, text = docs / "work_precision.json", page.read_text(), whole.read_text()
     brief = kept.read_text()
     readme.main(["--docs", str(docs), "--readme", str(page)])
-    assert page.read_text() == text
+    assert (page.read_text(), whole.read_text()) == (short, text)
     assert kept.read_text() == brief
     assert '"all"' in data.read_text()
     assert '"all"' not in brief
     assert "2.87 /" in readme.table(results)
     assert readme.table(records.load(kept)) in text
-    assert text.count(readme.BEGIN) == text.count(readme.END) == 1
-    assert text.count("## Beside other simulators") == 1
-    assert "![CPU time against error](docs/work_precision.png)" in text
-    assert results.problems["slider_crank_regular"]["title"] in text
-    assert text.endswith("## Measured\n\ntext\n")
+    for written in (short, text):
+        assert written.count(readme.BEGIN) == written.count(readme.END) == 1
+        assert results.problems["slider_crank_regular"]["title"] in written
+        assert written.endswith(f"{readme.END}\n\ntext\n")
+    assert "![CPU time against error](docs/work_precision.png)" in short
+    assert "![CPU time against error](work_precision.png)" in text
     assert kept.with_suffix(".png").stat().st_size > 10_000
     with pytest.raises(ValueError, match="marks"):
         readme.rewritten(f"{readme.END} {readme.BEGIN}", "new")

@@ -300,9 +300,7 @@ def test_warnings_are_single_lines() -> None:
 
 def test_simulate_can_play_the_run_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     played = []
-    monkeypatch.setattr(
-        "srm_mbs.simulation.result.Solution.play", lambda *given, **o: played.append((given, o))
-    )
+    monkeypatch.setattr("srm_mbs.api.Solution.play", lambda *given, **o: played.append((given, o)))
     run("simulate", "four_bar", "--t-end", 0.1, "--play", "--gaps", "--trace", "crank:1,0,0")
     (((solution,), options),) = played
     assert solution.t[-1] == 0.1
@@ -514,7 +512,7 @@ def test_file_that_cannot_be_written_after_all_does_not_lose_the_others(
     def full(_: object, path: Path) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr("srm_mbs.simulation.result.Solution.save", full)
+    monkeypatch.setattr("srm_mbs.api.Solution.save", full)
     out, plot = tmp_path / "run.npz", tmp_path / "run.png"
     output = run("simulate", "four_bar", "--t-end", 0.1, "--out", out, "--plot", plot, status=2)
     assert error_line(output).startswith(

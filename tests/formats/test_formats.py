@@ -8,6 +8,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.formats import gepetto
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.spanning_tree_to_urdf import CLOSURE_OF
 from srm_mbs.formats.registry import FORMATS, find_format
 from srm_mbs.formats.urdf import loop_elements, validation
@@ -28,13 +29,13 @@ TEXTS = {
 @pytest.mark.parametrize("suffix", ["", ".xml", ".urdf", ".sdf", ".toml", ".yaml", ".txt"])
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_format_is_found_by_its_content(name: str, suffix: str) -> None:
-    assert find_format(Path(f"file{suffix}"), TEXTS[name]).name == name
+    assert find_format(Path(f"file{suffix}"), Document(TEXTS[name], "file")).name == name
 
 
 @pytest.mark.parametrize("found", FORMATS, ids=lambda found: found.name)
 def test_a_file_that_says_nothing_is_judged_by_its_suffix(found: object) -> None:
     suffix = found.suffixes[0]  # type: ignore[attr-defined]
-    assert suffix in find_format(Path(f"file{suffix}"), "?").suffixes
+    assert suffix in find_format(Path(f"file{suffix}"), Document("?", "file")).suffixes
 
 
 @pytest.mark.parametrize(

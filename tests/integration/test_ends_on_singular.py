@@ -186,7 +186,7 @@ def test_a_search_ahead_of_an_end_that_leaves_all_numbers_is_given_up(
     def diverges(*_: object, **__: object) -> None:
         np.linalg.svd(np.full((2, 2), np.nan))
 
-    monkeypatch.setattr(singular_endpoints, "block_of", diverges)
+    monkeypatch.setattr(singular_endpoints.BranchMotion, "block", diverges)
     t = first_passage("slider_crank")
     solution = srm.simulate(srm.load("slider_crank"), t, rtol=1e-8)
     assert solution.success

@@ -286,7 +286,7 @@ def test_events_may_come_from_a_generator(slider_crank: srm.Mechanism) -> None:
     made = srm.simulate(slider_crank, 5.0, events=(event(rate) for _ in range(2)))
     assert np.array_equal(times(made, 1), times(listed))
     assert made.request is not None
-    assert len(list(made.request.options["events"])) == 2
+    assert len(list(made.request.events)) == 2
     swept = srm.sweep(
         slider_crank,
         [{}, {}],

@@ -10,13 +10,13 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.branch_limit import branch_limit
 from srm_mbs.dynamics.singularities.local_analysis import (
     SingularConfiguration,
     analyse_singular,
     nearest_singular,
 )
-from srm_mbs.model.mechanism import Mechanism
 from tests.support import reduced
 from tests.support.bundled import load
 from tests.support.mechanisms import ball_dead_point, distance, floating_slider_crank

@@ -132,7 +132,7 @@ END = 0.35
 
 
 def touched(reach: float, tableau: str, tol: float = 1e-8) -> tuple[srm.Solution, float]:
-    """The mechanism of tests.tangency, and the error of its input angle."""
+    """The mechanism of tests.support.tangency, and the error of its input angle."""
     solution = srm.simulate(tangency.mechanism(reach), END, rtol=tol, tableau=tableau)
     assert solution.success
     t = np.linspace(0.0, END, 36)[1:]

@@ -17,8 +17,8 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.analysis.summary import force_rows
 from srm_mbs.cli.tables import equilibrium_rows
-from srm_mbs.dynamics.forces import friction_time
 from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.formats.build import friction_time
 from tests.support.mechanisms import along_x, rod
 
 Coordinates = Callable[[FloatArray], FloatArray]
@@ -554,8 +554,12 @@ def test_friction_acts_beside_damping_on_open_and_closed_mechanisms(name: str) -
 
 def test_the_time_of_friction_is_that_of_the_fastest_joint() -> None:
     """A joint with more friction and less inertia sets it; alone it is m s/F."""
-    assert friction_time(rubbing(3.0)) == pytest.approx(2.0 * SPEED / 3.0)
-    assert friction_time(rubbing(0.0)) == np.inf
+
+    def time_of(mechanism: srm.Mechanism) -> float:
+        return friction_time(mechanism.model, mechanism.q0, mechanism.friction_speed)
+
+    assert time_of(rubbing(3.0)) == pytest.approx(2.0 * SPEED / 3.0)
+    assert time_of(rubbing(0.0)) == np.inf
     chain = srm.load("pendulum_chain")
     model = chain.model.copy()
     model.friction = np.array([0.3, 0.0, 0.7])
@@ -563,7 +567,7 @@ def test_the_time_of_friction_is_that_of_the_fastest_joint() -> None:
     M = np.triu(M) + np.triu(M, 1).T
     fastest = np.abs(np.linalg.eigvals(np.linalg.solve(M, np.diag(model.friction)))).max() / SPEED
     rough = replace(chain, model=model, friction_speed=SPEED)
-    assert friction_time(rough) == pytest.approx(1.0 / fastest, rel=1e-10)
+    assert time_of(rough) == pytest.approx(1.0 / fastest, rel=1e-10)
 
 
 def test_negative_friction_and_senseless_speeds_are_refused() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import srm_mbs as srm
-from srm_mbs.formats.csv_table import read_table
+from srm_mbs.formats.csv_table import read_csv
 from srm_mbs.model.laws import Law
 
 TIMES = [0.0, 0.2, 0.5, 0.9, 1.4, 2.0]
@@ -92,7 +92,7 @@ def test_malformed_laws_are_refused(make: object, words: str) -> None:
 def test_columns_of_a_csv_file_are_found_by_name(tmp_path: Path) -> None:
     path = tmp_path / "motion.csv"
     path.write_text("angle, t ,other\n1.5,0.0,7\n\n2.5,0.1,8\n")
-    np.testing.assert_array_equal(read_table(path, ("t", "angle")), [[0.0, 1.5], [0.1, 2.5]])
+    np.testing.assert_array_equal(read_csv(path).columns(("t", "angle")), [[0.0, 1.5], [0.1, 2.5]])
 
 
 @pytest.mark.parametrize(
@@ -111,10 +111,10 @@ def test_malformed_tables_are_refused_with_file_and_row(
     path = tmp_path / "motion.csv"
     path.write_text(text)
     with pytest.raises(srm.InputError, match=words) as caught:
-        read_table(path, ("t", "value"))
+        read_csv(path).columns(("t", "value"))
     assert str(path) in str(caught.value)
 
 
 def test_a_missing_table_is_refused(tmp_path: Path) -> None:
     with pytest.raises(srm.InputError, match="cannot be read"):
-        read_table(tmp_path / "none.csv", ("t", "value"))
+        read_csv(tmp_path / "none.csv")

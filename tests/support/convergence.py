@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 
 STEPS = {
     "fe": (2e-3, 1e-3, 5e-4),

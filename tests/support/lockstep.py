@@ -18,13 +18,13 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.branch_guard import BranchGuard
-from srm_mbs.integration.control.placement import SingularityPlacement
-from srm_mbs.integration.control.prescribed_times import SlopeOfSigma
+from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
 from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
+from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
 
 
@@ -146,9 +146,10 @@ def compare(
     memory = start(system, method, 0.0, x, norm, t_end)
     order = scheme.controller_order or 1
     first = initial_step(system, x, memory, norm, t_end, order) if step is None else 0.0
-    control, _ = placed_control(
-        system, method, step, lambda: first, (0.0, t_end), placement, np.zeros(0), arrivals
+    options = RunOptions(
+        t_end, method=method, step=step, placement=placement, singular_times=np.zeros(0)
     )
+    control, _ = placed_control(system, options, lambda: first, arrivals)
     run = CompiledRun(
         kernel_system,
         method,
@@ -180,9 +181,9 @@ def compare(
         # Before the reference proposes: its proposal writes the slope into the memory.
         stop, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
         proposal = control.propose(t, limit, memory)
-        assert proposal.arriving == (stop == ARRIVAL)
-        if proposal.arriving:
-            memory = passing.arrive(t, x, memory)
+        assert proposal.singular_arrival == (stop == ARRIVAL)
+        if proposal.singular_arrival:
+            memory = passing.singular_arrival(t, x, memory)
             out.arrivals += 1
             continue
         try:
@@ -196,7 +197,7 @@ def compare(
             out.verdicts.append((t, verdict, twin_verdict))
         if result is not None:
             twin_result = run.last()
-            size = np.maximum(one, memory.magnitude)
+            size = np.maximum(one, memory.state_scale)
             rates = np.abs(result.rates).max(axis=0)
             change = system.difference(result.state, twin_result.state)
             # Next to a singular configuration the algebra magnifies rounding by 1 / sigma^2.
@@ -224,7 +225,7 @@ def compare(
                 change = np.abs(twin_result.correction - result.correction)
                 out.correction = max(out.correction, float(np.max(change / scale)))
             # An error estimate is a difference of rates: its rounding is theirs.
-            rounding = norm(proposal.h * rates, norm.weights(memory.magnitude))
+            rounding = norm(proposal.h * rates, norm.weights(memory.state_scale))
             change = abs(twin_result.error_ratio - result.error_ratio)
             bound = (rounding + result.error_ratio) / lowest**2
             out.error = max(out.error, float(change / bound))

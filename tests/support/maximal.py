@@ -64,7 +64,7 @@ def _mechanism(
 
 
 def slider_crank(joints: str, angle: float = 7 * np.pi / 4, rate: float = 0.0) -> srm.Mechanism:
-    """The bundled slider_crank (:func:`tests.reduced.slider_crank`)."""
+    """The bundled slider_crank (:func:`tests.support.reduced.slider_crank`)."""
     c, s = np.cos(angle), np.sin(angle)
     crank = Bar("crank", 1.0, 2.0, (0.0, 0.0), angle, rate=rate)
     tip, moving = (2.0 * c, 2.0 * s), (-2.0 * s * rate, 2.0 * c * rate)
@@ -78,7 +78,7 @@ def slider_crank(joints: str, angle: float = 7 * np.pi / 4, rate: float = 0.0) -
 
 
 def parallelogram(joints: str, angle: float = 1.0, rate: float = 6.0) -> srm.Mechanism:
-    """The bundled parallelogram (:func:`tests.reduced.parallelogram`)."""
+    """The bundled parallelogram (:func:`tests.support.reduced.parallelogram`)."""
     c, s = np.cos(angle), np.sin(angle)
     crank = Bar("crank", 1.0, 1.0, (0.0, 0.0), angle, rate=rate)
     coupler = Bar("coupler", 2.0, 2.0, (c, s), 0.0, (-s * rate, c * rate))

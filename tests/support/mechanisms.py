@@ -63,8 +63,8 @@ def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mecha
     """The bundled spatial_dead_point with a Pinocchio ball joint: nq != nv.
 
     ``angle`` (rad) and ``rate`` (rad/s) of the crank count from the guide line, where
-    :func:`tests.reduced.spatial_dead_point` has them.  Axes: x along the line, z along the crank's
-    axis; gravity is tilted instead of the line.  The rod does not spin.
+    :func:`tests.support.reduced.spatial_dead_point` has them.  Axes: x along the line, z along the
+    crank's axis; gravity is tilted instead of the line.  The rod does not spin.
     """
     crank, side = 2.0, 1.5
     model = pin.Model()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pinocchio as pin
 
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.mjcf.reader import translate
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf.parser import build_urdf
@@ -116,8 +117,8 @@ def file(world: str = TWO, more: str = "") -> str:
 def model_of(text: str) -> pin.Model:
     """Pinocchio's model of the translated tree."""
     made = translated(text)
-    return build_urdf(made.urdf, "x.urdf", made.entries.get("base", "fixed")).model
+    return build_urdf(made.tree, "x.urdf", made.entries.get("base", "fixed")).model
 
 
 def translated(text: str) -> Translation:
-    return translate(text, "robot.xml", Options())
+    return translate(Document(text, "robot.xml"), Options())

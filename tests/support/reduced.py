@@ -10,7 +10,7 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 
 G = 9.81
 Field = Callable[[float, Any], Any]

@@ -1,4 +1,4 @@
-"""Pictures of runs to compare with, and how; ``python -m tests.screenshots`` makes them anew."""
+"""Reference pictures of runs; ``python -m tests.support.screenshots`` makes them again."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.work_precision.references import Reference, read
 from benchmarks.work_precision.trees import Tree
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 
 SAMPLES = 100
 """Equally spaced times of a run, the end included, at which errors are taken."""

@@ -16,8 +16,8 @@ from srm_mbs.analysis.accuracy.error_estimate import (
     ErrorEstimate,
     Trial,
 )
-from srm_mbs.integration.methods.regularisation import parse_eps
-from srm_mbs.simulation.result import Solution
+from srm_mbs.integration.methods.thesis.regularisation import parse_eps
+from srm_mbs.simulation.result import SimulationResult
 
 Grade = Literal["good", "fair", "poor", "unknown"]
 GRADES: tuple[Grade, ...] = ("good", "fair", "unknown", "poor")
@@ -69,7 +69,7 @@ def _grade(value: float, limits: tuple[float, float]) -> Grade:
     return "good" if value <= good else "fair" if value <= fair else "poor"
 
 
-def assess_status(solution: Solution) -> Assessment:
+def assess_status(solution: SimulationResult) -> Assessment:
     """Whether the run reached its end."""
     start, end = solution.span
     if solution.status == "finished":
@@ -129,7 +129,7 @@ def _setting(estimate: ErrorEstimate, trial: Trial) -> str:
     return f"step {trial.setting:.3g} s" if estimate.fixed else f"rtol {trial.setting:.3g}"
 
 
-def assess_errors(solution: Solution, estimate: ErrorEstimate | str) -> list[Assessment]:
+def assess_errors(solution: SimulationResult, estimate: ErrorEstimate | str) -> list[Assessment]:
     """The error of the run, by comparison with the other runs."""
     if isinstance(estimate, str):
         return [
@@ -149,7 +149,7 @@ def assess_errors(solution: Solution, estimate: ErrorEstimate | str) -> list[Ass
     ]
 
 
-def _error(solution: Solution, estimate: ErrorEstimate) -> Assessment:
+def _error(solution: SimulationResult, estimate: ErrorEstimate) -> Assessment:
     largest: dict[str, list[float]] = {}
     for row in estimate.joints:
         largest.setdefault(row.unit, []).append(row.position)
@@ -183,7 +183,7 @@ def _error(solution: Solution, estimate: ErrorEstimate) -> Assessment:
     return Assessment("estimated error", grade, text)
 
 
-def _other_runs(solution: Solution, estimate: ErrorEstimate) -> list[Assessment]:
+def _other_runs(solution: SimulationResult, estimate: ErrorEstimate) -> list[Assessment]:
     """Differences in how the runs ended, and in their jumps."""
     out = []
     others = [trial for trial in estimate.trials if not trial.own]
@@ -281,9 +281,9 @@ def _sensitivity(comparison: Comparison, rate: float) -> list[Assessment]:
     return [Assessment("sensitivity", "fair", text)]
 
 
-def _common_errors(solution: Solution) -> list[Assessment]:
+def _common_errors(solution: SimulationResult) -> list[Assessment]:
     """Errors that all runs share, so that no difference shows them."""
-    method = None if solution.request is None else solution.request.options["method"]
+    method = None if solution.request is None else solution.request.method
     eps = getattr(method, "eps", None)
     if eps is None or parse_eps(eps).power:
         return []

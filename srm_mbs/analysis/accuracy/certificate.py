@@ -18,7 +18,7 @@ from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of,
 from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
 from srm_mbs.errors import InputError
 from srm_mbs.simulation.rerun import unsupported_reason
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,11 @@ class Certificate:
 
 
 def certify(
-    solution: Solution, *, rtol: float | None = None, again: bool = True, progress: Any = False
+    solution: SimulationResult,
+    *,
+    rtol: float | None = None,
+    again: bool = True,
+    progress: Any = False,
 ) -> Certificate:
     """Estimate how accurate a run is.
 
@@ -108,7 +112,7 @@ def certify(
     InputError
         If ``solution`` is no run, or ``rtol`` is not valid for it.
     """
-    if not isinstance(solution, Solution):
+    if not isinstance(solution, SimulationResult):
         raise InputError(
             f"a {type(solution).__name__} is not a run",
             element="solution",

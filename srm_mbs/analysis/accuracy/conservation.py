@@ -11,7 +11,7 @@ from srm_mbs.analysis.accuracy.error_estimate import sample_times
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.scaling import constraint_angles
 from srm_mbs.errors import EvaluationError, InputError
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class EnergyError:
     rounding: float
 
 
-def drift_of(solution: Solution) -> tuple[Drift, ...]:
+def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
     """The drift of a run, for each unit of its closure rows and drives; empty for an open chain."""
     found: dict[str, tuple[FloatArray, FloatArray, float]] = {}
     for part in solution.segments:
@@ -102,7 +102,7 @@ def drift_of(solution: Solution) -> tuple[Drift, ...]:
     )
 
 
-def energy_error(solution: Solution) -> EnergyError | str:
+def energy_error(solution: SimulationResult) -> EnergyError | str:
     """Residual of the energy balance, or the reason why it cannot be computed."""
     if solution.t_eval is not None:  # few times, or none, do not represent the run
         ends = [[*part.steps.times[:-1], part.steps.end] for part in solution.segments]

@@ -16,13 +16,13 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import turning_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.simulation.options import positive, tightest_rtol
 from srm_mbs.simulation.rerun import rerun
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 
 MAX_STEP_ENDS = 2000
 """Most ends of steps at which two runs are compared."""
@@ -187,7 +187,7 @@ class ErrorEstimate:
     comparison: Comparison
 
 
-def checked_settings(solution: Solution, rtol: float | None) -> list[float]:
+def checked_settings(solution: SimulationResult, rtol: float | None) -> list[float]:
     """Tolerances, or fixed steps, of the reruns, the tightest last.
 
     Raises
@@ -224,7 +224,7 @@ def checked_settings(solution: Solution, rtol: float | None) -> list[float]:
 
 
 def estimate_error(
-    solution: Solution, settings: list[float], progress: Any = False
+    solution: SimulationResult, settings: list[float], progress: Any = False
 ) -> ErrorEstimate | str:
     """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed."""
     fixed = solution.settings.step is not None
@@ -301,16 +301,16 @@ def observed_order(settings: Sequence[float], differences: Sequence[float]) -> f
     return math.log(quotient) / math.log(settings[0] / settings[1])
 
 
-def _expected(solution: Solution, fixed: bool) -> float | None:
+def _expected(solution: SimulationResult, fixed: bool) -> float | None:
     if not fixed:
         return 1.0
     request = solution.request
-    method = "" if request is None else request.options["method"]
+    method = "" if request is None else request.method
     split = method == "psrm" or (isinstance(method, PSRM) and method.correction == "split")
     return float(solution.scheme.order) if split else None
 
 
-def parted_at(whole: Comparison, run: Solution, other: Solution) -> float | None:
+def parted_at(whole: Comparison, run: SimulationResult, other: SimulationResult) -> float | None:
     """The singular passage (s) at which two runs left on different branches.
 
     The rates differ suddenly there; otherwise small differences grow over many times 1/rate.
@@ -334,7 +334,7 @@ def parted_at(whole: Comparison, run: Solution, other: Solution) -> float | None
 # Comparison of two runs ----------------------------------------------------------------------
 
 
-def sample_times(solution: Solution, *, fixed: bool = False) -> FloatArray:
+def sample_times(solution: SimulationResult, *, fixed: bool = False) -> FloatArray:
     """Times (n,) s at which a run is compared: ends of its steps, and evenly spaced ones.
 
     With ``fixed`` the ends only, at which the method has its order.
@@ -349,7 +349,7 @@ def sample_times(solution: Solution, *, fixed: bool = False) -> FloatArray:
     return np.union1d(ends, np.linspace(start, end, EVEN_TIMES))
 
 
-def compare(run: Solution, other: Solution, times: FloatArray) -> Comparison:
+def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -> Comparison:
     """Compare two runs at those of ``times`` (n,) s that both cover.
 
     Windows around jumps of the state, whose times differ, are left out.
@@ -406,12 +406,12 @@ def _largest(rows: FloatArray) -> float:
     return float(np.linalg.norm(rows, axis=1).max(initial=0.0))
 
 
-def _jump_times(run: Solution) -> Sequence[float]:
+def _jump_times(run: SimulationResult) -> Sequence[float]:
     return [segment.span[0] for segment in run.segments[1:]]
 
 
 def _between_jumps(
-    run: Solution, other: Solution, times: FloatArray
+    run: SimulationResult, other: SimulationResult, times: FloatArray
 ) -> tuple[BoolArray, FloatArray]:
     """Which times (n,) lie between the same jumps of both runs, and the differences in time (k,) s
     of the jumps."""

@@ -23,7 +23,7 @@ from srm_mbs.analysis.report.sections import (
     run_data,
 )
 from srm_mbs.errors import InputError, __version__
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.page import render, write_page
 
 FOLDER = Path(__file__).parent
@@ -39,7 +39,7 @@ CONTENTS = {
 
 
 def write_report(
-    solution: Solution,
+    solution: SimulationResult,
     path: str | Path,
     *,
     animation: bool = True,
@@ -81,7 +81,7 @@ def write_report(
 
 
 def report_page(
-    solution: Solution,
+    solution: SimulationResult,
     certificate: Certificate,
     *,
     animation: bool = True,
@@ -126,7 +126,7 @@ def check_pictures(kinds: Sequence[str]) -> None:
             )
 
 
-def _summary(solution: Solution, certificate: Certificate) -> list[str]:
+def _summary(solution: SimulationResult, certificate: Certificate) -> list[str]:
     """Sentences that summarise the mechanism, the run and its accuracy."""
     mechanism = solution.mechanism
     start, end = solution.span

@@ -22,11 +22,11 @@ from srm_mbs.analysis.summary import (
     mechanism_rows,
     run_rows,
 )
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import NAMED_LOOPS
 from srm_mbs.visualization.animation.playback import page_of
@@ -141,7 +141,7 @@ class Image:
         return f"data:{self.media_type};base64,{base64.b64encode(self.data).decode('ascii')}"
 
 
-def mechanism_data(solution: Solution) -> dict[str, Any]:
+def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
     """Snapshot, provenance, joints, bodies, loops, forces and drives."""
     mechanism = solution.mechanism
     model = mechanism.model
@@ -180,7 +180,7 @@ def mechanism_data(solution: Solution) -> dict[str, Any]:
     }
 
 
-def animation_page(solution: Solution) -> str:
+def animation_page(solution: SimulationResult) -> str:
     """The page of the animation.
 
     Raises
@@ -207,7 +207,7 @@ def freedom_rows(mechanism: Mechanism) -> list[tuple[str, str, str]]:
     return rows
 
 
-def run_data(solution: Solution) -> dict[str, Any]:
+def run_data(solution: SimulationResult) -> dict[str, Any]:
     """Settings, statistics, singular passages and events."""
     return {
         "message": solution.message,
@@ -221,7 +221,7 @@ def run_data(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _settings(solution: Solution) -> list[tuple[str, str]]:
+def _settings(solution: SimulationResult) -> list[tuple[str, str]]:
     settings, start = solution.settings, solution.span[0]
     scheme = TABLEAUS.get(settings.tableau)
     order = "" if scheme is None else f", a Runge-Kutta scheme of order {scheme.order}"
@@ -251,7 +251,7 @@ def _settings(solution: Solution) -> list[tuple[str, str]]:
     return rows
 
 
-def _passages(solution: Solution) -> dict[str, Any]:
+def _passages(solution: SimulationResult) -> dict[str, Any]:
     """Rows of the singular passages, and what they leave out."""
     crossings = solution.crossings
     listed = crossings[:MAX_LISTED_PASSAGES]
@@ -282,7 +282,7 @@ def _branch(crossing: Crossing) -> str:
     return f"left on another one ({count} meet)"
 
 
-def _events(solution: Solution) -> list[tuple[str, str, str]]:
+def _events(solution: SimulationResult) -> list[tuple[str, str, str]]:
     """(number, times met, first times) of each event."""
     rows = []
     for k, times in enumerate(solution.t_events or (), start=1):
@@ -291,7 +291,7 @@ def _events(solution: Solution) -> list[tuple[str, str, str]]:
     return rows
 
 
-def pictures_data(solution: Solution, kinds: Sequence[str]) -> dict[str, Any]:
+def pictures_data(solution: SimulationResult, kinds: Sequence[str]) -> dict[str, Any]:
     """Plots of the run, and sentences about those that it does not have."""
     images, missing = [], []
     for kind in kinds:
@@ -319,7 +319,7 @@ def _plot_image(figure: Figure, description: str, caption: str) -> Image:
     return Image(out.getvalue(), "image/png", description, caption)
 
 
-def accuracy_data(solution: Solution, certificate: Certificate) -> dict[str, Any]:
+def accuracy_data(solution: SimulationResult, certificate: Certificate) -> dict[str, Any]:
     """Assessments, drift, energy balance, and the error estimate with the runs it compares."""
     estimate = certificate.estimate
     return {
@@ -351,7 +351,7 @@ def _energy(certificate: Certificate) -> list[tuple[str, str]]:
     ]
 
 
-def _estimate(solution: Solution, estimate: ErrorEstimate) -> dict[str, Any]:
+def _estimate(solution: SimulationResult, estimate: ErrorEstimate) -> dict[str, Any]:
     """Estimated error of each joint, the runs that were compared, and the plot over time."""
     units = solution.mechanism.structure.units
     plot = _plot_image(
@@ -389,7 +389,7 @@ def _estimate(solution: Solution, estimate: ErrorEstimate) -> dict[str, Any]:
     }
 
 
-def draw_errors(solution: Solution, comparison: Comparison) -> Figure:
+def draw_errors(solution: SimulationResult, comparison: Comparison) -> Figure:
     """Largest difference of positions and of rates, in units, over time."""
     size = comparison.size
     lowest = SMALLEST_DIFFERENCE * comparison.largest

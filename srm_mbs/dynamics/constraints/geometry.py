@@ -30,10 +30,10 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
-from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW
+from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW, structure_of
 from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_units
-from srm_mbs.model.drives import in_order_of_rows
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.drives import in_order_of_rows, positions
+from srm_mbs.model.mechanism import MechanismData
 
 
 class ClosureGeometry:
@@ -56,7 +56,7 @@ class ClosureGeometry:
         Names of the drives whose rows follow those of the loops: none.
     """
 
-    def __init__(self, mechanism: Mechanism, start: FloatArray) -> None:
+    def __init__(self, mechanism: MechanismData, start: FloatArray) -> None:
         self.mechanism = mechanism
         self.start = start
         # Gravity cancels in Gdot v, but its rounding would not at small rates.
@@ -112,7 +112,7 @@ class ClosureGeometry:
     @cached_property
     def _shares(self) -> list[tuple[int, int, float]]:
         """The eliminations of the load-time analysis, between normalised rows."""
-        eliminations = self.mechanism.structure.eliminations
+        eliminations = structure_of(self.mechanism).eliminations
         if not eliminations:
             return []
         size = (self.row_unit * self.row_size).tolist()
@@ -175,6 +175,54 @@ class ClosureGeometry:
         return pin.difference(self.model, a, b) / self.unit  # type: ignore[no-any-return]
 
 
+class DriveRows:
+    """The rows of the drives at t = 0 as pure numbers, beside those of a
+    :class:`ClosureGeometry`.
+
+    Parameters
+    ----------
+    mechanism
+        Its drives.
+    geometry
+        What gives the units, and a model without gravity, whose rounding would not cancel.
+    q : (nq,)
+        The configuration.
+
+    Attributes
+    ----------
+    rows : (k, nv), rates : (k,)
+        In units: the drives ask for rows u = rates.
+    """
+
+    def __init__(self, mechanism: MechanismData, geometry: ClosureGeometry, q: FloatArray) -> None:
+        drives = in_order_of_rows(mechanism.drives)
+        self._model, self._data, self._q = geometry.model, geometry.data, q
+        self._kinematics = DrivenKinematics(geometry.model, (), drives)
+        joints = [geometry.model.getJointId(d.joint) if d.joint else 0 for d in drives]
+        in_v = [geometry.model.joints[joint].idx_v for joint in joints]
+        self._row_unit = np.array(
+            [geometry.unit[k] if joint else geometry.length for joint, k in zip(joints, in_v)]
+        )
+        self._unit = geometry.unit
+        # Rates and accelerations do not depend on where a law starts, but for its target.
+        starts = positions(geometry.model, drives, q)
+        moving = np.array([d.curve(starts[d.name])(0.0) for d in drives]).reshape(-1, 3)
+        self.rates = moving[:, 1] / self._row_unit
+        self._bends = moving[:, 2] / self._row_unit
+        pin.crba(self._model, self._data, q, pin.Convention.WORLD)
+        self._kinematics.update(self._data, q, with_bias=False)
+        self.rows = self._kinematics.G / self._row_unit[:, None] * self._unit
+
+    def bias(self, u: FloatArray) -> FloatArray:
+        """Gdot v - s'' (k,) for the rates u (nv,) in units."""
+        v = u * self._unit
+        pin.crba(self._model, self._data, self._q, pin.Convention.WORLD)
+        pin.nonLinearEffects(self._model, self._data, self._q, v)
+        self._kinematics.update(self._data, self._q)
+        out: FloatArray = self._kinematics.bias / self._row_unit - self._bends
+        return out
+
+
 class DrivenGeometry(ClosureGeometry):
     """Closure and drive equations of a mechanism over places (q, t), (nq + 1,).
 
@@ -195,9 +243,9 @@ class DrivenGeometry(ClosureGeometry):
         unit at most.
     """
 
-    def __init__(self, mechanism: Mechanism, start: FloatArray, t: float | None = None) -> None:
+    def __init__(self, mechanism: MechanismData, start: FloatArray, t: float | None = None) -> None:
         super().__init__(mechanism, start)
-        units = mechanism.structure.units
+        units = structure_of(mechanism).units
         curves = mechanism.drive_curves
         if t is not None:
             curves = {name: curve.piece(t) for name, curve in curves.items()}
@@ -264,7 +312,7 @@ class DrivenGeometry(ClosureGeometry):
         return out
 
 
-def geometry_of(mechanism: Mechanism, q: FloatArray, t: float | None = None) -> ClosureGeometry:
+def geometry_of(mechanism: MechanismData, q: FloatArray, t: float | None = None) -> ClosureGeometry:
     """The closures of a mechanism, and its drives if it has any; parameters as for
     :class:`DrivenGeometry`."""
     return DrivenGeometry(mechanism, q, t) if mechanism.drives else ClosureGeometry(mechanism, q)

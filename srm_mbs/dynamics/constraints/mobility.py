@@ -8,21 +8,17 @@ be singular.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.constraints.rheonomic import DriveRows
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.constraints.rows import world_jacobian
-from srm_mbs.dynamics.constraints.structure import ManifoldSampler, row_names
-
-if TYPE_CHECKING:
-    from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.constraints.structure import ManifoldSampler, row_names, structure_of
+from srm_mbs.model.mechanism import MechanismData
 
 RESTARTS = 4
 STEPS = 4
@@ -90,7 +86,7 @@ class Mobility:
     idle: tuple[IdleMotion, ...]
 
 
-def mobility(mechanism: Mechanism) -> Mobility:
+def mobility(mechanism: MechanismData) -> Mobility:
     """Count and analyse the degrees of freedom of ``mechanism``, whose drives take them away again.
 
     Raises
@@ -99,7 +95,7 @@ def mobility(mechanism: Mechanism) -> Mobility:
         If the mass matrix is not positive definite.
     """
     driven, mechanism = mechanism, mechanism.undriven
-    structure = mechanism.structure
+    structure = structure_of(mechanism)
     nv, rows, rank = mechanism.model.nv, len(structure.row_names), structure.rank
     samples = _samples(mechanism)
     geometry = ClosureGeometry(mechanism, mechanism.q0)
@@ -122,7 +118,7 @@ def mobility(mechanism: Mechanism) -> Mobility:
         if driven.drives:
             G = np.vstack([G, DriveRows(driven, geometry, q).rows])
         dependent = null_basis(G.T, RANK)
-        if len(G) - dependent.shape[1] == driven.structure.rank:
+        if len(G) - dependent.shape[1] == structure_of(driven).rank:
             np.maximum(undetermined, (dependent**2).sum(axis=1), out=undetermined)
     return Mobility(
         joint_freedoms=nv,
@@ -143,17 +139,18 @@ def mobility(mechanism: Mechanism) -> Mobility:
     )
 
 
-def _samples(mechanism: Mechanism) -> list[FloatArray]:
+def _samples(mechanism: MechanismData) -> list[FloatArray]:
     """The initial configuration, and closed ones around it."""
     samples = [np.array(mechanism.q0)]
-    if mechanism.structure.rank:
-        walker = ManifoldSampler(mechanism, mechanism.structure.units)
+    structure = structure_of(mechanism)
+    if structure.rank:
+        walker = ManifoldSampler(mechanism, structure.units)
         rng = np.random.default_rng(1)
         samples += walker.walk(samples[0], rng, RESTARTS, STEPS)
     return samples
 
 
-def _unreachable(mechanism: Mechanism, rates: FloatArray) -> tuple[str, ...]:
+def _unreachable(mechanism: MechanismData, rates: FloatArray) -> tuple[str, ...]:
     stuck = []
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
@@ -162,7 +159,7 @@ def _unreachable(mechanism: Mechanism, rates: FloatArray) -> tuple[str, ...]:
     return tuple(stuck)
 
 
-def _compounds(mechanism: Mechanism) -> list[tuple[tuple[str, ...], IndexArray]]:
+def _compounds(mechanism: MechanismData) -> list[tuple[tuple[str, ...], IndexArray]]:
     """Joints with their velocity components; those that massless links make one are joined.
 
     A ball joint is often described as three hinges.  A link between them must be held by nothing
@@ -197,7 +194,7 @@ def _compounds(mechanism: Mechanism) -> list[tuple[tuple[str, ...], IndexArray]]
     return [(tuple(names), np.array(columns)) for names, columns in out]
 
 
-def _planar(mechanism: Mechanism, samples: list[FloatArray]) -> bool:
+def _planar(mechanism: MechanismData, samples: list[FloatArray]) -> bool:
     """Whether all links move parallel to one plane."""
     model = mechanism.model
     data = workspace(model)

@@ -185,7 +185,7 @@ class Projection:
         self.factorisations = 0
         self.sigma = np.inf
         self.rank = rank
-        self.weak = False
+        self.rank_deficient = False
         self.held: FloatArray | None = None
         self._allocate(0, 0)
 
@@ -247,7 +247,7 @@ class Projection:
         while rank > 0 and not abs(packed.item(rank - 1, rank - 1)) >= floor:
             rank -= 1
         self.rank = rank
-        self.weak = rank < structural
+        self.rank_deficient = rank < structural
         if rank < m:
             packed, permutation, tau = packed[:, :rank], permutation[:rank], tau[:rank]
         self._permutation = permutation

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -20,12 +20,9 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination, LoopKinematics, all_rows, closure_errors
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.drives import NOMINAL, Drive, in_order_of_rows, positions
+from srm_mbs.model.drives import NOMINAL_LENGTH, Drive, in_order_of_rows
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.mechanism import Mechanism
-
-if TYPE_CHECKING:
-    from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.model.mechanism import MechanismData
 
 
 class DrivenKinematics:
@@ -84,8 +81,10 @@ class DrivenKinematics:
             (
                 first + k,
                 1.0 / float(scale[total - len(ordered) + k]),
-                # The row of a distance is |p| - NOMINAL.
-                curves[drive.name].shifted(-NOMINAL) if drive.distance else curves[drive.name],
+                # The row of a distance is |p| - NOMINAL_LENGTH.
+                curves[drive.name].shifted(-NOMINAL_LENGTH)
+                if drive.distance
+                else curves[drive.name],
             )
             for k, drive in enumerate(ordered)
             if curves is not None
@@ -141,7 +140,7 @@ class DrivenKinematics:
 
 
 def constraint_errors(
-    mechanism: Mechanism, t: FloatArray, q: FloatArray, v: FloatArray
+    mechanism: MechanismData, t: FloatArray, q: FloatArray, v: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """g - s (n, rows) in m and rad, and G v - s' (n, rows), of all rows at n states.
 
@@ -164,51 +163,3 @@ def constraint_errors(
         g[i] = rows.g
         c[i] = rows.G @ v[i] - rows.pushed
     return g, c
-
-
-class DriveRows:
-    """The rows of the drives at t = 0 as pure numbers, beside those of a
-    :class:`~srm_mbs.dynamics.constraints.geometry.ClosureGeometry`.
-
-    Parameters
-    ----------
-    mechanism
-        Its drives.
-    geometry
-        What gives the units, and a model without gravity, whose rounding would not cancel.
-    q : (nq,)
-        The configuration.
-
-    Attributes
-    ----------
-    rows : (k, nv), rates : (k,)
-        In units: the drives ask for rows u = rates.
-    """
-
-    def __init__(self, mechanism: Mechanism, geometry: ClosureGeometry, q: FloatArray) -> None:
-        drives = in_order_of_rows(mechanism.drives)
-        self._model, self._data, self._q = geometry.model, geometry.data, q
-        self._kinematics = DrivenKinematics(geometry.model, (), drives)
-        joints = [geometry.model.getJointId(d.joint) if d.joint else 0 for d in drives]
-        in_v = [geometry.model.joints[joint].idx_v for joint in joints]
-        self._row_unit = np.array(
-            [geometry.unit[k] if joint else geometry.length for joint, k in zip(joints, in_v)]
-        )
-        self._unit = geometry.unit
-        # Rates and accelerations do not depend on where a law starts, but for its target.
-        starts = positions(geometry.model, drives, q)
-        moving = np.array([d.curve(starts[d.name])(0.0) for d in drives]).reshape(-1, 3)
-        self.rates = moving[:, 1] / self._row_unit
-        self._bends = moving[:, 2] / self._row_unit
-        pin.crba(self._model, self._data, q, pin.Convention.WORLD)
-        self._kinematics.update(self._data, q, with_bias=False)
-        self.rows = self._kinematics.G / self._row_unit[:, None] * self._unit
-
-    def bias(self, u: FloatArray) -> FloatArray:
-        """Gdot v - s'' (k,) for the rates u (nv,) in units."""
-        v = u * self._unit
-        pin.crba(self._model, self._data, self._q, pin.Convention.WORLD)
-        pin.nonLinearEffects(self._model, self._data, self._q, v)
-        self._kinematics.update(self._data, self._q)
-        out: FloatArray = self._kinematics.bias / self._row_unit - self._bends
-        return out

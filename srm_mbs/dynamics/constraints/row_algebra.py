@@ -49,8 +49,14 @@ from srm_mbs.dynamics.constraints.projection import (
 )
 from srm_mbs.errors import EvaluationError
 
-LARGE = 64
-"""Coordinates above which pivots are taken along the graph, by the kernel where there is one."""
+GRAPH_ORDER_ABOVE = 64
+"""Coordinates above which pivots are taken along the graph of the loops."""
+
+KERNEL_ABOVE = 64
+"""Coordinates above which row algebra runs on the compiled kernel, where there is one."""
+
+ARPACK_ABOVE = 64
+"""Columns above which singular values come from a sparse factorisation."""
 
 FULL = 0.5
 """Part of the entries of W from which there is no graph to follow."""
@@ -69,7 +75,7 @@ def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
     parents : (nv,)
         The next coordinate to the root, or -1.
     """
-    if pattern.shape[1] <= LARGE or not len(pattern):
+    if pattern.shape[1] <= GRAPH_ORDER_ABOVE or not len(pattern):
         return ()
     return _ordered(pattern.shape, np.packbits(pattern).tobytes(), tuple(parents))
 
@@ -344,7 +350,7 @@ def row_algebra(
     rows, nv = pattern.shape
     parents = [-1] * nv if model is None else coordinate_parents(model)
     order = graph_order(pattern, parents)
-    if core is None or choice == "dense" or (choice == "auto" and nv <= LARGE) or not rows:
+    if core is None or choice == "dense" or (choice == "auto" and nv <= KERNEL_ABOVE) or not rows:
         return DenseAlgebra(order)
     supports = [np.flatnonzero(p).tolist() for p in pattern]
     return CompiledAlgebra(
@@ -445,7 +451,7 @@ def singular_value(A: FloatArray, k: int) -> float:
 
 def _pivoted(A: FloatArray, cut: float) -> RowAlgebra | None:
     """The factorisation of A by the kernel, if it is there and A has many columns."""
-    if A.shape[1] <= LARGE:
+    if A.shape[1] <= ARPACK_ABOVE:
         return None
     algebra = row_algebra(A != 0.0)
     if not isinstance(algebra, CompiledAlgebra):

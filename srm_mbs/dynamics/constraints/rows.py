@@ -41,7 +41,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 Vector = Sequence[float]
 """Three numbers."""
@@ -451,12 +451,14 @@ class LoopKinematics:
                 each[row] -= factor * each[other]
 
 
-def all_rows(mechanism: Mechanism) -> LoopKinematics:
+def all_rows(mechanism: MechanismData) -> LoopKinematics:
     """All rows of a mechanism's closures, unscaled, with memory of their own."""
-    resolved: LoopKinematics = mechanism.derived(
-        "all_rows", lambda: LoopKinematics(mechanism.model, mechanism.loops)
-    )
-    return resolved.copy_workspace()
+    return _all_rows(mechanism).copy_workspace()
+
+
+@per_model
+def _all_rows(mechanism: MechanismData) -> LoopKinematics:
+    return LoopKinematics(mechanism.model, mechanism.loops)
 
 
 def closure_errors(

@@ -1,12 +1,12 @@
 """Load-time analysis of the closures: row scales, structural rank, redundant rows.
 
-A walk on the closure manifold (docs/notation.md, "The walk") visits
+A walk on the closure manifold (docs/notation.md, "Manifold sampling") visits
 closed configurations from several restarts, because the start may itself be singular, and open
 random configurations alone give the wrong rank for over-constrained loops.
 
 The walk on the closure manifold that the load-time analysis makes, and its scaled rows.
 
-Source: docs/notation.md, "The walk" and "Scales of rows".
+Source: docs/notation.md, "Load-time analysis".
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.drives import in_order_of_rows
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.model.mechanism import MechanismData, per_start
 from srm_mbs.model.validation import check_inertia
 
 OPEN_SAMPLES = 24
@@ -62,7 +62,7 @@ class ManifoldSampler:
         Rows that are taken off others; none until :meth:`separate`.
     """
 
-    def __init__(self, mechanism: Mechanism, units: Units) -> None:
+    def __init__(self, mechanism: MechanismData, units: Units) -> None:
         self.model = mechanism.model
         self.data = workspace(self.model)
         self.units = units
@@ -130,7 +130,7 @@ class ManifoldSampler:
             q = pin.integrate(self.model, q, -self._plain.solve(g) * unit)
         return q, error
 
-    def set_scale(self, mechanism: Mechanism, rng: np.random.Generator) -> None:
+    def set_scale(self, mechanism: MechanismData, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""
         squares = np.zeros_like(self.scale)
         uncancelled = np.zeros(2)
@@ -352,7 +352,7 @@ class Structure:
     notes: tuple[str, ...]
     eliminations: tuple[Elimination, ...] = ()
 
-    def at(self, mechanism: Mechanism) -> Structure:
+    def at(self, mechanism: MechanismData) -> Structure:
         """The same facts with the units of ``mechanism``, which differs in its start only."""
         return replace(self, units=coordinate_units(mechanism, mechanism.q0, mechanism.v0))
 
@@ -368,7 +368,7 @@ class Structure:
 
 
 def _closed(
-    mechanism: Mechanism, walker: ManifoldSampler, rng: np.random.Generator
+    mechanism: MechanismData, walker: ManifoldSampler, rng: np.random.Generator
 ) -> Iterator[FloatArray]:
     """The closed configurations that the analysis looks at."""
     start, error = walker.close(mechanism.q0, iterations=100)
@@ -437,16 +437,16 @@ def _balanced(walker: ManifoldSampler, samples: _Samples, rank: int) -> _Samples
     return samples
 
 
-def row_names(mechanism: Mechanism) -> tuple[str, ...]:
+def row_names(mechanism: MechanismData) -> tuple[str, ...]:
     """Names of all rows: ``loop.row``, then those of the drives."""
     names = [name for loop in mechanism.loops for name in loop.row_names]
     return (*names, *(drive.name for drive in in_order_of_rows(mechanism.drives)))
 
 
-def analyse(mechanism: Mechanism) -> Structure:
+def analyse(mechanism: MechanismData) -> Structure:
     """Row scales, structural rank, reference pivot and zero rows of ``mechanism``.
 
-    Deterministic: the walk uses a fixed seed.  Source: docs/notation.md, "The walk".
+    Deterministic: the walk uses a fixed seed.  Source: docs/notation.md, "Manifold sampling".
 
     Raises
     ------
@@ -508,3 +508,9 @@ def analyse(mechanism: Mechanism) -> Structure:
         tuple(notes),
         walker.eliminations,
     )
+
+
+@per_start
+def structure_of(mechanism: MechanismData) -> Structure:
+    """The :func:`analyse` of ``mechanism``, made once."""
+    return analyse(mechanism)

@@ -3,8 +3,8 @@
 Other formats describe joints between any two bodies.  The choice of the tree follows one rule:
 of each loop the joint with the most freedom is cut, since it adds the fewest closure rows and
 leaves the fewest joint coordinates; among those the one farthest from the root, so that the tree
-stays shallow.  A joint that carries what no closure has (friction, a screw, a coupling) is cut
-only if nothing else is left.
+stays shallow.  A joint with a property that no closure has (friction, a thread, a coupling) is cut
+only if the loop has no other joint.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ FREEDOM = {
     "floating": 6,
 }
 """Degrees of freedom of the types of joint."""
-UNLIMITED = 1e16
-"""What SDF writes for "no limit"; limits do not act."""
+NO_LIMIT = 1e16
+"""The number that SDF writes for "no limit" (any unit); limits do not act."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +91,10 @@ class Joint:
     axis: Direction = (1.0, 0.0, 0.0)
     second_axis: Direction | None = None
     pitch: float = 0.0
-    lower: float = -UNLIMITED
-    upper: float = UNLIMITED
-    effort: float = UNLIMITED
-    speed: float = UNLIMITED
+    lower: float = -NO_LIMIT
+    upper: float = NO_LIMIT
+    effort: float = NO_LIMIT
+    speed: float = NO_LIMIT
     damping: float = 0.0
     friction: float = 0.0
     stiffness: float = 0.0
@@ -153,7 +153,7 @@ class SpanningTree:
 
 
 class NoTreeError(Exception):
-    """The joints that the user wants cut do not leave a tree; ``joint`` is at fault."""
+    """Cutting the joints that the user named does not leave a tree; ``joint`` is at fault."""
 
     def __init__(self, joint: str, problem: str, remedy: str) -> None:
         super().__init__(problem)
@@ -169,7 +169,7 @@ def _neighbours(joints: Sequence[Joint]) -> dict[str, list[tuple[str, Joint]]]:
 
 
 def distances(joints: Sequence[Joint], root: str) -> dict[str, int]:
-    """Joints between ``root`` and each body that it is connected with, nearest first."""
+    """Number of joints between ``root`` and each body connected with it, nearest first."""
     near = _neighbours(joints)
     found, queue = {root: 0}, [root]
     for body in queue:  # the queue grows on the way
@@ -200,7 +200,7 @@ def _joiner() -> Callable[[Joint], bool]:
 def spanning_tree(joints: Sequence[Joint], root: str, cut: Sequence[str] = ()) -> SpanningTree:
     """A spanning tree of the joints, which connect all bodies with ``root``.
 
-    A minimal spanning tree (Kruskal's algorithm) by: what a closure cannot replace, freedom,
+    A minimal spanning tree (Kruskal's algorithm) by: properties that no closure has, freedom,
     distance from the root, place in the file.
 
     Parameters
@@ -279,7 +279,7 @@ def _check_cut(
 
 
 def components(bodies: Mapping[str, Body], joints: Sequence[Joint]) -> Iterator[list[str]]:
-    """Bodies that joints connect, in the order of the file; that of the ground has ``world``."""
+    """Connected components, their bodies in the order of the file; ``world`` is the ground."""
     left = dict.fromkeys((WORLD, *bodies))
     while left:
         found = distances(joints, next(iter(left)))

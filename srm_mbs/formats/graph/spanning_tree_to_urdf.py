@@ -1,10 +1,7 @@
-"""From a graph of joints to a URDF tree, the closures of the joints cut, and their springs.
+"""From a graph of joints to a URDF tree, with closures and springs of the joints that are cut.
 
-Bodies and joints as the text of a URDF, in the dialect of ``docs/formats.md``.
-
-A joint that closes a loop: the closure that leaves the same freedom.
-
-Every format with loops names its joint types a little differently; they meet here.
+The URDF is in the dialect of ``docs/formats.md``.  A joint that is cut becomes the closure with the
+same freedom; :data:`CLOSURE_OF` has the names of joint types of all formats.
 """
 
 from __future__ import annotations
@@ -13,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import pinocchio as pin
@@ -32,7 +29,7 @@ from srm_mbs.formats.translation import Translation
 from srm_mbs.model.anchors import WORLD
 
 JOINT_FRAME = "::joint_frame"
-"""Added to a joint's name: the massless link at the joint where its child's frame is elsewhere."""
+"""Suffix of the massless link at a joint whose child has its frame elsewhere."""
 
 
 def numbers(values: Iterable[float]) -> str:
@@ -52,7 +49,7 @@ def rpy(rotation: FloatArray) -> tuple[float, float, float]:
 
 
 def is_identity(placement: pin.SE3) -> bool:
-    """Whether a placement moves nothing by more than rounding."""
+    """Whether a placement is the identity within rounding."""
     return bool(placement.isIdentity(1e-13))
 
 
@@ -108,11 +105,11 @@ def _joint(robot: Element, joint: Joint, child: str) -> None:
         SubElement(node, "dynamics", acting)
 
 
-def urdf_text(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> str:
-    """Text of a URDF.
+def urdf_tree(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> Element:
+    """Root element of a URDF.
 
     A link keeps the frame that the file gave it.  Where the joint that carries it is elsewhere,
-    a massless link stands at the joint, and the link is fixed to that.
+    a massless link is added at the joint, and the link is fixed to that.
 
     Parameters
     ----------
@@ -144,8 +141,7 @@ def urdf_text(name: str, bodies: Iterable[Body], joints: Sequence[Joint]) -> str
             _joint(robot, joint, frame)
             held = Joint(frame + "::fixed", "fixed", frame, joint.child, back)
             _joint(robot, held, joint.child)
-    indent(robot)
-    return tostring(robot, encoding="unicode") + "\n"
+    return robot
 
 
 CLOSURE_OF = {
@@ -162,9 +158,10 @@ CLOSURE_OF = {
 }
 """Joint types of all formats, and the closure of the same freedom."""
 WITH_AXIS = ("revolute", "prismatic", "cylindrical", "planar")
-ROTATION_SEEN = ("frame", "prismatic")
-"""Closures for which the turn of a about the axis matters."""
-PARALLEL = 1e-9
+FIXED_ABOUT_AXIS = ("frame", "prismatic")
+"""Closures that fix the rotation of a about the axis."""
+AXIS_TOLERANCE = 1e-9
+"""Norm of the difference of two unit vectors below which they are the same axis."""
 
 
 def placement(xyz: Sequence[float], rpy: Sequence[float]) -> pin.SE3:
@@ -222,8 +219,8 @@ def closure(
         out |= {"axis_a": other.tolist(), "axis_b": direction.tolist()}
     elif type_ in WITH_AXIS:
         out["axis"] = direction.tolist()
-        if np.linalg.norm(other - direction) > PARALLEL:
-            if type_ in ROTATION_SEEN:
+        if np.linalg.norm(other - direction) > AXIS_TOLERANCE:
+            if type_ in FIXED_ABOUT_AXIS:
                 raise fault(
                     f"the axes of a {kind} joint in its two frames differ",
                     "Turn one of the frames so that the axis has the same components in both",
@@ -303,7 +300,7 @@ class GraphTranslator:
     root
         The body that floats if nothing connects it with the ground.
     free
-        Names for the joints by which bodies move freely beside others.
+        Bodies that move freely beside others, and the names of their joints.
     """
 
     def __init__(
@@ -348,12 +345,12 @@ class GraphTranslator:
             entries["loop"] = loops
         if forces:
             entries["force"] = forces
-        self._tell(tree)
-        urdf = urdf_text(self.name, self.bodies.values(), tree.joints)
-        return Translation(urdf, entries, tuple(self.notes))
+        self._add_notes(tree)
+        urdf = urdf_tree(self.name, self.bodies.values(), tree.joints)
+        return Translation(urdf, entries=entries, notes=tuple(self.notes))
 
     def _rooted(self) -> tuple[str, str]:
-        """Base and root body; bodies that hang on nothing get a floating joint to the ground."""
+        """Base and root body; bodies that no joint connects to the ground get a floating joint."""
         parts = [part for part in components(self.bodies, self.joints) if part != [WORLD]]
         free = [part for part in parts if WORLD not in part]
         if len(parts) == 1 and free:
@@ -442,7 +439,8 @@ class GraphTranslator:
             }
         ]
 
-    def _tell(self, tree: SpanningTree) -> None:
+    def _add_notes(self, tree: SpanningTree) -> None:
+        """Note the joints that are cut, and those whose parent and child changed places."""
         if tree.cut:
             names = ", ".join(repr(joint.name) for joint in tree.cut)
             self.notes.append(f"the joints {names} close loops: they are cut and became closures")

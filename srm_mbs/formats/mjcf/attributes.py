@@ -1,8 +1,7 @@
-"""Attributes of MJCF elements with their default classes, and the ways to write an orientation.
+"""Elements and attributes of MJCF: names, default classes, numbers and orientations.
 
-Elements and attributes of MJCF: what is read, what does not matter to the motion.
-
-Everything else is refused by name.
+The tables list the names that are read and those that do not affect the motion; all others are
+refused.
 """
 
 from __future__ import annotations
@@ -121,7 +120,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     "mesh": ("name", "class", "file", "scale", "inertia", "refpos", "refquat"),
     "material": ("name", "class", "rgba"),
 }
-"""Attributes that are read; those of a joint equality stand in JOINT_EQUALITY."""
+"""Attributes that are read; those of a joint equality are in JOINT_EQUALITY."""
 JOINT_EQUALITY = ("name", "class", "active", "joint1", "joint2", "polycoef")
 _CONTACT = ("solref", "solimp", "margin", "gap", "user")
 IGNORED_ATTRIBUTES: dict[str, tuple[str, ...]] = {
@@ -274,7 +273,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass
 class Compiler:
-    """What ``<compiler>`` says that matters here."""
+    """Settings of ``<compiler>`` that are used here."""
 
     degrees: bool = True
     sequence: str = "xyz"
@@ -324,12 +323,12 @@ class MjcfValues(XmlValues):
             if child.tag != "default" and child.tag in ATTRIBUTES:
                 self.known(child, f"{where}, <{child.tag}>")
                 mine.setdefault(child.tag, {}).update(child.attrib)
-        # The classes inside inherit everything, wherever it stands.
+        # Nested classes inherit all attributes, also those that follow them in the file.
         for child in node.findall("default"):
             self.read_defaults(child, name)
 
     def known(self, node: Element, where: str) -> None:
-        """Refuse unknown attributes; those that do not matter to the motion are passed over."""
+        """Refuse unknown attributes; those that do not affect the motion are ignored."""
         ignored = IGNORED_ATTRIBUTES.get(node.tag, ())
         for key in node.attrib:
             if key not in ATTRIBUTES[node.tag] and key not in ignored:
@@ -393,7 +392,7 @@ class MjcfValues(XmlValues):
         return pin.SE3(self.rotation(given, where), self.get(given, "pos", 3, "0 0 0", where))
 
     def rotation(self, given: Mapping[str, str], where: str) -> FloatArray:
-        """The orientation (3, 3), however it is written.
+        """The orientation (3, 3), in any of the notations of MJCF.
 
         Raises
         ------
@@ -428,7 +427,8 @@ class MjcfValues(XmlValues):
         return np.eye(3)
 
     def _euler(self, angles: FloatArray) -> FloatArray:
-        """Lower-case letters turn about the turned axes, capitals about the fixed ones."""
+        """The rotation (3, 3) of ``euler``; lower-case letters of the sequence are intrinsic,
+        capitals extrinsic rotations."""
         out = np.eye(3)
         for letter, angle in zip(self.compiler.sequence, angles):
             turn = pin.AngleAxis(self.angle(angle), np.array(AXES[letter.lower()])).matrix()
@@ -437,7 +437,7 @@ class MjcfValues(XmlValues):
 
 
 def z_along(direction: FloatArray) -> FloatArray:
-    """The least rotation (3, 3) that turns z to the unit vector ``direction``."""
+    """The smallest rotation (3, 3) that takes the z axis to the unit vector ``direction``."""
     z = np.array([0.0, 0.0, 1.0])
     axis = np.cross(z, direction)
     sine = float(np.linalg.norm(axis))

@@ -1,7 +1,7 @@
 """The tree of bodies of an MJCF file.
 
-Positions count from the pose of the file: a joint's ``ref``, its value there in MuJoCo, is
-subtracted from everything that is measured on it.
+Joint positions are zero in the pose of the file: MuJoCo's value there, a joint's ``ref``, is
+subtracted from its limits and from the rest position of its spring.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.graph.joint_graph import UNLIMITED, Body, Joint
+from srm_mbs.formats.graph.joint_graph import NO_LIMIT, Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
 from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, MjcfValues
 from srm_mbs.formats.mjcf.geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
@@ -22,7 +22,7 @@ from srm_mbs.model.anchors import WORLD
 
 JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""
-OURS = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
+URDF_TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
 
 
 class BodyReader:
@@ -85,7 +85,7 @@ class BodyReader:
         self.bodies[name] = Body(name)
         if parent in self._moving or any(c.tag in ("joint", "freejoint") for c in node):
             self._moving.add(name)
-        # Joints first, so that they stand before those of the bodies inside.
+        # Joints first: they precede those of nested bodies.
         self._joints(node, name, parent, in_parent, childclass)
         self._contents(node, name, pin.SE3.Identity(), childclass, found)
         self.bodies[name] = self._finished(name, found["inertial"], found["geom"])
@@ -98,7 +98,7 @@ class BodyReader:
         childclass: str,
         found: dict[str, list[Any]],
     ) -> None:
-        """What stands in a body, or in a ``<frame>`` in it; geoms and inertials into ``found``."""
+        """Read the elements of a body or of a ``<frame>``; geoms and inertials into ``found``."""
         values = self.values
         where = f"body {name!r}"
         many = ("geom", "site", "body", "frame", "joint")
@@ -187,7 +187,7 @@ class BodyReader:
         return pin.Inertia(mass, placed.translation, turn @ about @ turn.T)
 
     def _bounded(self, inertia: pin.Inertia | None) -> pin.Inertia | None:
-        """With the least mass and principal moments that the compiler allows."""
+        """The inertia with at least the mass and principal moments that the compiler demands."""
         compiler = self.values.compiler
         if not (compiler.bound_mass or compiler.bound_inertia):
             return inertia
@@ -197,7 +197,7 @@ class BodyReader:
         return pin.Inertia(max(inertia.mass, compiler.bound_mass), inertia.lever, about)
 
     def rescale(self) -> None:
-        """Bring all masses together to ``settotalmass``."""
+        """Scale all inertias so that the total mass is ``settotalmass``."""
         wanted = self.values.compiler.total_mass
         total = sum(body.inertia.mass for body in self.bodies.values() if body.inertia is not None)
         if wanted <= 0.0 or total <= 0.0:
@@ -214,7 +214,7 @@ class BodyReader:
     def _joints(
         self, node: Element, name: str, parent: str, in_parent: pin.SE3, childclass: str
     ) -> None:
-        """The joints of a body, one after the other; the bodies between them are massless."""
+        """The joints of a body, in series, with massless bodies between them."""
         nodes = [child for child in node if child.tag in ("joint", "freejoint")]
         if not nodes:
             self.joints.append(
@@ -270,7 +270,7 @@ class BodyReader:
             self.free[child] = name
             return None
         where_it_is = pin.SE3(np.eye(3), values.get(given, "pos", 3, "0 0 0", where))
-        placed = Joint(name, OURS[kind], parent, child, at * where_it_is, where_it_is)
+        placed = Joint(name, URDF_TYPES[kind], parent, child, at * where_it_is, where_it_is)
         if kind == "ball":
             self._ball_spring(placed, acting.pop("stiffness"))
             return replace(placed, **acting)
@@ -331,11 +331,11 @@ class BodyReader:
             raise values.fault(where, "the range does not increase", "Exchange the two")
         if kind == "hinge":
             low, high = values.angle(low), values.angle(high)
-        clipped: FloatArray = np.clip([low - ref, high - ref], -UNLIMITED, UNLIMITED)
+        clipped: FloatArray = np.clip([low - ref, high - ref], -NO_LIMIT, NO_LIMIT)
         return {"lower": float(clipped[0]), "upper": float(clipped[1])}
 
     def _ball_spring(self, joint: Joint, stiffness: float) -> None:
-        """A ball's spring turns against the rotation vector: a bushing without translation."""
+        """The spring of a ball joint, with a moment of -k times the rotation vector: a bushing."""
         if stiffness:
             self.forces.append(
                 {

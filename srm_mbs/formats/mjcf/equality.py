@@ -142,7 +142,7 @@ class EqualityReader:
         self._close(name, "frame", (first, in_first), (second, at), where)
 
     def _joint(self, name: str, given: dict[str, str], where: str) -> None:
-        """q_1 - ref_1 = a_0 + a_1 (q_2 - ref_2) + ...; ours count from the references."""
+        """q_1 = a_0 + a_1 q_2 with positions that are zero at the references of MuJoCo."""
         coefficients = self.values.numbers(
             given.get("polycoef", "0 1 0 0 0"), (1, 2, 3, 4, 5), where, "polycoef"
         )

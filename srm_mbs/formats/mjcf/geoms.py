@@ -1,4 +1,4 @@
-"""Geoms of MJCF: the inertia that they give their body, and what is drawn of them."""
+"""Geoms of MJCF: their inertia and their visuals."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], file: str) -> pin.Inertia
 
 
 def _enclosed(geom: Geom, mesh: Mesh | None, file: str) -> pin.Inertia:
-    """Of the solid of density 1 that the triangles of a mesh enclose: inertia="exact"."""
+    """Inertia of the solid of density 1 kg/m^3 that a mesh encloses: inertia="exact"."""
     if mesh is None or mesh.inertia != "exact":
         raise InputError(
             "the inertia of a mesh is read from its triangles only, and only if MuJoCo does so too",

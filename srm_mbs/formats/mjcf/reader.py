@@ -7,6 +7,7 @@ drops ``<equality><joint>`` and activates what is inactive.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -16,31 +17,34 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
 from srm_mbs.formats.mjcf.geoms import Mesh
 from srm_mbs.formats.translation import Options, Translation
-from srm_mbs.formats.xml import parse_urdf
+from srm_mbs.formats.xml import parse_xml
 
 GRAVITY = "0 0 -9.81"
-DEEPEST = 20
-"""Most files included in each other."""
+LARGEST_INCLUDE_DEPTH = 20
+"""Largest number of files that include each other."""
 FORCES_OFF = ("passive", "spring", "damper", "frictionloss", "constraint")
-"""Flags that would switch off what acts here."""
+"""Flags that would disable forces that this package applies."""
 
 
 def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -> None:
-    """Put the contents of included files in the place of each ``<include>``."""
+    """Replace each ``<include>`` by the contents of its file."""
     for i, child in reversed(list(enumerate(node))):
         if child.tag != "include":
             _expanded(values, child, folder, depth)
             continue
         name = child.get("file", "")
         where = f"<include> {name!r}"
-        if depth >= DEEPEST:
-            raise values.fault(where, f"more than {DEEPEST} files include each other", "Break it")
+        if depth >= LARGEST_INCLUDE_DEPTH:
+            raise values.fault(
+                where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
+            )
         try:
             text = (folder / name).read_text(encoding="utf-8-sig")
         except (OSError, ValueError) as error:
@@ -49,7 +53,7 @@ def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -
                 f"it cannot be read: {error}",
                 "Check the path, which is relative to the model",
             ) from error
-        root = parse_urdf(text, str(folder / name))
+        root = parse_xml(text, str(folder / name))
         values.check_depth(root)
         _expanded(values, root, folder, depth + 1)
         node.remove(child)
@@ -134,7 +138,7 @@ def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
 
 
 def _mesh_axes(values: MjcfValues, given: dict[str, str], scale: FloatArray, where: str) -> pin.SE3:
-    """Where the axes of a mesh file lie in those of the mesh.
+    """Placement of the axes of a mesh file in those of the mesh.
 
     MuJoCo makes S R^T (x - p) of a vertex x, with the scale S, ``refpos`` p and ``refquat`` R.
     """
@@ -148,13 +152,13 @@ def _mesh_axes(values: MjcfValues, given: dict[str, str], scale: FloatArray, whe
     return pin.SE3(R.T, -scale * (R.T @ p))
 
 
-def translate(text: str, file: str, options: Options) -> Translation:
+def translate(document: Document, options: Options) -> Translation:
     """Translate an MJCF file.
 
     Parameters
     ----------
-    text, file
-        The file and its path, for messages and for what it includes.
+    document
+        The file; its path is also where the files that it includes are searched.
     options
         Joints to cut: bodies of MJCF are a tree, so that any name is an error.
 
@@ -163,8 +167,8 @@ def translate(text: str, file: str, options: Options) -> Translation:
     InputError
         Naming the file, the element and the remedy.
     """
+    file, root = document.file, document.xml
     values = MjcfValues(file)
-    root = parse_urdf(text, file)
     if root.tag != "mujoco":
         raise InputError(
             f"the root element is <{root.tag}>, not <mujoco>", file=file, remedy="Give an MJCF file"
@@ -223,7 +227,7 @@ def translate(text: str, file: str, options: Options) -> Translation:
     _add(entries, "lock", closures.lock)
     if closures.held:
         entries["initial"] = {"q": closures.held}
-    return Translation(made.urdf, entries, (*made.notes, *values.notes()))
+    return replace(made, entries=entries, notes=(*made.notes, *values.notes()))
 
 
 def _add(entries: dict[str, Any], key: str, more: list[Any]) -> None:

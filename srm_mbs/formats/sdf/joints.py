@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.formats.graph.joint_graph import UNLIMITED, Body, Direction, Joint
+from srm_mbs.formats.graph.joint_graph import NO_LIMIT, Body, Direction, Joint
 from srm_mbs.formats.sdf.links import Frames, joint_frame
 from srm_mbs.formats.xml import XmlValues
 from srm_mbs.model.anchors import WORLD
@@ -45,14 +45,15 @@ AXIS_READ = ("xyz", "use_parent_model_frame", "dynamics", "limit", "initial_posi
 DYNAMICS_READ = ("damping", "friction", "spring_reference", "spring_stiffness")
 LIMIT_READ = ("lower", "upper", "effort", "velocity")
 LIMIT_IGNORED = ("stiffness", "dissipation")
-PERPENDICULAR = 1e-9
-SECOND = "::axis2"
-"""Added to a joint's name: its second axis, where that is a joint of its own."""
+ANGLE_COSINE_TOLERANCE = 1e-9
+"""Of the cosine of the angle between two axes that are parallel or perpendicular."""
+SECOND_AXIS_SUFFIX = "::axis2"
+"""Suffix of the joint of a second axis that is a joint of its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """An ``<axis>``: direction in the joint's frame, and what acts along it."""
+    """An ``<axis>``: direction in the joint's frame, and what it says of its coordinate."""
 
     direction: Direction
     dynamics: dict[str, float]
@@ -134,7 +135,7 @@ class JointReader:
                 self._mimics.append((name, prefix, axis.mimic))
 
     def _placement(self, name: str) -> pin.SE3:
-        """Of a joint's frame, in the world."""
+        """Placement of a joint's frame in the world."""
         return self.frames.placement(self._frame_of[name], f"joint {name!r}")
 
     def end(self, node: Element, side: str, prefix: str, name: str) -> str:
@@ -163,10 +164,10 @@ class JointReader:
     def _two_axes(self, joint: Joint, axes: list[Axis]) -> None:
         first, second = axes
         cosine = float(np.dot(first.direction, second.direction))
-        if 1.0 - abs(cosine) < PERPENDICULAR:
+        if 1.0 - abs(cosine) < ANGLE_COSINE_TOLERANCE:
             raise self.fault(joint.name, "its two axes are parallel", "Correct <axis2>")
         acts = any(axis.dynamics[key] for axis in axes for key in axis.dynamics if key != "rest")
-        if abs(cosine) < PERPENDICULAR and not acts and not (first.mimic or second.mimic):
+        if abs(cosine) < ANGLE_COSINE_TOLERANCE and not acts and not (first.mimic or second.mimic):
             self.joints.append(
                 replace(
                     joint,
@@ -176,13 +177,13 @@ class JointReader:
                 )
             )
             return
-        # Two hinges and a massless cross take any angle between the axes, and what acts on them.
+        # Two hinges and a massless cross have any angle between the axes, and forces on both.
         cross = Body(joint.name + "::cross")
         self.between[cross.name] = cross
         one = replace(joint, type="revolute", child=cross.name, in_child=pin.SE3.Identity())
         other = replace(
             joint,
-            name=joint.name + SECOND,
+            name=joint.name + SECOND_AXIS_SUFFIX,
             type="revolute",
             parent=cross.name,
             in_parent=pin.SE3.Identity(),
@@ -190,7 +191,7 @@ class JointReader:
         self.joints += [_along(one, first), _along(other, second)]
 
     def _pitch(self, node: Element, name: str) -> float:
-        """Metres per turn; the older ``<thread_pitch>`` is read as libsdformat converts it."""
+        """Metres per turn; the older ``<thread_pitch>`` is converted as libsdformat does."""
         where = f"joint {name!r}"
         given = node.find("screw_thread_pitch")
         if given is not None:
@@ -273,12 +274,12 @@ class JointReader:
             for child in node:
                 if child.tag in LIMIT_READ:
                     value = self.values.limit(child.text or "", where, f"<{child.tag}>")
-                    found[child.tag] = float(np.clip(value, -UNLIMITED, UNLIMITED))
-        if found.get("lower", -UNLIMITED) > found.get("upper", UNLIMITED):
+                    found[child.tag] = float(np.clip(value, -NO_LIMIT, NO_LIMIT))
+        if found.get("lower", -NO_LIMIT) > found.get("upper", NO_LIMIT):
             raise self.values.fault(where, "<lower> is above <upper>", "Exchange them")
         for tag, key in (("effort", "effort"), ("velocity", "speed")):
-            value = found.pop(tag, UNLIMITED)
-            found[key] = value if value >= 0.0 else UNLIMITED  # -1 means no limit
+            value = found.pop(tag, NO_LIMIT)
+            found[key] = value if value >= 0.0 else NO_LIMIT  # -1 means no limit
         return found
 
     # Couplings ------------------------------------------------------------------------------

@@ -1,10 +1,9 @@
-"""Links of an SDF file: inertia and what is drawn.
-
-Frames of an SDF file: who is placed relative to whom, and where each is.
+"""Links of an SDF file with their inertias and visuals, and the frames that place them.
 
 Names follow SDF 1.7 and later (``http://sdformat.org/tutorials?tut=pose_frame_semantics``): every
 link, joint, frame and nested model is a frame of its model; ``a::b`` is the frame b of the nested
-model a; ``__model__`` is a model's own frame.  Older files fit in: they have no frames but these.
+model a; ``__model__`` is a model's own frame.  Older files are a special case: they have no other
+frames.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from srm_mbs.formats.graph.joint_graph import Body
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, origin
 from srm_mbs.formats.xml import XmlValues
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.coordinates import UNIT_LENGTH_TOLERANCE
 
 MODEL = "__model__"
 SEPARATOR = "::"
@@ -29,7 +29,7 @@ RESERVED = ("world", "__model__", "__root__")
 
 
 def joint_frame(name: str, version: tuple[int, int]) -> str:
-    """Name of a joint's frame; before SDF 1.7 nothing names it, and links may be called alike."""
+    """Name of a joint's frame; before SDF 1.7 nothing refers to it, and links may have its name."""
     return name if version >= (1, 7) else f"{name}{SEPARATOR}__joint__"
 
 
@@ -44,7 +44,7 @@ def pose(
         angles = np.deg2rad(numbers[3:]) if degrees else numbers[3:]
         return pin.SE3(pin.rpy.rpyToMatrix(angles), numbers[:3])
     length = float(np.linalg.norm(numbers[3:]))
-    if abs(length - 1.0) > 1e-3:
+    if abs(length - 1.0) > UNIT_LENGTH_TOLERANCE:
         raise values.fault(
             where, f"the quaternion of <pose> has length {length:.6g}", "Give a unit quaternion"
         )
@@ -82,7 +82,7 @@ class Frames:
         body: str | None = None,
         attached_to: str = WORLD,
     ) -> None:
-        """Place a frame; ``body`` is the link that it is part of, or ``attached_to`` tells."""
+        """Place a frame; it is part of the link ``body``, by default of that of ``attached_to``."""
         if name in self._frames:
             raise InputError(
                 f"two links, joints, frames or models of one model are called {name!r}",
@@ -276,6 +276,6 @@ def _visual(values: XmlValues, node: Element, link: str, place_of: PlaceOf) -> E
 
 
 def mesh_name(uri: str) -> str:
-    """The file name that URDF uses for a mesh of SDF: ``package://`` stands for ``model://``."""
+    """The file name in URDF of a mesh of SDF: ``package://`` in place of ``model://``."""
     uri = uri.strip()
     return f"package://{uri[len('model://') :]}" if urlsplit(uri).scheme == "model" else uri

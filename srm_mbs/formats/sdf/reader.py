@@ -1,13 +1,13 @@
 """SDF (``http://sdformat.org``) to a URDF tree and closures.
 
-Read are models with their links, joints, frames and nested or included models.  The joints of a
-file form a graph; :mod:`srm_mbs.formats.graph.joint_graph` says which of them are cut.
+Models are read with their links, joints, frames and nested or included models.  The joints of a
+file form a graph; :mod:`srm_mbs.formats.graph.joint_graph` chooses those that are cut.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -16,6 +16,7 @@ from xml.etree.ElementTree import Element
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.sdf.joints import JointReader
@@ -30,7 +31,7 @@ from srm_mbs.formats.sdf.links import (
     read_link,
 )
 from srm_mbs.formats.translation import Options, Translation
-from srm_mbs.formats.xml import XmlValues, parse_urdf
+from srm_mbs.formats.xml import XmlValues, parse_xml
 from srm_mbs.model.anchors import WORLD
 
 OLDEST, NEWEST = (1, 3), (1, 12)
@@ -59,13 +60,13 @@ WORLD_IGNORED = (
 MANY = ("link", "joint", "frame", "model", "include")
 GRAVITY = "0 0 -9.8"
 """SDF's default in a ``<world>``."""
-DEEPEST = 20
-"""Most files included in each other."""
+LARGEST_INCLUDE_DEPTH = 20
+"""Largest number of files that include each other."""
 
 
 @dataclass(frozen=True)
 class _Scope:
-    """Where an element stands: the names around it, its file, and that file's version."""
+    """Context of an element: prefix of its names, its file, and that file's version."""
 
     prefix: str
     file: str
@@ -84,7 +85,7 @@ class SdfReader:
         self.frames = Frames(file)
         self.bodies: dict[str, Body] = {}
         self.fixed: list[str] = []
-        self._has_model = True  # not a world around several
+        self._has_model = True  # and not a world with several
         self.reader = JointReader(self.values, self.frames)
         self._joint_nodes: list[tuple[Element, _Scope]] = []
 
@@ -107,7 +108,7 @@ class SdfReader:
         return placement, child.get("frame" if older else "relative_to", "").strip()
 
     def own_place(self, scope: _Scope) -> PlaceOf:
-        """Reads poses that are relative to what they stand in, and to nothing else."""
+        """A reader of poses that are relative to the enclosing element only."""
 
         def place_of(node: Element, where: str) -> pin.SE3:
             placement, relative_to = self.place(node, where, scope)
@@ -136,7 +137,7 @@ class SdfReader:
     ) -> str:
         """Read a model whose names begin with ``scope.prefix``; returns its canonical link.
 
-        ``around`` is the prefix of what it stands in; ``placed`` the pose of an ``<include>``.
+        ``around`` is the prefix of the enclosing model; ``placed`` the pose of an ``<include>``.
         """
         where = f"model {scope.prefix.removesuffix(SEPARATOR) or node.get('name', '')!r}"
         values = self.values
@@ -175,7 +176,7 @@ class SdfReader:
         return canonical
 
     def nested(self, node: Element, scope: _Scope) -> str:
-        """A model inside a model; its name stands for its own frame outside."""
+        """A model inside a model; outside, its name means its own frame."""
         name = self.name(node, scope)
         inner = _Scope(name + SEPARATOR, scope.file, scope.version, scope.depth)
         canonical = self.model(node, inner, scope.prefix)
@@ -229,10 +230,12 @@ class SdfReader:
         for what in ("merge", "placement_frame"):
             if node.get(what) is not None or node.find(what) is not None:
                 raise values.fault(where, f"{what} is not read by this version", "Remove it")
-        if scope.depth >= DEEPEST:
-            raise values.fault(where, f"more than {DEEPEST} files include each other", "Break it")
+        if scope.depth >= LARGEST_INCLUDE_DEPTH:
+            raise values.fault(
+                where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
+            )
         path, text = self._included(uri, scope.file, where)
-        root = self.parsed(text, str(path))
+        root = self.checked(parse_xml(text, str(path)), str(path))
         model = root.find("model")
         if model is None:
             raise values.fault(where, f"{str(path)!r} holds no <model>", "Include a model")
@@ -256,7 +259,7 @@ class SdfReader:
         return canonical
 
     def _included(self, uri: str, file: str, where: str) -> tuple[Path, str]:
-        """Path and text of an included file; a folder stands for the model that is in it."""
+        """Path and text of an included file; a folder means the model in it."""
         parts = urlsplit(uri)
         if parts.scheme not in ("", "model", "file") or not uri:
             raise self.values.fault(
@@ -283,9 +286,8 @@ class SdfReader:
 
     # Files ----------------------------------------------------------------------------------
 
-    def parsed(self, text: str, file: str) -> Element:
-        """Root element of an SDF file."""
-        root = parse_urdf(text, file)
+    def checked(self, root: Element, file: str) -> Element:
+        """The root element of an SDF file."""
         self.values.check_depth(root)
         if root.tag != "sdf":
             raise InputError(
@@ -307,10 +309,10 @@ class SdfReader:
             )
         return found
 
-    def read(self, text: str) -> tuple[str, str, dict[str, Any]]:
+    def read(self, root: Element) -> tuple[str, str, dict[str, Any]]:
         """Read the whole file: its name, the root link, and entries that are no loops."""
         file = self.values.file
-        root = self.parsed(text, file)
+        self.checked(root, file)
         version = self.version(root, file)
         self.values.attributes(root, "<sdf>", ("version",))
         self.values.children(root, "<sdf>", ("model", "world"), ("actor", "light"))
@@ -330,7 +332,7 @@ class SdfReader:
         return name, canonical, entries
 
     def world(self, node: Element, scope: _Scope) -> tuple[str, dict[str, Any]]:
-        """A world with models, whose names stand before those of their links."""
+        """A world with models, whose names are prefixes of those of their links."""
         self.values.children(node, "<world>", WORLD_READ, WORLD_IGNORED, MANY)
         self._has_model = False
         models = [self.nested(model, scope) for model in node.findall("model")]
@@ -361,7 +363,7 @@ class SdfReader:
 
 
 def _of_folder(folder: Path) -> Path:
-    """The SDF file of a model's folder: what ``model.config`` names, or ``model.sdf``."""
+    """The SDF file of a model's folder: the one that ``model.config`` names, or ``model.sdf``."""
     config = folder / "model.config"
     if config.is_file():
         found = re.findall(r"<sdf[^>]*>\s*([^<\s]+)\s*</sdf>", config.read_text(encoding="utf-8"))
@@ -370,13 +372,13 @@ def _of_folder(folder: Path) -> Path:
     return folder / "model.sdf"
 
 
-def translate(text: str, file: str, options: Options) -> Translation:
+def translate(document: Document, options: Options) -> Translation:
     """Translate an SDF file.
 
     Parameters
     ----------
-    text, file
-        The file and its path, for messages and for what it includes.
+    document
+        The file; its path is also where the files that it includes are searched.
     options
         The joints to cut; none: chosen by :mod:`srm_mbs.formats.graph.joint_graph`.
 
@@ -385,8 +387,9 @@ def translate(text: str, file: str, options: Options) -> Translation:
     InputError
         Naming the file, the element and the remedy.
     """
+    file = document.file
     reader = SdfReader(file)
-    name, root, entries = reader.read(text)
+    name, root, entries = reader.read(document.xml)
     couplings = reader.reader.couplings()
     reader.static()
     where = {link: reader.frames.placement(link, f"link {link!r}") for link in reader.bodies}
@@ -396,4 +399,4 @@ def translate(text: str, file: str, options: Options) -> Translation:
     entries |= made.entries
     if couplings:
         entries["loop"] = [*entries.get("loop", ()), *couplings]
-    return Translation(made.urdf, entries, (*made.notes, *reader.values.notes()))
+    return replace(made, entries=entries, notes=(*made.notes, *reader.values.notes()))

@@ -1,11 +1,7 @@
-"""A whole mechanism description, and the closures, forces and drives that its entries ask for.
+"""A whole description: from its text to checked tables, and from these to elements.
 
-Laws as descriptions write them: a type, and the keys of that type.
-
-From the text of a description to its tables, and the words for what is wrong in it.
-
-Unknown keys, wrong types and non-finite numbers become one :class:`InputError` that names the
-file, the key and the remedy.
+Unknown keys, wrong types and numbers that are not finite become one :class:`InputError` that names
+the file, the key and the remedy.  The keys themselves are in :mod:`srm_mbs.formats.toml.schema`.
 """
 
 from __future__ import annotations
@@ -17,19 +13,18 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from srm_mbs.errors import InputError
-from srm_mbs.formats.csv_table import read_table, table_columns
+from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.schema import (
+    CSV_KEYS,
     FORCE_ENTRIES,
+    LAW_KEYS,
+    TABLE_KEYS,
     AnchorEntry,
-    ForceEntry,
-    LoopEntry,
     StrictEntry,
     TopEntry,
-    TorqueEntry,
-    WrenchEntry,
 )
 from srm_mbs.formats.translation import MODEL_KEYS
 from srm_mbs.model.anchors import Anchor
@@ -38,105 +33,8 @@ from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Law, Polynomial, Table
 
-TABLE_KEYS = ("table", "time", "value")
-"""Keys of a table in a file: its path, and the names of its columns, by default t and value."""
-LAW_KEYS = (
-    "type",
-    *dict.fromkeys(key.name for kind in LAW_TYPES.values() for key in fields(kind)),  # type: ignore[arg-type]
-    *TABLE_KEYS,
-)
-"""All keys that laws have."""
-
-
-def law_from(entry: Mapping[str, Any], folder: Path) -> Law:
-    """The law of ``entry``, keys and their values, None for those that are not given; a table is
-    read from ``folder``.
-
-    Raises
-    ------
-    InputError
-        For an unknown type, a key that the type needs or does not take, or a malformed table.
-    """
-    kind = LAW_TYPES.get(entry["type"])
-    if kind is None:
-        raise InputError(
-            f"there is no law of type {entry['type']!r}",
-            remedy=f"Known: {', '.join(LAW_TYPES)}",
-        )
-    given = {key: entry[key] for key in LAW_KEYS[1:] if entry[key] is not None}
-    keys = fields(kind)  # type: ignore[arg-type]
-    accepted = [*(key.name for key in keys), *(TABLE_KEYS if kind is Table else ())]
-    for key in given:
-        if key not in accepted:
-            raise InputError(
-                f"a law of type {kind.type!r} takes no {key}",
-                remedy=f"Known: {', '.join(accepted)}",
-            )
-    if kind is Table and "table" in given:
-        if "t" in given or "values" in given:
-            raise InputError(
-                "the values are given twice", remedy="Give table, or t and values, not both"
-            )
-        columns = (given.get("time", "t"), given.get("value", "value"))
-        t, values = read_table(folder / given["table"], columns).T.tolist()
-        return Table(t, values)
-    for key in TABLE_KEYS[1:]:
-        if key in given:
-            raise InputError(
-                f"{key} names a column, but there is no table", remedy='Give table = "file.csv"'
-            )
-    missing = [key.name for key in keys if key.default is MISSING and key.name not in given]
-    if missing:
-        raise InputError(
-            f"a law of type {kind.type!r} needs {' and '.join(missing)}",
-            remedy='Give them, or table = "file.csv"' if kind is Table else "Add it",
-        )
-    return kind(**given)
-
-
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
-"""Columns of the table of a wrench; those that are not there are zero."""
-
-
-def with_law(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The keys of a torque or wrench with its law made, in place of ``table``, ``time`` and
-    ``value``.
-
-    Raises
-    ------
-    InputError
-        If law and table are both given, neither of them nor a torque, or a table is malformed.
-    """
-    out = {key: value for key, value in values.items() if key not in TABLE_KEYS}
-    table, time = values.get("table"), values.get("time")
-    named = [key for key in TABLE_KEYS[1:] if values.get(key) is not None]
-    if values["law"] is not None:
-        if table is not None or named:
-            raise InputError("law and table are given", remedy="Give one of them")
-        out["law"] = law_from(values["law"], folder)
-    elif table is None:
-        if named:
-            raise InputError(
-                f"{named[0]} names a column, but there is no table",
-                remedy='Give table = "file.csv"',
-            )
-        if values["type"] == "torque" and values["torque"] is None:
-            raise InputError("there is no torque", remedy="Give torque, law or table")
-    elif values["type"] == "torque":
-        columns = (time or "t", values["value"] or "value")
-        out["law"] = Table(*read_table(folder / table, columns).T.tolist())
-    else:
-        there = [name for name in COMPONENTS if name in table_columns(folder / table)]
-        if not there:
-            raise InputError(
-                f"the table has none of the columns {', '.join(COMPONENTS)}",
-                file=str(folder / table),
-                remedy="Name the columns of force and moment in the first line",
-            )
-        t, *columns_read = read_table(folder / table, (time or "t", *there)).T.tolist()
-        laws = {name: Table(t, column) for name, column in zip(there, columns_read)}
-        out["law"] = tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
-    return out
+"""Columns of the table of a wrench; those that are missing are zero."""
 
 
 class Description(TopEntry):
@@ -165,20 +63,20 @@ class Description(TopEntry):
         """Names of the joints that take part in a coupling."""
         return frozenset(name for entry in self.loop for name in entry.joints or ())
 
-    def anchors(self) -> Iterator[tuple[str, AnchorEntry]]:
+    def anchors(self) -> Iterator[tuple[str, Any]]:
         """Every anchor with its key, ``loop[0].a`` for example."""
         entries: list[tuple[str, Iterable[tuple[str, Any]]]] = [
-            *((f"loop[{i}]", entry) for i, entry in enumerate(self.loop)),
-            *((f"force[{i}]", entry) for i, entry in enumerate(self.force)),
-            *((f"drive[{i}]", entry) for i, entry in enumerate(self.drive)),
+            (f"{kind}[{i}]", entry)
+            for kind in ("loop", "force", "drive")
+            for i, entry in enumerate(getattr(self, kind))
         ]
         for where, entry in entries:
             for key, value in entry:
                 if isinstance(value, AnchorEntry):
                     yield f"{where}.{key}", value
 
-    def force_elements(self, folder: Path | None) -> tuple[ForceElement, ...]:
-        """The force elements; tables are read from ``folder``, None leaves out those that have one.
+    def force_elements(self, tables: CsvFolder | None) -> tuple[ForceElement, ...]:
+        """The force elements; without ``tables`` those that follow a law are left out.
 
         Raises
         ------
@@ -190,18 +88,16 @@ class Description(TopEntry):
         for i, entry in enumerate(self.force):
             with _labelled("force", i, entry.name) as label:
                 values = _with_anchors(label, entry)
-                law = values.get("law")
-                if law is not None:
-                    values["law"] = {key: getattr(law, key) for key in LAW_KEYS}
-                if folder is None and (values.get("law") or values.get("table")):
-                    continue
-                if isinstance(entry, TorqueEntry | WrenchEntry):
-                    values = with_law(values, folder or Path())
-                out.append(FORCE_TYPES[values.pop("type")](**values))
+                kind = values.pop("type")
+                if kind in CSV_KEYS:
+                    if tables is None and (values["law"] or values["table"]):
+                        continue
+                    values = _with_law(kind, values, tables or CsvFolder(Path()))
+                out.append(FORCE_TYPES[kind](**values))
         return tuple(out)
 
-    def drives(self, folder: Path) -> tuple[Drive, ...]:
-        """The drives; tables are read from ``folder``, unless their paths are absolute.
+    def drives(self, tables: CsvFolder) -> tuple[Drive, ...]:
+        """The drives.
 
         Raises
         ------
@@ -211,21 +107,9 @@ class Description(TopEntry):
         out = []
         for i, entry in enumerate(self.drive):
             with _labelled("drive", i, entry.name or entry.joint or "") as label:
-                anchors = {
-                    side: None if given is None else _anchor(label, side, given)
-                    for side, given in (("a", entry.a), ("b", entry.b))
-                }
-                out.append(
-                    Drive(
-                        law_from({key: getattr(entry, key) for key in LAW_KEYS}, folder),
-                        joint=entry.joint,
-                        axis=entry.axis,
-                        distance=entry.distance,
-                        absolute=entry.absolute,
-                        name=entry.name,
-                        **anchors,
-                    )
-                )
+                values = _with_anchors(label, entry)
+                law = law_from({key: values.pop(key) for key in LAW_KEYS}, tables)
+                out.append(Drive(law, **values))
         return tuple(out)
 
 
@@ -241,42 +125,120 @@ def _labelled(kind: str, index: int, name: str) -> Iterator[str]:
         raise
 
 
-def _anchor(label: str, side: str, given: AnchorEntry) -> Anchor:
-    try:
-        return Anchor(given.link, given.frame, _triple(given.xyz), _triple(given.rpy))
-    except InputError as error:
-        what = "" if error.element == "anchor" else f": {error.element}"
-        error.element = f"{label}, anchor {side}{what}"
-        raise
-
-
-def _with_anchors(label: str, entry: LoopEntry | ForceEntry) -> dict[str, Any]:
-    """The keys of an element, its anchors made."""
+def _with_anchors(label: str, entry: BaseModel) -> dict[str, Any]:
+    """The keys of an element, with :class:`Anchor` in place of the tables of anchors."""
     return {
         key: _anchor(label, key, value) if isinstance(value, AnchorEntry) else value
         for key, value in entry
     }
 
 
-def _triple(values: list[float]) -> tuple[float, float, float]:
-    x, y, z = values
-    return (x, y, z)
+def _anchor(label: str, side: str, entry: Any) -> Anchor:
+    try:
+        return Anchor(**dict(entry))
+    except InputError as error:
+        what = "" if error.element == "anchor" else f": {error.element}"
+        error.element = f"{label}, anchor {side}{what}"
+        raise
 
 
-PROBLEMS: dict[str, tuple[str | None, str]] = {
-    "string_type": ("a text is wanted", "Put it in quotes"),
-    "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
-    "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
-    "model_attributes_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
-    "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
-    "number": (None, "Give a finite number"),
-    "greater_than": (None, "Give a positive number"),
-    "too_short": (None, "Give the right number of values"),
-    "too_long": (None, "Give the right number of values"),
-    "literal_error": (None, "Choose one of those"),
-    "bool_type": ("true or false is wanted", "Write true or false without quotes"),
-}
-"""By pydantic's type of error: the problem (None: pydantic's own words) and the remedy."""
+# -- laws ------------------------------------------------------------------------------------
+
+
+def law_from(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
+    """The law of ``entry``, keys and their values, None for those that are not given.
+
+    Raises
+    ------
+    InputError
+        For an unknown type, a key that the type needs or does not take, or a malformed table.
+    """
+    kind = LAW_TYPES.get(entry["type"])
+    if kind is None:
+        raise InputError(
+            f"there is no law of type {entry['type']!r}",
+            remedy=f"Known: {', '.join(LAW_TYPES)}",
+        )
+    given = {key: value for key, value in entry.items() if key != "type" and value is not None}
+    keys = fields(kind)  # type: ignore[arg-type]
+    accepted = [*(key.name for key in keys), *(TABLE_KEYS if kind is Table else ())]
+    for key in given:
+        if key not in accepted:
+            raise InputError(
+                f"a law of type {kind.type!r} takes no {key}",
+                remedy=f"Known: {', '.join(accepted)}",
+            )
+    if kind is Table and "table" in given:
+        if "t" in given or "values" in given:
+            raise InputError(
+                "the values are given twice", remedy="Give table, or t and values, not both"
+            )
+        return _table_law(given["table"], given.get("time"), given.get("value"), tables)
+    _refuse_columns(given)
+    missing = [key.name for key in keys if key.default is MISSING and key.name not in given]
+    if missing:
+        raise InputError(
+            f"a law of type {kind.type!r} needs {' and '.join(missing)}",
+            remedy='Give them, or table = "file.csv"' if kind is Table else "Add it",
+        )
+    return kind(**given)
+
+
+def _table_law(file: str, time: str | None, value: str | None, tables: CsvFolder) -> Table:
+    columns = tables.table(file).columns((time or "t", value or "value"))
+    return Table(*columns.T.tolist())
+
+
+def _refuse_columns(given: Mapping[str, Any]) -> None:
+    """Refuse the names of columns where there is no table."""
+    for key in TABLE_KEYS[1:]:
+        if given.get(key) is not None:
+            raise InputError(
+                f"{key} names a column, but there is no table", remedy='Give table = "file.csv"'
+            )
+
+
+def _with_law(kind: str, values: Mapping[str, Any], tables: CsvFolder) -> dict[str, Any]:
+    """The keys of a torque or wrench with its law made, in place of those of its table.
+
+    Raises
+    ------
+    InputError
+        If law and table are both given, neither of them nor a torque, or a table is malformed.
+    """
+    out = {key: value for key, value in values.items() if key not in TABLE_KEYS}
+    table = values["table"]
+    if values["law"] is not None:
+        if any(values.get(key) is not None for key in TABLE_KEYS):
+            raise InputError("law and table are given", remedy="Give one of them")
+        out["law"] = law_from(dict(values["law"]), tables)
+    elif table is None:
+        _refuse_columns(values)
+        if kind == "torque" and values["torque"] is None:
+            raise InputError("there is no torque", remedy="Give torque, law or table")
+    elif kind == "torque":
+        out["law"] = _table_law(table, values["time"], values["value"], tables)
+    else:
+        out["law"] = _wrench_laws(table, values["time"], tables)
+    return out
+
+
+def _wrench_laws(file: str, time: str | None, tables: CsvFolder) -> tuple[Law, ...]:
+    """The six laws of a wrench from the columns that its table has."""
+    table = tables.table(file)
+    there = [name for name in COMPONENTS if name in table.names]
+    if not there:
+        raise InputError(
+            f"the table has none of the columns {', '.join(COMPONENTS)}",
+            file=table.file,
+            remedy="Name the columns of force and moment in the first line",
+        )
+    t, *columns = table.columns((time or "t", *there)).T.tolist()
+    laws = {name: Table(t, column) for name, column in zip(there, columns)}
+    return tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
+
+
+# -- text to tables --------------------------------------------------------------------------
 
 
 def parse_description(text: str, file: str) -> Description:
@@ -287,16 +249,37 @@ def parse_description(text: str, file: str) -> Description:
     InputError
         Naming the file, the key or line, and the remedy.
     """
+    return check_description(parse_toml(text, file), file)
+
+
+def parse_toml(text: str, file: str) -> dict[str, Any]:
+    """The tables of the TOML ``text`` of ``file``.
+
+    Raises
+    ------
+    InputError
+        If it is not valid TOML.
+    """
     try:
-        raw = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
         raise InputError(
             f"this is not valid TOML: {error}",
             file=file,
             remedy="Correct it there; text stands in quotes, lists in [ ]",
         ) from error
+
+
+def check_description(entries: Mapping[str, Any], file: str) -> Description:
+    """The tables of a description, as ``tomllib`` gives them, checked.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key and the remedy.
+    """
     try:
-        description = Description.model_validate(raw)
+        description = Description.model_validate(entries)
     except ValidationError as error:
         key, problem, remedy = _explain(error)
         if key == "format":
@@ -326,8 +309,49 @@ def parse_description(text: str, file: str) -> Description:
     return description
 
 
+# -- messages of pydantic in terms of the file -----------------------------------------------
+
+PROBLEMS: dict[str, tuple[str | None, str]] = {
+    "string_type": ("a text is wanted", "Put it in quotes"),
+    "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
+    "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "model_attributes_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
+    "number": (None, "Give a finite number"),
+    "greater_than": (None, "Give a positive number"),
+    "too_short": (None, "Give the right number of values"),
+    "too_long": (None, "Give the right number of values"),
+    "literal_error": (None, "Choose one of those"),
+    "bool_type": ("true or false is wanted", "Write true or false without quotes"),
+}
+"""By pydantic's type of error: the problem (None: pydantic's own words) and the remedy."""
+
+
+def _explain(error: ValidationError) -> tuple[str, str, str]:
+    """Key, problem and remedy of the first error."""
+    first = error.errors()[0]
+    location = _location(first)
+    key = _key_path(location)
+    if first["type"] == "extra_forbidden":
+        name = str(location[-1])
+        return key, f"unknown key {name!r}", f"Known: {_known_keys(first['loc'])}"
+    if first["type"] == "union_tag_not_found":
+        return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"
+    if first["type"] == "union_tag_invalid":
+        tag = first["input"]["type"]
+        known = f"Known: {', '.join(FORCE_TYPES)}"
+        return f"{key}.type", f"there is no force type {_shortened(tag)}", known
+    if first["type"] == "missing":
+        return key, "this key is missing", "Add it"
+    message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+    problem, remedy = PROBLEMS.get(first["type"], (None, "Correct the value"))
+    if location[0] == "initial" and first["type"] == "number":
+        remedy = "Give a finite number, or a list of them for a joint with several coordinates"
+    return key, f"{problem or message}, not {_shortened(first.get('input'))}", remedy
+
+
 def _location(error: Any) -> tuple[int | str, ...]:
-    """Where an error is, without the type of force that pydantic puts behind its number."""
+    """The location of an error, without the type of force that pydantic adds after its number."""
     location: tuple[int | str, ...] = error["loc"]
     if location[:1] == ("force",) and len(location) > 2 and location[2] in FORCE_TYPES:
         return (*location[:2], *location[3:])
@@ -345,7 +369,7 @@ def _key_path(location: tuple[int | str, ...]) -> str:
 
 
 def _known_keys(location: tuple[int | str, ...]) -> str:
-    """Keys of the table that holds ``location``, a location of pydantic's."""
+    """Keys of the table that holds ``location``, as pydantic gives it."""
     table: type[StrictEntry] = Description
     if location[0] == "force" and len(location) > 2:
         table = FORCE_ENTRIES[str(location[2])]
@@ -359,30 +383,8 @@ def _known_keys(location: tuple[int | str, ...]) -> str:
     return ", ".join(table.model_fields)
 
 
-def _explain(error: ValidationError) -> tuple[str, str, str]:
-    """Key, problem and remedy of the first thing that is wrong."""
-    first = error.errors()[0]
-    location = _location(first)
-    key = _key_path(location)
-    if first["type"] == "extra_forbidden":
-        name = str(location[-1])
-        return key, f"unknown key {name!r}", f"Known: {_known_keys(first['loc'])}"
-    if first["type"] == "union_tag_not_found":
-        return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"
-    if first["type"] == "union_tag_invalid":
-        tag = first["input"]["type"]
-        known = f"Known: {', '.join(FORCE_TYPES)}"
-        return f"{key}.type", f"there is no force type {_shown(tag)}", known
-    if first["type"] == "missing":
-        return key, "this key is missing", "Add it"
-    message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
-    problem, remedy = PROBLEMS.get(first["type"], (None, "Correct the value"))
-    if location[0] == "initial" and first["type"] == "number":
-        remedy = "Give a finite number, or a list of them for a joint with several coordinates"
-    return key, f"{problem or message}, not {_shown(first.get('input'))}", remedy
-
-
-def _shown(value: Any) -> str:
+def _shortened(value: Any) -> str:
+    """``repr`` of a value for messages, at most 60 characters of it."""
     try:
         text = repr(value)
     except ValueError:  # Python prints no integer of more than 4300 digits

@@ -1,25 +1,37 @@
-"""The tables of a mechanism description and the types of their values, checked with pydantic.
+"""The tables of a description, checked with pydantic.
 
-One class per table; what they make is in :mod:`srm_mbs.formats.toml.description`.
+The tables of closures, forces, drives and laws are derived from the fields of the classes in
+:mod:`srm_mbs.model`; no key of theirs is listed here.  The classes are dataclasses and not pydantic
+models because they are constructed in Python far more often than read from files: their
+constructors take positional arguments, raise :class:`~srm_mbs.errors.InputError` with a remedy, and
+cost no import of pydantic.  A description is stricter than a constructor: numbers are no strings
+and no booleans, tables have no unknown keys, and tables of numbers may come from CSV files.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, fields
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, StrictBool, StrictStr
+import pydantic
+from pydantic import BaseModel, ConfigDict, PlainValidator, StrictBool, StrictStr, create_model
 from pydantic_core import PydanticCustomError
 
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.drives import Drive
+from srm_mbs.model.forces import FORCE_TYPES
+from srm_mbs.model.laws import LAW_TYPES, Law
 from srm_mbs.model.mechanism import FRICTION_SPEED
-
-LARGEST = 1e30
-"""Numbers beyond this have lost their meaning, and their squares may overflow."""
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise PydanticCustomError("number", "a finite number is wanted")
-    if not abs(value) <= LARGEST:
+    if not abs(value) <= LARGEST_MAGNITUDE:
         raise PydanticCustomError("number", "a finite number of sensible size is wanted")
     return float(value)
 
@@ -31,9 +43,15 @@ def _joint_value(value: Any) -> float | list[float]:
 
 
 Number = Annotated[float, PlainValidator(_number)]
-Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
-SixNumbers = Annotated[list[Number], Field(min_length=6, max_length=6)]
+Positive = Annotated[Number, pydantic.Field(gt=0)]
 JointValue = Annotated[float | list[float], PlainValidator(_joint_value)]
+
+
+def _list_of(count: int) -> Any:
+    return Annotated[list[Number], pydantic.Field(min_length=count, max_length=count)]
+
+
+Vector = Annotated[list[Number], pydantic.Field(min_length=3, max_length=3)]
 Base = Literal["fixed", "floating", "planar"]
 
 
@@ -43,157 +61,114 @@ class StrictEntry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class AnchorEntry(StrictEntry):
-    """``{ link = "rod", xyz = [...], rpy = [...] }``, or with ``frame`` instead of ``link``."""
-
-    link: StrictStr | None = None
-    frame: StrictStr | None = None
-    xyz: Vector = [0.0, 0.0, 0.0]
-    rpy: Vector = [0.0, 0.0, 0.0]
+# -- tables derived from the classes of elements ---------------------------------------------
 
 
-class LoopEntry(StrictEntry):
-    """One ``[[loop]]``."""
+def _entry_type(hint: Any, count: int) -> Any:
+    """The type of a value in a description for a field of type ``hint``.
 
-    name: StrictStr = ""
-    type: StrictStr
-    a: AnchorEntry | None = None
-    b: AnchorEntry | None = None
-    axis: Vector | None = None
-    axis_a: Vector | None = None
-    axis_b: Vector | None = None
-    length: Number | None = None
-    joints: list[StrictStr] | None = None
-    ratio: Number | None = None
-    coefficients: list[Number] | None = None
-    offset: Number | None = None
-
-
-class ForceEntry(StrictEntry):
-    """What every ``[[force]]`` has; ``type`` tells which of the following it is."""
-
-    type: str
-    name: StrictStr = ""
-
-
-class SpringDamperEntry(ForceEntry):
-    """A ``[[force]]`` of type ``spring_damper``; the keys are those of the element."""
-
-    type: Literal["spring_damper"]
-    a: AnchorEntry
-    b: AnchorEntry
-    stiffness: Number = 0.0
-    damping: Number = 0.0
-    rest_length: Number | None = None
+    ``count`` is the length of a list whose type does not say it, or 0.
+    """
+    if hint is float:
+        return Number
+    if hint in (str, bool):
+        return StrictStr if hint is str else StrictBool
+    if hint is Anchor:
+        return AnchorEntry
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return hint
+    if origin in (Union, UnionType):
+        return _union_type(parts, count)
+    if origin is tuple and parts[-1] is not Ellipsis:
+        return _list_of(len(parts))
+    if origin in (tuple, Sequence):
+        return _list_of(count) if count else list[_entry_type(parts[0], 0)]  # type: ignore[misc]
+    raise TypeError(f"no table of a description can hold a {hint!r}")  # pragma: no cover
 
 
-class LawEntry(StrictEntry):
-    """A law over time; which keys it takes depends on its type."""
-
-    type: StrictStr
-    speed: Number | None = None
-    amplitude: Number | None = None
-    frequency_hz: Number | None = None
-    omega: Number | None = None
-    phase: Number | None = None
-    offset: Number | None = None
-    coefficients: list[Number] | None = None
-    target: Number | None = None
-    duration: Number | None = None
-    start: Number | None = None
-    t: list[Number] | None = None
-    values: list[Number] | None = None
-    table: StrictStr | None = None
-    time: StrictStr | None = None
-    value: StrictStr | None = None
+def _union_type(parts: tuple[Any, ...], count: int) -> Any:
+    optional = type(None) in parts
+    if Law in parts:
+        kind: Any = LawEntry
+    elif float in parts and len(parts) > 1 + optional:
+        kind = JointValue
+    else:  # of several classes, as of a closure type, descriptions know the first
+        kind = _entry_type(parts[0], count)
+    return kind | None if optional else kind
 
 
-class TorqueEntry(ForceEntry):
-    """A ``[[force]]`` of type ``torque``: a number, a law that multiplies it, or a table."""
-
-    type: Literal["torque"]
-    joint: StrictStr
-    torque: JointValue | None = None
-    law: LawEntry | None = None
-    table: StrictStr | None = None
-    time: StrictStr | None = None
-    value: StrictStr | None = None
+def _keys(kind: Any, without: Sequence[str] = ()) -> dict[str, Any]:
+    """Keys of the class ``kind`` with their types and defaults, as pydantic takes them."""
+    hints = get_type_hints(kind)
+    return {
+        key.name: (_entry_type(hints[key.name], key.metadata.get("count", 0)), _default(key))
+        for key in fields(kind)
+        if key.name not in without
+    }
 
 
-class TorsionSpringEntry(ForceEntry):
-    """A ``[[force]]`` of type ``torsion_spring``."""
-
-    type: Literal["torsion_spring"]
-    joint: StrictStr
-    stiffness: Number = 0.0
-    damping: Number = 0.0
-    rest_angle: Number = 0.0
+def _default(key: Field[Any]) -> Any:
+    if key.default is MISSING or key.metadata.get("needed"):
+        return ...
+    return list(key.default) if isinstance(key.default, tuple) else key.default
 
 
-class WrenchEntry(ForceEntry):
-    """A ``[[force]]`` of type ``wrench``."""
-
-    type: Literal["wrench"]
-    at: AnchorEntry
-    force: Vector = [0.0, 0.0, 0.0]
-    moment: Vector = [0.0, 0.0, 0.0]
-    frame: Literal["world", "link"] = "world"
-    law: LawEntry | None = None
-    table: StrictStr | None = None
-    time: StrictStr | None = None
+def _optional(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """The same keys, none of which is needed."""
+    return {name: (kind | None, None) for name, (kind, _) in keys.items()}
 
 
-class LimitSpringEntry(ForceEntry):
-    """A ``[[force]]`` of type ``limit_spring``."""
-
-    type: Literal["limit_spring"]
-    joint: StrictStr
-    stiffness: Number
-    damping: Number = 0.0
-    lower: Number | None = None
-    upper: Number | None = None
-    depth: Number | None = None
+def _entry(name: str, doc: str, keys: Mapping[str, Any]) -> type[StrictEntry]:
+    return create_model(name, __base__=StrictEntry, __doc__=doc, __module__=__name__, **keys)
 
 
-class BushingEntry(ForceEntry):
-    """A ``[[force]]`` of type ``bushing``."""
-
-    type: Literal["bushing"]
-    a: AnchorEntry
-    b: AnchorEntry
-    stiffness: SixNumbers = [0.0] * 6
-    damping: SixNumbers = [0.0] * 6
-
-
-AnyForceEntry = Annotated[
-    SpringDamperEntry
-    | TorqueEntry
-    | TorsionSpringEntry
-    | WrenchEntry
-    | BushingEntry
-    | LimitSpringEntry,
-    Field(discriminator="type"),
-]
-FORCE_ENTRIES: dict[str, type[ForceEntry]] = {
-    "spring_damper": SpringDamperEntry,
-    "torque": TorqueEntry,
-    "torsion_spring": TorsionSpringEntry,
-    "wrench": WrenchEntry,
-    "bushing": BushingEntry,
-    "limit_spring": LimitSpringEntry,
+AnchorEntry: Any = _entry(
+    "AnchorEntry",
+    '``{ link = "rod", xyz = [...], rpy = [...] }``, or with ``frame`` instead of ``link``.',
+    _keys(Anchor),
+)
+TABLE_KEYS = ("table", "time", "value")
+"""Keys of a table in a CSV file: its path, and the names of its columns, by default t and value."""
+_TABLE = dict.fromkeys(TABLE_KEYS, (StrictStr | None, None))
+_LAW = {
+    "type": (StrictStr, ...),
+    **{k: v for kind in LAW_TYPES.values() for k, v in _optional(_keys(kind)).items()},
+    **_TABLE,
 }
+LAW_KEYS = tuple(_LAW)
+"""All keys that laws have."""
+LawEntry: Any = _entry(
+    "LawEntry", "A law over time; which keys it takes depends on its type.", _LAW
+)
+_NAME = {"name": (StrictStr, "")}
+LoopEntry: Any = _entry("LoopEntry", "One ``[[loop]]``.", {**_NAME, **_keys(LoopClosure)})
+DriveEntry: Any = _entry(
+    "DriveEntry",
+    "One ``[[drive]]``: the motion that is prescribed, and the keys of its law.",
+    {**_LAW, **_NAME, **_keys(Drive, ("law", "name"))},
+)
+CSV_KEYS = {"torque": TABLE_KEYS, "wrench": TABLE_KEYS[:2]}
+"""Keys by which forces take their values over time from a CSV file."""
 
 
-class DriveEntry(LawEntry):
-    """One ``[[drive]]``: what moves, and the keys of its law."""
+def _force_entry(name: str, kind: Callable[..., Any]) -> Any:
+    type_ = {"type": (Literal[name], ...)}
+    table = {key: _TABLE[key] for key in CSV_KEYS.get(name, ())}
+    keys = {**type_, **_NAME, **_keys(kind, ("name",)), **table}
+    return _entry(f"{kind.__name__}Entry", f"A ``[[force]]`` of type ``{name}``.", keys)
 
-    name: StrictStr = ""
-    joint: StrictStr | None = None
-    a: AnchorEntry | None = None
-    b: AnchorEntry | None = None
-    axis: Vector | None = None
-    distance: StrictBool = False
-    absolute: StrictBool = False
+
+FORCE_ENTRIES: dict[str, Any] = {
+    name: _force_entry(name, kind) for name, kind in FORCE_TYPES.items()
+}
+"""The tables of forces by their type."""
+AnyForceEntry: Any = Annotated[
+    Union[tuple(FORCE_ENTRIES.values())],  # noqa: UP007 - the members are computed
+    pydantic.Field(discriminator="type"),
+]
+
+# -- the other tables ------------------------------------------------------------------------
 
 
 class InitialEntry(StrictEntry):
@@ -207,13 +182,13 @@ class InitialEntry(StrictEntry):
 class SimulationEntry(StrictEntry):
     """``[simulation]``: defaults of the command line."""
 
-    t_end: Annotated[Number, Field(gt=0)] | None = None
-    rtol: Annotated[Number, Field(gt=0)] | None = None
-    atol: Annotated[Number, Field(gt=0)] | None = None
+    t_end: Positive | None = None
+    rtol: Positive | None = None
+    atol: Positive | None = None
 
 
 class TopEntry(StrictEntry):
-    """The top of a description, and with it all that it holds."""
+    """A whole description."""
 
     format: Literal[1]
     name: StrictStr = ""
@@ -225,7 +200,7 @@ class TopEntry(StrictEntry):
     gravity: Vector = [0.0, 0.0, -9.81]
     lock: list[StrictStr] = []
     limits: Literal["reported", "spring"] = "reported"
-    friction_speed: Annotated[Number, Field(gt=0)] = FRICTION_SPEED
+    friction_speed: Positive = FRICTION_SPEED
     loop: list[LoopEntry] = []
     force: list[AnyForceEntry] = []
     drive: list[DriveEntry] = []

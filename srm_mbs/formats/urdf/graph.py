@@ -1,4 +1,4 @@
-"""Links and joints of a URDF as a graph: which joint moves which link, and where at q = 0."""
+"""Links and joints of a URDF as a graph, with the placements of the links at q = 0."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pinocchio as pin
 
 from srm_mbs.errors import InputError
 from srm_mbs.formats.graph.spanning_tree_to_urdf import placement
+from srm_mbs.formats.xml import parse_numbers
 
 ONE_DEGREE = ("revolute", "continuous", "prismatic", "screw")
 
@@ -19,7 +20,7 @@ def link_of(joint: Element, side: str) -> str:
 
 
 class Graph:
-    """The joints of a URDF; names that are missing or wrong are left to the check of the tree.
+    """The joints of a URDF; the check of the tree refuses missing and wrong names later.
 
     Attributes
     ----------
@@ -97,15 +98,10 @@ class Graph:
 
 
 def joint_placement(joint: Element) -> pin.SE3:
-    """Placement of the joint in its parent link; the identity where its numbers are none."""
+    """Placement of the joint in its parent link; zero where the file has no three numbers."""
     origin = joint.find("origin")
-    values = {}
+    values = []
     for key in ("xyz", "rpy"):
-        try:
-            values[key] = [
-                float(x) for x in (origin.get(key, "") if origin is not None else "").split()
-            ]
-        except ValueError:
-            values[key] = []
-    xyz, rpy = (values[key] if len(values[key]) == 3 else [0.0] * 3 for key in ("xyz", "rpy"))
-    return placement(xyz, rpy)
+        given = None if origin is None else parse_numbers(origin.get(key, ""))
+        values.append(given if given is not None and len(given) == 3 else [0.0] * 3)
+    return placement(*values)

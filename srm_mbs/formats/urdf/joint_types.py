@@ -1,12 +1,12 @@
-"""Joint types that URDF has no word for: spherical, universal and screw.
+"""Joint types that URDF does not have: spherical, universal and screw.
 
-Pinocchio's URDF reader knows none of them.  It is given floating joints in their place, and the
-model that it makes is built again, joint by joint, with the right joint models.
+Pinocchio's URDF reader gets floating joints in their place; the model that it returns is then
+rebuilt, joint by joint, with the right joint models.
 
 * ``spherical``: a ball; configuration a quaternion xyzw, velocity the angular velocity in the
   child's frame.
 * ``universal``: ``<axis>`` is fixed in the parent, ``<axis2>`` in the child; the child is turned by
-  the first angle about ``<axis>``, then by the second about the ``<axis2>`` that turned with it.
+  the first angle about ``<axis>``, then by the second about the rotated ``<axis2>``.
 * ``screw``: an angle about ``<axis>``, and along it ``<thread_pitch value>`` metres for each turn.
 """
 
@@ -101,7 +101,7 @@ def take_extended(root: Element) -> dict[str, JointData]:
 
 
 def with_joints(model: pin.Model, joints: Mapping[str, JointData]) -> pin.Model:
-    """``model`` with its joints of these names replaced; everything else is carried over."""
+    """``model`` with its joints of these names replaced; everything else is copied."""
     if not joints:
         return model
     out = pin.Model()

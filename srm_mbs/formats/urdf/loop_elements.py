@@ -1,17 +1,17 @@
-"""Loops that other tools write into a URDF, each in its own words.
+"""Loop elements that other tools write into a URDF.
 
 * URDF+ (M. Chignoli et al., arXiv 2411.19753): ``<loop>``, ``<coupling>``;
 * Isaac Sim: ``<loop_joint>``;
 * the proposal for urdfdom (ros/urdfdom, pull request 264): ``<constraint>``;
 * Drake: ``<drake:ball_constraint>``, ``<drake:linear_spring_damper>``.
 
-In every one a frame is placed on each of two links, by ``xyz`` and ``rpy`` as in an ``<origin>``.
+In each of them a frame is placed on each of two links, by ``xyz`` and ``rpy`` as in an
+``<origin>``.
 
-``<gazebo><joint>``: joints of SDF that a URDF carries for Gazebo, which close loops.
-
-Gazebo inserts the element into the SDF that it makes of the URDF.  There a joint's frame lies on
-the child, displaced by ``<pose>``; on the parent it is where it stands at q = 0.  Axes are in the
-joint's frame, or with ``<use_parent_model_frame>`` in the root link's.
+* Gazebo: ``<gazebo><joint>``, a joint of SDF that Gazebo inserts into the SDF that it makes of the
+  URDF.  Its frame is given on the child, displaced by ``<pose>``; on the parent it is placed so
+  that both coincide at q = 0.  Axes are in the joint's frame, or with
+  ``<use_parent_model_frame>`` in the root link's.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def local_name(node: Element) -> str:
 
 
 class LoopElements(ElementChecker):
-    """Reads the elements of one URDF; what they say gathers in :attr:`loops` and :attr:`forces`."""
+    """Reads the loop elements of one URDF into :attr:`loops` and :attr:`forces`."""
 
     def __init__(self, file: str, graph: Graph) -> None:
         super().__init__(file)
@@ -81,7 +81,7 @@ class LoopElements(ElementChecker):
             found = True
         return found
 
-    # -- what every one of them needs ---------------------------------------------------------
+    # -- parts of the elements ------------------------------------------------------------------
 
     def parts(
         self,
@@ -157,7 +157,7 @@ class LoopElements(ElementChecker):
         return self.numbers(node, key, 3, where)
 
     def origin_of(self, node: Element | None, where: str) -> pin.SE3:
-        """The placement that ``xyz`` and ``rpy`` of ``node`` say; the identity if it is None."""
+        """The placement by ``xyz`` and ``rpy`` of ``node``; the identity if it is None."""
         return placement(self.vector(node, "xyz", where), self.vector(node, "rpy", where))
 
     def kind(self, node: Element, where: str) -> str:
@@ -212,7 +212,7 @@ class LoopElements(ElementChecker):
     # -- one reader each ----------------------------------------------------------------------
 
     def _loop(self, node: Element, where: str) -> None:
-        """URDF+: the frames coincide as those of a joint, the axis has the same components."""
+        """URDF+: a joint between the two frames; its axis has the same components in both."""
         self.only(node, where, ("name", "type"))
         parts = self.parts(
             node,
@@ -254,7 +254,7 @@ class LoopElements(ElementChecker):
         self.loops.append(coupling(node.get("name", ""), second, first, ratio))
 
     def _loop_joint(self, node: Element, where: str) -> None:
-        """Isaac: link1 is the parent; some files call both of them link1."""
+        """Isaac Sim: link1 is the parent; in some files both links are called link1."""
         self.only(node, where, ("name", "type"))
         ends, axes = [], []
         for child in node:
@@ -371,11 +371,11 @@ def coupling(
 
 
 NOT_ACTING = ("physics", "sensor")
-"""Elements inside such a joint that belong to Gazebo's own solver."""
+"""Elements inside a Gazebo joint that belong to Gazebo's own solver."""
 
 
-def read(root: Element, elements: LoopElements) -> bool:
-    """Read and remove the joints of ``root``; whether there were any.
+def read_gazebo_joints(root: Element, elements: LoopElements) -> bool:
+    """Read and remove the joints of Gazebo in ``root``; whether there were any.
 
     Raises
     ------
@@ -461,7 +461,7 @@ def _pose(node: Element | None, child: str, where: str, elements: LoopElements) 
 
 
 def _damping(node: Element | None, tag: str, where: str, elements: LoopElements) -> float:
-    """Damping about <axis>; what else acts there is refused."""
+    """Damping about <axis>; friction and springs there are refused."""
     values = {}
     for key in ("damping", "friction", "spring_stiffness"):
         given = None if node is None else node.find(f"dynamics/{key}")

@@ -1,37 +1,32 @@
-"""Loops inside a URDF: taken out of it and written as closures of a description.
+"""Loops inside a URDF: removed from its tree and written as closures of a description.
 
-* the loop elements of other tools (:mod:`srm_mbs.formats.urdf.loop_elements`,
-  :mod:`srm_mbs.formats.urdf.loop_elements`);
+* the loop elements of other tools (:mod:`srm_mbs.formats.urdf.loop_elements`);
 * a child link with two parents: the second joint becomes a closure of its freedom, closed at the
   joint's zero;
 * ``<mimic>``: a coupling q = multiplier q_other + offset;
-* pairs of frames of onshape-to-robot (:mod:`srm_mbs.formats.urdf.loops`).
+* pairs of frames ``closing_<name>_1`` and ``closing_<name>_2`` of onshape-to-robot.
 
-A URDF without any of them is left as it is.
+A URDF without any of them remains as it is.
 
-Loops of onshape-to-robot: pairs of frames ``closing_<name>_1`` and ``closing_<name>_2``.
-
-The exporter writes a mate whose name begins with ``closing_`` as two frames, which in its URDFs are
-links on fixed joints.  A revolute mate gets two more frames, 0.1 m along its axis:
-``closing_<name>_1_z`` and ``closing_<name>_2_z``.  Of the other mates (ball, fastened, slider) the
-URDF does not say the type: the origins are joined, with a note.
+onshape-to-robot writes a mate whose name begins with ``closing_`` as two frames, which in its URDFs
+are links on fixed joints.  A revolute mate gets two more frames, 0.1 m along its axis:
+``closing_<name>_1_z`` and ``closing_<name>_2_z``.  For the other mates (ball, fastened, slider) the
+URDF does not contain the type: the origins are joined, with a note.
 """
 
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.translation import Options, Translation
-from srm_mbs.formats.urdf import loop_elements
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
-from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
-from srm_mbs.formats.xml import parse_urdf
+from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling, read_gazebo_joints
 
 CLOSING = re.compile(r"(closing_.+)_1\Z")
 
@@ -81,21 +76,21 @@ def closing_frames(
     return loops, notes
 
 
-def translate(text: str, file: str, options: Options) -> Translation:
-    """The URDF ``text`` without its loops, and these as entries of a description.
+def translate(document: Document, options: Options) -> Translation:
+    """A URDF without its loops, and these as entries of a description.
 
     Raises
     ------
     InputError
         Naming the element that cannot be read.
     """
-    root = parse_urdf(text, file)
-    elements = LoopElements(file, Graph(root))
+    root = document.xml
+    elements = LoopElements(document.file, Graph(root))
     notes: list[str] = []
     found = _cut_second_parents(root, elements, options, notes)
     elements.graph = graph = Graph(root)
     found |= elements.read(root)
-    found |= loop_elements.read(root, elements)
+    found |= read_gazebo_joints(root, elements)
     found |= _mimics(elements, options, notes)
     loops, remarks = closing_frames(graph.links, options.own)
     elements.loops.extend(loops)
@@ -106,11 +101,9 @@ def translate(text: str, file: str, options: Options) -> Translation:
     if elements.forces:
         entries["force"] = _named(elements.forces, options.own.get("force", ()))
     if found:
-        # Otherwise the check of the tree counts the same again.
+        elements.named(root, "joint")
         notes += elements.ignored_notes()
-        ET.indent(root)
-        text = ET.tostring(root, encoding="unicode") + "\n"
-    return Translation(text, entries, tuple(notes))
+    return Translation(root, "" if found else document.text, entries, tuple(notes))
 
 
 def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
@@ -137,10 +130,10 @@ def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
 def _cut_second_parents(
     root: Element, reader: LoopElements, options: Options, notes: list[str]
 ) -> bool:
-    """Take the joints out that close loops, their closures into ``reader``; whether there were
+    """Remove the joints that close loops and add their closures to ``reader``; whether there were
     any."""
     by_child: dict[str, list[Element]] = {}
-    for joint in reader.named(root, "joint").values():
+    for joint in reader.named(root, "joint", count=False).values():
         child = link_of(joint, "child")
         if child and link_of(joint, "parent"):
             by_child.setdefault(child, []).append(joint)

@@ -1,8 +1,7 @@
-"""URDF to Pinocchio: the checked tree on its base, and joints that are locked.
+"""From a URDF to a Pinocchio model: the checked tree on its base, and locked joints.
 
-Pinocchio gets a copy of the file that holds nothing but what
-:class:`~srm_mbs.formats.urdf.validation.UrdfChecker` has checked; what is dropped knowingly is
-listed in the notes.
+Pinocchio gets a URDF that contains only what
+:class:`~srm_mbs.formats.urdf.validation.UrdfChecker` has checked; the notes list what was removed.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import pinocchio as pin
 from srm_mbs.errors import InputError
 from srm_mbs.formats.urdf.joint_types import take_extended, with_joints
 from srm_mbs.formats.urdf.validation import UrdfChecker
-from srm_mbs.formats.xml import parse_urdf
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +31,7 @@ class UrdfModel:
     model
         Pinocchio's model, with joint damping from the file.
     notes
-        Sentences about what the file holds and this version does not use.
+        Sentences about the contents of the file that are ignored.
     """
 
     model: pin.Model
@@ -48,20 +46,21 @@ ROOT_JOINTS: dict[str, Callable[[], Any] | None] = {
 
 
 def build_urdf(
-    text: str,
+    root: Element,
     file: str,
     base: str,
     locked: Sequence[str] = (),
     counting_turns: Collection[str] = (),
 ) -> UrdfModel:
-    """Check ``text`` and build its tree on a fixed, floating or planar base.
+    """Check a URDF and build its tree on a fixed, floating or planar base.
 
     Inertias are checked by :func:`~srm_mbs.model.validation.check_inertia`, after locking.
 
     Parameters
     ----------
-    text, file
-        The URDF and its name for messages.
+    root, file
+        Root element of the URDF, which is reduced to what Pinocchio is to read, and the name of the
+        file for messages.
     base
         ``fixed``, ``floating`` (root joint ``root_joint``, a free flyer) or ``planar`` (motion in
         the x-y plane of the world).
@@ -77,7 +76,6 @@ def build_urdf(
         Naming the file, the element and the remedy.
     """
     checker = UrdfChecker(file)
-    root = parse_urdf(text, file)
     checker.check(root, base, locked)
     unlimited = _without_limits(root, set(counting_turns) - set(locked))
     armature = _armature(root)
@@ -111,7 +109,7 @@ def build_urdf(
 
 
 def _armature(root: Element) -> dict[str, float]:
-    """Inertias of motors by joint: an attribute of <dynamics> that URDF does not have."""
+    """Inertias of motors by joint, from ``armature`` of <dynamics>, which URDF does not have."""
     found = {}
     for joint in root.findall("joint"):
         dynamics = joint.find("dynamics")
@@ -147,8 +145,8 @@ def _without_limits(root: Element, names: Collection[str]) -> dict[str, bool]:
 def lock_joints(model: pin.Model, names: list[str], q: Any) -> pin.Model:
     """``model`` without the joints ``names``, frozen at the configuration ``q`` (nq,).
 
-    Pinocchio finds joints by frame name there, and URDF models give links and joints the same
-    names; link frames are renamed while it works.
+    ``pin.buildReducedModel`` finds joints by the names of frames, and in URDF models links and
+    joints may have the same names; link frames are renamed meanwhile.
     """
     working = model.copy()
     mark = "\0link"

@@ -1,15 +1,9 @@
-"""What a URDF says, checked before Pinocchio reads it.
+"""Check of a URDF before Pinocchio reads it.
 
-Pinocchio's parser drops what it does not know without a word: unknown elements, a second joint
-with the same child, a whole <inertial> whose numbers are separated by a newline.
-Everything that would change the mechanism is therefore checked on the XML, and what is left of it
-holds nothing but what was checked, with the numbers written afresh.
-
-Elements and attributes of URDF: what is read, what is ignored knowingly, what is refused.
-
-Elements, attributes and numbers of a URDF: the unknown is refused, the ignored is counted.
-
-The joints of a URDF, one by one: type, axes, limits, damping and friction.
+Pinocchio's parser drops unknown content without a message: unknown elements, a second joint with
+the same child, a whole <inertial> whose numbers are separated by a newline.  Everything that would
+change the mechanism is therefore checked on the XML.  Unknown elements and attributes are refused,
+ignored ones are counted and removed; what remains has its numbers written afresh.
 """
 
 from __future__ import annotations
@@ -22,11 +16,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from srm_mbs.errors import InputError, SrmWarning
-from srm_mbs.formats.toml.schema import LARGEST
+from srm_mbs.errors import SrmWarning
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import NUMBER
+from srm_mbs.formats.xml import XmlFile
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
 IGNORED = {
@@ -81,45 +75,30 @@ INFORMATIVE = {
 }
 """Attributes of other tools found in published files: ignored, with a note."""
 DRAWN_ONLY = ("material", "visual", "collision")
-"""Elements whose loss needs no note: they do not act."""
+"""Elements that are removed without a note: they do not act."""
 
 
-class ElementChecker:
-    """What every check of elements and attributes needs; faults are :class:`InputError`."""
+class ElementChecker(XmlFile):
+    """Checks of elements and attributes of a URDF; faults are :class:`InputError`."""
 
     def __init__(self, file: str) -> None:
-        self.file = file
+        super().__init__(file)
         self.notes: list[str] = []
-        self.ignored: dict[str, int] = {}
-
-    def fault(self, element: str, problem: str, remedy: str) -> InputError:
-        return InputError(problem, file=self.file, element=element, remedy=remedy)
 
     def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
         """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
-        text = node.get(key)
-        parts = (text or "").split()
-        values = [float(part) for part in parts] if all(map(NUMBER.fullmatch, parts)) else []
         # Limits do not act, and exporters write the largest double there.
-        largest = sys.float_info.max if node.tag == "limit" else LARGEST
-        if len(values) != count or not all(abs(value) <= largest for value in values):
-            tag = node.tag.rsplit("}", 1)[-1]
-            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
-            raise self.fault(
-                where,
-                f"<{tag}> has no {key!r}"
-                if text is None
-                else f"<{tag} {key}={text!r}> is not {wanted}",
-                f"Write {wanted}",
-            )
-        node.set(key, " ".join(map(repr, values)))
-        return values
+        largest = sys.float_info.max if node.tag == "limit" else LARGEST_MAGNITUDE
+        return self.attribute_numbers(node, key, count, where, largest)
 
-    def attributes(self, node: Element, where: str) -> None:
+    def attributes(self, node: Element, where: str, count: bool = True) -> None:
+        """Refuse unknown attributes; count and remove those that are ignored, or leave them."""
         known = ATTRIBUTES.get(node.tag)
         ignored = INFORMATIVE.get(node.tag, ())
         for key in list(node.attrib):
             if key in ignored:
+                if not count:
+                    continue
                 self.ignore(f"<{node.tag} {key}> attribute")
                 del node.attrib[key]
             elif known is not None and key not in known:
@@ -128,15 +107,6 @@ class ElementChecker:
                     f"<{node.tag}> has an unknown attribute {key!r}",
                     f"Known: {', '.join(known)}",
                 )
-
-    def ignore(self, what: str) -> None:
-        self.ignored[what] = self.ignored.get(what, 0) + 1
-
-    def ignored_notes(self) -> tuple[str, ...]:
-        """What was ignored, one sentence for each kind."""
-        return tuple(
-            f"{count} {what}(s) do not act and are ignored" for what, count in self.ignored.items()
-        )
 
     def children(self, node: Element, where: str) -> None:
         """Refuse unknown elements of ``node``; count and remove those that are ignored."""
@@ -202,10 +172,11 @@ class ElementChecker:
                     "Put <mass> and <inertia> into the <inertial> of the link",
                 )
 
-    def named(self, root: Element, tag: str) -> dict[str, Element]:
+    def named(self, root: Element, tag: str, count: bool = True) -> dict[str, Element]:
+        """The elements of that tag by name; ``count`` as for :meth:`attributes`."""
         found: dict[str, Element] = {}
         for node in root.findall(tag):
-            self.attributes(node, f"<{tag}>")
+            self.attributes(node, f"<{tag}>", count)
             name = node.get("name")
             if not name:
                 raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')
@@ -233,8 +204,8 @@ UNIVERSE = "universe"
 """Pinocchio's name for the ground."""
 ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
-PARALLEL = 1e-6
-"""Axes of a universal joint at a smaller angle (rad) are parallel."""
+PARALLEL_AXES_TOLERANCE = 1e-6
+"""Axes of a universal joint at an angle (rad) below this are parallel."""
 
 
 class JointChecker(ElementChecker):
@@ -309,7 +280,7 @@ class JointChecker(ElementChecker):
             axis = joint.find("axis")
             first = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
             second = self.direction(node, where)
-            if np.linalg.norm(np.cross(first, second)) < PARALLEL:
+            if np.linalg.norm(np.cross(first, second)) < PARALLEL_AXES_TOLERANCE:
                 raise self.fault(
                     where, "<axis> and <axis2> are parallel", "Give them different directions"
                 )
@@ -366,17 +337,18 @@ class JointChecker(ElementChecker):
             joint.remove(dynamics)
 
 
-DEEPEST = 1000
-"""Most links between the root and a leaf: Pinocchio's recursive parser overflows the stack."""
-POINT_LIKE = 1e-18
-"""m^2: a radius of gyration below a nanometre is the rounding of zero."""
+LARGEST_TREE_DEPTH = 1000
+"""Largest number of links between the root and a leaf: Pinocchio's recursive parser overflows the
+stack in deeper trees."""
+POINT_MASS_GYRATION_SQUARED = 1e-18
+"""Square of the radius of gyration (m^2) below which it is rounding: a nanometre."""
 
 
 class UrdfChecker(JointChecker):
     """Walks a URDF once; raises :class:`InputError` at the first fault."""
 
     def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
-        """The whole file; leaves in ``root`` what Pinocchio is to read."""
+        """Check the whole file; ``root`` keeps what Pinocchio is to read."""
         self.root(root)
         for block in root.findall("gazebo"):
             for joint in block.iter("joint"):
@@ -448,7 +420,7 @@ class UrdfChecker(JointChecker):
             self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
         )
         principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_LIKE * value
+        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
         if principal[0] < -rounding:
             raise self.fault(
                 where,
@@ -506,10 +478,10 @@ class UrdfChecker(JointChecker):
             children.setdefault(parent, []).append(child)
         level, depth, loose = roots, 0, set(links)
         while level:
-            if depth > DEEPEST:
+            if depth > LARGEST_TREE_DEPTH:
                 raise self.fault(
                     f"link {level[0]!r}",
-                    f"more than {DEEPEST} joints lie between it and the root link",
+                    f"more than {LARGEST_TREE_DEPTH} joints lie between it and the root link",
                     "Split the chain: Pinocchio cannot read such a deep one",
                 )
             loose -= set(level)

@@ -1,20 +1,19 @@
-r"""Steps placed so that no stage lands on a singular configuration.
+r"""Steps placed so that no stage lies on a singular configuration.
 
-A wrapper of step-size control (docs/notation.md, "Singular configurations"):
+:class:`SingularityPlacement` wraps step-size control (docs/notation.md, "Singular configurations"):
 
 * a priori, when sigma falls, its zero is predicted by a parabola through the stages of the last
   step, and the step is shortened so that the zero lies well inside a gap between the abscissae of
-  the tableau, or well behind the end;
+  the tableau, or well after the end;
 * sigma changes by at most 0.5 per step;
 * a posteriori, when a stage came too close, the zero is located from the stages of the step and
   the step is redone, at most three times;
-* where the run, or its piece, ends beside a singular configuration, steps are not placed: the
-  multipliers up to the end are found first (:mod:`srm_mbs.integration.singular_endpoints`).
+* where the run, or its smooth interval, ends beside a singular configuration, steps are not placed:
+  the multipliers up to the end are found first (:mod:`srm_mbs.integration.singular_endpoints`).
 
-Zeros of sigma, from its values at the stages of a step.
-
-sigma is the modulus of a smooth quantity: at a passage it has a kink.  With the sign turned behind
-it, the values follow a polynomial of low degree.
+sigma is the modulus of a smooth quantity: at a passage it has a kink.  With the sign changed after
+its zero, the values at the stages of a step follow a polynomial of low degree, from which the zero
+is found.
 """
 
 from __future__ import annotations
@@ -26,12 +25,32 @@ from enum import IntEnum
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.integration.control.step_size import Grid, Proposal, StepDecision, StepSizeControl
+from srm_mbs.integration.control.step_size import (
+    ControlWrapper,
+    Grid,
+    Proposal,
+    StepDecision,
+    StepSizeControl,
+)
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
-AHEAD = 3.0
-"""Zeros are looked for within this many steps."""
+PREDICTION_STEPS = 3.0
+"""Steps within which zeros of sigma are predicted."""
+SIGMA_CHANGE = 0.5
+"""Largest change of sigma in one step, by the slope of the last steps."""
+TOO_CLOSE = 0.05
+"""A stage is too close if sigma < TOO_CLOSE * slope * h, and nearer to zero than the start."""
+CLEARANCE = 0.6
+"""Distance of the zero from the abscissae that is large enough, over half the widest gap."""
+MAX_REDONE = 3
+"""Times that one step is redone because a stage came too close."""
+SINGULAR_END_SIGMA = 5e-3
+"""A run, or its smooth interval, ends beside a singular configuration if sigma is smaller there:
+rounding in direct solves at smaller sigma exceeds the tightest tolerances."""
+ARRIVAL_SIGMA_CHANGE = 0.2
+"""Change of sigma up to such an end from where it is prepared for, unless one step reaches
+further."""
 
 
 def misfit(basis: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
@@ -87,7 +106,7 @@ def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
 
 def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
     """Where sigma will vanish, in steps from the start of the last one (> 1); None if it does not
-    fall, or not within ``AHEAD`` steps.
+    fall, or not within ``PREDICTION_STEPS`` steps.
 
     A parabola through the start, the stage ``k`` with the abscissa ``c``, and the end; a line if
     that has no zero ahead.
@@ -106,35 +125,21 @@ def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
         if root >= 0.0 and a < 0.0:
             zero = 2.0 * start / (-a + np.sqrt(root))
         elif a + 2.0 * b >= 0.0 or root < 0.0:
-            return None if line > AHEAD else line
+            return None if line > PREDICTION_STEPS else line
     return (
         float(zero)
-        if 1.0 < zero < AHEAD
-        else (line if 1.0 < line < AHEAD and zero <= 1.0 else None)
+        if 1.0 < zero < PREDICTION_STEPS
+        else (line if 1.0 < line < PREDICTION_STEPS and zero <= 1.0 else None)
     )
 
 
-SIGMA_CHANGE = 0.5
-"""Largest change of sigma in one step, by the slope of the last steps."""
-TOO_CLOSE = 0.05
-"""A stage is too close if sigma < TOO_CLOSE * slope * h, and nearer to zero than the start."""
-CLEARANCE = 0.6
-"""Distance of the zero from the abscissae that is good enough, over half the widest gap."""
-MAX_REDONE = 3
-BESIDE = 5e-3
-"""A run, or its piece, ends beside a singular configuration if sigma is smaller there: rounding in
-direct solves nearer than that exceeds the tightest tolerances."""
-ARRIVAL = 0.2
-"""Change of sigma from where such an end is prepared for, unless one step reaches further."""
-
-
 class Arrival(IntEnum):
-    """What is known of the end of the run, or its piece."""
+    """Whether the run, or its smooth interval, ends beside a singular configuration."""
 
     NONE = 0
-    """It is no matter, or prepared for."""
+    """It does not matter, or has been prepared for."""
     WATCHED = 1
-    """It may lie beside a singular configuration."""
+    """It may."""
     DUE = 2
     """It does: a step that reached it was redone."""
 
@@ -168,7 +173,7 @@ class Gaps:
     def longest_step(self, distance: float, h: float) -> float:
         """The longest step up to ``h`` (s) for a zero of sigma at ``distance`` (s) ahead.
 
-        The zero comes to lie in a wide gap between the abscissae, or so far behind the end that
+        The zero comes to lie in a wide gap between the abscissae, or so far after the end that
         an equal step would put it there.
         """
         position = distance / h
@@ -190,22 +195,19 @@ class Gaps:
         return distance / self._wide[-1][1]
 
 
-class SingularityPlacement:
+class SingularityPlacement(ControlWrapper):
     """Wraps ``inner`` step-size control around singular configurations.
 
     Parameters
     ----------
     inner, scheme
-        What is wrapped; the tableau of the run.
+        The control that is wrapped; the tableau of the run.
     t_end
         End of the run (s).
     arrivals
         Whether the driver prepares for ends beside singular configurations.
 
-    Attributes
-    ----------
-    placed, replaced
-        How many steps were changed a priori, and redone a posteriori.
+    ``placed`` counts the steps changed a priori, ``replaced`` those redone a posteriori.
     """
 
     def __init__(
@@ -215,7 +217,7 @@ class SingularityPlacement:
         t_end: float = np.inf,
         arrivals: bool = False,
     ) -> None:
-        self._inner = inner
+        super().__init__(inner)
         self._t_end = t_end
         self._gaps = Gaps(scheme)
         self._abscissae = [*scheme.c.tolist(), 1.0]
@@ -223,9 +225,6 @@ class SingularityPlacement:
         self._later_stages = [j for j, c in enumerate(self._abscissae) if c > 0.0]
         self._inner_stages = [j for j in self._later_stages if self._abscissae[j] < 1.0]
         self._middle = scheme.middle
-        self.adaptive = inner.adaptive
-        self.placed = 0
-        self.replaced = 0
         self._slope = 0.0
         self._zero: float | None = None
         self._redo: float | None = None
@@ -246,7 +245,7 @@ class SingularityPlacement:
         proposal = self._inner.propose(t, limit, memory)
         if self._arrives(t, proposal):
             self._arrival = Arrival.NONE
-            return replace(proposal, arriving=True)
+            return replace(proposal, singular_arrival=True)
         # Where the multipliers are known, stages may lie anywhere.
         self._known = memory.history is not None and memory.history.known_until >= self._t_end
         if self._known:
@@ -270,13 +269,15 @@ class SingularityPlacement:
             return self._arrival is Arrival.DUE
         if self._zero is None or not self._zero > t:
             return False
-        if not abs(self._zero - self._t_end) * self._slope < BESIDE:
+        if not abs(self._zero - self._t_end) * self._slope < SINGULAR_END_SIGMA:
             return False
-        return proposal.t_new >= self._t_end or (self._t_end - t) * self._slope <= ARRIVAL
+        return (
+            proposal.t_new >= self._t_end or (self._t_end - t) * self._slope <= ARRIVAL_SIGMA_CHANGE
+        )
 
     def _placed(self, distance: float, h: float, t: float) -> float:
         if t + h >= self._t_end and self._gaps.ends_on(distance, h):
-            return h  # the run, or its piece, ends there
+            return h  # the run, or its smooth interval, ends there
         if self.adaptive:
             return self._gaps.longest_step(distance, h)
         # A fixed step may cross its grid point where that is singular: it could only creep up.
@@ -288,7 +289,7 @@ class SingularityPlacement:
     def _better_step(self, h: float, sigmas: FloatArray, slope: float, last: bool) -> float | None:
         """A better step length if a stage or the end came too close, else None.
 
-        ``last``: the run, or its piece, ends with this step, wherever that is.
+        ``last``: the run, or its smooth interval, ends with this step, wherever that is.
         """
         values: list[float] = sigmas.tolist()
         reach = TOO_CLOSE * max(self._slope, slope) * h
@@ -303,17 +304,17 @@ class SingularityPlacement:
         return self._gaps.longest_step(zero * h, 0.98 * h)
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
-        """Redo a badly placed step; otherwise the inner control's verdict."""
+        """Redo a badly placed step; otherwise the inner decision."""
         slope = 0.0
         if result is None:
             pass
-        elif result.quiet:  # no zero is near: only the slope goes on
+        elif result.quiet:  # no zero is near: only the slope is kept
             slope = result.slope
         else:
             h = proposal.h
             slope = sigma_slope(self._inverse, result.sigmas, h)
             last = proposal.t_new >= self._t_end
-            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < BESIDE:
+            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < SINGULAR_END_SIGMA:
                 self._arrival, self._redo = Arrival.DUE, h
                 self.replaced += 1
                 return StepDecision.REPLACED
@@ -324,14 +325,39 @@ class SingularityPlacement:
                     self._redone += 1
                     self.replaced += 1
                     return StepDecision.REPLACED
-        verdict = self._inner.decide(proposal, result)
+        decision = self._inner.decide(proposal, result)
         self._redo = None
         self._redone = 0
-        if verdict is StepDecision.ACCEPTED and result is not None:
+        if decision is StepDecision.ACCEPTED and result is not None:
             slowest = 0.5 * self._slope
             self._slope = slope if slope > slowest else slowest
             self._zero = None
             if not result.quiet:
                 ahead = zero_ahead(*self._middle, result.sigmas)
                 self._zero = None if ahead is None else result.t + proposal.h * ahead
-        return verdict
+        return decision
+
+
+class SlopeOfSigma(ControlWrapper):
+    """Wraps ``inner`` step-size control without placing steps.
+
+    It measures how fast sigma changes, by which the zone is widened for fast passages.
+    """
+
+    def __init__(self, inner: StepSizeControl, scheme: ButcherTableau) -> None:
+        super().__init__(inner)
+        self._inverse = inverse_abscissae(scheme)
+        self._slope = 0.0
+
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
+        """The inner proposal."""
+        memory.sigma_slope = self._slope
+        return self._inner.propose(t, limit, memory)
+
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
+        """The inner decision."""
+        decision = self._inner.decide(proposal, result)
+        if decision is StepDecision.ACCEPTED and result is not None:
+            slope = sigma_slope(self._inverse, result.sigmas, proposal.h)
+            self._slope = max(slope, 0.5 * self._slope)
+        return decision

@@ -1,7 +1,7 @@
-"""Step-size control: how long the next step is, and whether the last one stands.
+"""Step-size control: the length of the next step, and whether the last one is accepted.
 
-Judging a step is separate from making it, and one control may wrap another
-(:class:`~srm_mbs.integration.control.placement.SingularityPlacement` does).
+The decision on a step is separate from making it.  One control may wrap another
+(:class:`ControlWrapper`).
 """
 
 from __future__ import annotations
@@ -18,19 +18,23 @@ from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 
 SAFETY = 0.9
+"""Safety factor of the next step."""
 MIN_FACTOR, MAX_FACTOR = 0.2, 5.0
-PROPORTIONAL, INTEGRAL = 0.4, 0.7
+"""Smallest and largest ratio of a step to the one before."""
+PROPORTIONAL_EXPONENT, INTEGRAL_EXPONENT = 0.4, 0.7
 """h_new = h 0.9 xi^(-0.7/k) xi_old^(0.4/k): PI control after Gustafsson."""
-XI_OLD_FLOOR = 1e-4
-XI_FLOOR = 1e-10
-OVERFLOW = 1e100
+MIN_OLD_ERROR_RATIO = 1e-4
+"""Smallest error ratio of the step before that counts."""
+MIN_ERROR_RATIO = 1e-10
+"""Smallest error ratio of a step that counts."""
+RATE_OVERFLOW = 1e100
 """Size of a rate from which its products may overflow."""
-PROBE = 0.01
+PROBE_LENGTH = 0.01
 """Length of the step that probes how fast rates change, over that in which the state would change
 by itself; the change that the first step may make."""
 LONGEST_FIRST = 100.0
 """Longest first step, over that probe."""
-FAILED_EVALUATION = 1e6
+UNEVALUATED_ERROR_RATIO = 1e6
 """Error ratio of a step whose stages could not be evaluated or are not finite."""
 
 
@@ -39,7 +43,7 @@ Grid = tuple[float, float]
 
 
 class StepDecision(Enum):
-    """What becomes of a proposed step."""
+    """Decision on a proposed step."""
 
     ACCEPTED = "accepted"
     REJECTED = "rejected"
@@ -51,21 +55,20 @@ class StepDecision(Enum):
 class Proposal:
     """A step of length ``h`` that ends at ``t_new`` (exactly, where that is a given time).
 
-    ``placed``: it was made shorter so that no stage lies on a singular configuration.
-    ``arriving``: the run, or its piece, is about to end beside one; the multipliers up to there are
-    to be found first (:mod:`srm_mbs.integration.singular_endpoints`), and a step proposed again.
+    Attributes
+    ----------
+    placed
+        Whether it was made shorter so that no stage lies on a singular configuration.
+    singular_arrival
+        Whether the run, or its smooth interval, is about to end beside one: the multipliers up to
+        there are found first (:func:`~srm_mbs.integration.singular_endpoints.singular_arrival`),
+        and a step is proposed again.
     """
 
     h: float
     t_new: float
     placed: bool = False
-    arriving: bool = False
-
-
-class Propose(Protocol):
-    """:meth:`StepSizeControl.propose`."""
-
-    def __call__(self, t: float, limit: float, memory: IntegratorState) -> Proposal: ...
+    singular_arrival: bool = False
 
 
 class StepSizeControl(Protocol):
@@ -77,13 +80,45 @@ class StepSizeControl(Protocol):
         """The next step from ``t``, at most ``limit`` long where the control is adaptive."""
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
-        """Judge a step; ``result`` is None if a stage could not be evaluated."""
+        """Decide on a step; ``result`` is None if a stage could not be evaluated."""
 
     def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """A step ends on ``end`` (s): a breakpoint, or the end of the run.
 
         With ``grid`` fixed steps are counted anew; others have none.
         """
+
+
+class ControlWrapper:
+    """Step-size control around ``inner``, which decides unless a subclass does.
+
+    Attributes
+    ----------
+    placed, replaced
+        How many steps were changed in advance, and redone afterwards.
+    """
+
+    def __init__(self, inner: StepSizeControl) -> None:
+        self._inner = inner
+        self.adaptive = inner.adaptive
+        self.placed = 0
+        self.replaced = 0
+
+    def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
+        """The inner proposal."""
+        return self._inner.propose(t, limit, memory)
+
+    def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
+        """The inner decision."""
+        return self._inner.decide(proposal, result)
+
+    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
+        """See :class:`StepSizeControl`."""
+        self._inner.set_target_time(end, grid)
+
+    def suspect_times(self) -> list[float]:
+        """Times (s) up to which the motion may have changed its branch: none."""
+        return []
 
 
 def _until(t: float, h: float, end: float) -> Proposal:
@@ -124,24 +159,28 @@ class PIControl:
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Accept if the error ratio xi <= 1; no growth right after a rejection."""
-        xi = FAILED_EVALUATION if result is None else result.error_ratio
-        if not xi < FAILED_EVALUATION:
-            xi = FAILED_EVALUATION
+        xi = UNEVALUATED_ERROR_RATIO if result is None else result.error_ratio
+        if not xi < UNEVALUATED_ERROR_RATIO:
+            xi = UNEVALUATED_ERROR_RATIO
         k = self._order
         if xi > 1.0:
             self._h = proposal.h * max(MIN_FACTOR, SAFETY * xi ** (-1.0 / k))
             self._just_rejected = True
             return StepDecision.REJECTED
-        factor = SAFETY * max(xi, XI_FLOOR) ** (-INTEGRAL / k) * self._xi_old ** (PROPORTIONAL / k)
+        factor = (
+            SAFETY
+            * max(xi, MIN_ERROR_RATIO) ** (-INTEGRAL_EXPONENT / k)
+            * self._xi_old ** (PROPORTIONAL_EXPONENT / k)
+        )
         factor = min(MAX_FACTOR, max(MIN_FACTOR, factor))
         if self._just_rejected:
             factor = min(factor, 1.0)
         h = proposal.h * factor
         if proposal.t_new == self._t_end and proposal.h < self._h:
-            # Cut to end there: behind a breakpoint the step wanted before is the better guess.
+            # Cut to end there: after a breakpoint the step proposed before is the better guess.
             h = max(h, self._h)
         self._h = h
-        self._xi_old = max(xi, XI_OLD_FLOOR)
+        self._xi_old = max(xi, MIN_OLD_ERROR_RATIO)
         self._just_rejected = False
         return StepDecision.ACCEPTED
 
@@ -207,23 +246,23 @@ def initial_step(
     order: int,
     t: float = 0.0,
 ) -> float:
-    """Length of the first step (s): the thesis' appendix B.2 made independent of the time unit.
+    """Length of the first step (s): the thesis' appendix B.2, independent of the unit of time.
 
     With d0 = ||unit of x||, d1 = ||x'|| and d2 = ||x''|| (an Euler step of 0.01 d0/d1), and the
     time tau = d1/d2: h = min(d0/d1, tau (0.01 / (tau d1))^(1/k)).
     """
-    weights = norm.weights(memory.magnitude)
-    # |x| itself may vanish; atol over rtol is the size that the tolerances call "one".
-    d0 = norm(np.maximum(memory.magnitude, norm.one), weights)
-    if not np.abs(memory.rate).max() < OVERFLOW:
+    weights = norm.weights(memory.state_scale)
+    # |x| itself may vanish; at the size atol / rtol both tolerances allow the same error.
+    d0 = norm(np.maximum(memory.state_scale, norm.one), weights)
+    if not np.abs(memory.rate).max() < RATE_OVERFLOW:
         raise EvaluationError("the rates at the start overflow: an input is far too large")
     with np.errstate(over="ignore"):
         d1 = norm(memory.rate, weights)
     if not np.isfinite(d1):
         raise EvaluationError(_TOO_TIGHT)
     if not d1 > 0.0:
-        return PROBE * span
-    h0 = min(PROBE * d0 / d1, span)
+        return PROBE_LENGTH * span
+    h0 = min(PROBE_LENGTH * d0 / d1, span)
     probe = system.retract(state, h0 * memory.rate)
     rate = system.chart_rate(h0 * memory.rate, system.evaluate(t + h0, probe).rate())
     with np.errstate(over="ignore"):
@@ -234,4 +273,4 @@ def initial_step(
     if not d2 > 0.0:
         return min(longest, span)
     tau = d1 / d2
-    return float(min(longest, tau * (PROBE / (tau * d1)) ** (1.0 / order), span))
+    return float(min(longest, tau * (PROBE_LENGTH / (tau * d1)) ** (1.0 / order), span))

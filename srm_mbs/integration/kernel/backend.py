@@ -9,9 +9,9 @@ import logging
 import os
 from functools import cache
 
-from srm_mbs._kernel import OUTDATED, core, missing
+from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, warn
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
@@ -35,10 +35,28 @@ def _unwanted() -> bool:
     return os.environ.get("SRM_MBS_BACKEND") == "python"
 
 
-def unsupported_reason(method: Method, placement: str, singular_times: FloatArray) -> str:
-    """Why the kernel cannot make a run: it is not there, or lacks an option; empty if it can."""
+def check_kernel() -> None:
+    """Check that ``backend="auto"`` takes the compiled kernel where it can.
+
+    Raises
+    ------
+    InputError
+        If it takes the Python reference.
+    """
     if core is None:
-        return missing
+        raise InputError(
+            f"the compiled kernel is not available: {missing}", element="backend", remedy=remedy
+        )
+    if _unwanted():
+        raise InputError(
+            "the environment variable SRM_MBS_BACKEND asks for the Python reference",
+            element="backend",
+            remedy="Run: unset SRM_MBS_BACKEND",
+        )
+
+
+def unsupported_reason(method: Method, placement: str, singular_times: FloatArray) -> str:
+    """Which option of a run the kernel lacks; empty if it has them all."""
     if not (isinstance(method, PSRM) and method.correction == "split"):
         return "it has the split PSRM only"
     if placement not in PLACEMENTS:
@@ -50,6 +68,8 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
 
 def uses_kernel(asked: str, method: Method, placement: str, singular_times: FloatArray) -> bool:
     """Whether a run with ``backend=asked`` is made by the compiled kernel.
+
+    Warns, once per process, where the kernel would make the run if it were available.
 
     Raises
     ------
@@ -64,23 +84,25 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         )
     if asked == "python" or (asked == "auto" and _unwanted()):
         return False
-    reason = unsupported_reason(method, placement, singular_times)
-    if asked == "kernel" and reason:
+    lacking = unsupported_reason(method, placement, singular_times)
+    if asked == "kernel" and (lacking or core is None):
+        other = "Use the backend auto, which takes the Python reference where it has to"
         raise InputError(
-            f"the compiled kernel cannot make this run: {reason}",
+            f"the compiled kernel cannot make this run: {lacking or missing}",
             element="backend",
-            remedy="Use the backend auto, which takes the Python reference where it has to",
+            remedy=other if lacking else f"{remedy}. {other}",
         )
-    if reason == OUTDATED:
-        warn_outdated()
-    elif reason:
-        log.info("the Python reference makes this run, not the compiled kernel: %s", reason)
-    return not reason
+    if lacking:
+        log.info("the Python reference makes this run, not the compiled kernel: %s", lacking)
+    elif core is None:
+        warn_missing()
+    return core is not None and not lacking
 
 
 @cache
-def warn_outdated() -> None:
-    """Say, once, that runs are slow because the kernel does not fit the sources any more."""
-    log.warning(
-        "runs use the Python reference, because the compiled kernel is left out: %s", missing
+def warn_missing() -> None:
+    """Warn, once per process, that runs are slow because there is no kernel."""
+    warn(
+        "runs use the Python reference, which is many times slower, because the compiled kernel "
+        f"is not available: {missing}. {remedy}"
     )

@@ -12,7 +12,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration import dense_output as hermite
 from srm_mbs.integration.dense_output import SLACK, DenseOutput, StepData
-from srm_mbs.integration.kernel.system import given_back, make_kernel_system, shared, taken
+from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 
@@ -73,22 +73,25 @@ class CompiledDenseOutput(DenseOutput):
             return super().__call__(t)  # loaded without the controller: no stage is to be evaluated
         if self._compiled is None:
             self._compiled = self._compile()
-        system = self._mechanism_system
-        kernel_system = taken(system) if self._kernel_system is None else self._kernel_system
-        before = kernel_system.evaluations, kernel_system.factorisations
         try:
-            return self._compiled.states(kernel_system, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
+            if self._kernel_system is not None:
+                return self._states(self._kernel_system, t)
+            with workspace(self._mechanism_system) as kernel_system:
+                return self._states(kernel_system, t)
         except ArithmeticError:
             return super().__call__(t)  # which says why
         except IndexError:
             self.check(t)  # raises
             raise
+
+    def _states(self, kernel_system: Any, t: FloatArray) -> FloatArray:
+        before = kernel_system.evaluations, kernel_system.factorisations
+        try:
+            return self._compiled.states(kernel_system, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
         finally:
-            system.count(
+            self._mechanism_system.count(
                 kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]
             )
-            if self._kernel_system is None:
-                given_back(system, kernel_system)
 
     @cached_property
     def _lone_zones(self) -> bool:

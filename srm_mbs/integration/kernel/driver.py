@@ -28,6 +28,7 @@ from srm_mbs.integration.kernel.run import (
     TOO_SHORT,
     CompiledRun,
 )
+from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 
@@ -102,8 +103,8 @@ def integrate(
                 run.arrive(passing)
                 continue
             if reason not in (CHUNK_FULL, FINISHED):
-                trouble = why_stopped(reason, system, run)
-                driver.fail(record, run.t, run.h, run.memory(), trouble, run.adaptive)
+                failure = why_stopped(reason, system, run)
+                record.mark_failed(failure, run.t, run.h, run.memory().sigma, run.adaptive)
                 break
             if not one_by_one or run.count == made:
                 continue
@@ -111,12 +112,12 @@ def integrate(
             stop = None if events is None else events.after_step(start, result, t)
             start = result.state
             if stop is not None:
-                record.ended(stop)
+                record.mark_stopped(stop)
                 break
             if tick is not None:
                 driver.call_progress(tick, t, result.h, result.state)
         else:
-            record.finished(run.t_end)
+            record.mark_finished(run.t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
         record.mark_aborted(run.t, error)
     record.attempts = [
@@ -128,15 +129,16 @@ def integrate(
     return record
 
 
-def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> str:
-    """Why the kernel stopped, in the words of the reference, which repeats what failed."""
+def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> RunFailure:
+    """Why the kernel stopped, as the reference says it, which repeats the attempt that failed."""
     attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
     if reason == STANDSTILL:
         return driver.standstill(run.t - run.time_before(driver.WATCHED_STEPS))
     if reason == CLOSURES:
-        return driver.Closures(system, run.norm).trouble(run.last())
+        failure = driver.Closures(system, run.norm).failure(run.last())
+        return failure or RunFailure.of(StopReason.ERROR_ESTIMATE)
     if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
-        return driver.BELOW_ROUND_OFF
+        return RunFailure.of(StopReason.ROUND_OFF)
     if run.trouble:
         failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
         # The last one first; at the edge of what can be evaluated rounding decides.
@@ -144,5 +146,7 @@ def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun
             try:
                 run.method.step(system, run.t, h, run.state, run.memory(), run.norm)
             except EvaluationError as error:
-                return str(error)
-    return driver.NOT_FINITE if reason == NOT_EVALUATED else ""
+                return RunFailure(StopReason.NOT_EVALUATED, str(error))
+    return RunFailure.of(
+        StopReason.NOT_FINITE if reason == NOT_EVALUATED else StopReason.ERROR_ESTIMATE
+    )

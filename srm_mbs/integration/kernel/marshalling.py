@@ -12,7 +12,6 @@ import numpy as np
 
 from srm_mbs.integration import breakpoints, driver, singular_endpoints
 from srm_mbs.integration.control import branch_guard, placement, step_size
-from srm_mbs.integration.control import placement as kinks
 from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.methods import near_singular, split_step
 from srm_mbs.integration.methods.base import IntegratorState
@@ -37,38 +36,38 @@ CONSTANTS = {
     "hit": near_singular.HIT,
     "projections": near_singular.PROJECTIONS,
     "fewest": near_singular.FEWEST,
-    "gap_every": split_step.GAP_EVERY,
+    "gap_every": split_step.RESIDUAL_EVERY,
     "safety": step_size.SAFETY,
     "min_factor": step_size.MIN_FACTOR,
     "max_factor": step_size.MAX_FACTOR,
-    "proportional": step_size.PROPORTIONAL,
-    "integral": step_size.INTEGRAL,
-    "xi_old_floor": step_size.XI_OLD_FLOOR,
-    "xi_floor": step_size.XI_FLOOR,
-    "failed_evaluation": step_size.FAILED_EVALUATION,
+    "proportional": step_size.PROPORTIONAL_EXPONENT,
+    "integral": step_size.INTEGRAL_EXPONENT,
+    "xi_old_floor": step_size.MIN_OLD_ERROR_RATIO,
+    "xi_floor": step_size.MIN_ERROR_RATIO,
+    "failed_evaluation": step_size.UNEVALUATED_ERROR_RATIO,
     "sigma_change": placement.SIGMA_CHANGE,
     "too_close": placement.TOO_CLOSE,
     "clearance": placement.CLEARANCE,
-    "ahead": kinks.AHEAD,
+    "ahead": placement.PREDICTION_STEPS,
     "max_redone": placement.MAX_REDONE,
-    "beside": placement.BESIDE,
-    "arrival_change": placement.ARRIVAL,
-    "turned": branch_guard.TURNED,
+    "beside": placement.SINGULAR_END_SIGMA,
+    "arrival_change": placement.ARRIVAL_SIGMA_CHANGE,
+    "turned": branch_guard.VELOCITY_JUMP,
     "guard_max_redone": branch_guard.MAX_REDONE,
     "smallest_step": driver.SMALLEST_STEP,
     "standstill": driver.STANDSTILL,
     "large_correction": driver.LARGE_CORRECTION,
-    "open": driver.OPEN,
-    "lost": driver.LOST,
+    "open": driver.RESIDUAL_EXAMINED,
+    "lost": driver.LARGEST_RESIDUAL,
     "watched_steps": driver.WATCHED_STEPS,
-    "look": singular_endpoints.LOOK,
+    "look": singular_endpoints.NEAR_SINGULAR_SIGMA,
     "closer": breakpoints.CLOSER,
     "allowed": breakpoints.ALLOWED,
 }
 """Every number of the algorithm, from the module of the reference that has it."""
 
 
-FIRST_STEP = (step_size.OVERFLOW, step_size.PROBE, step_size.LONGEST_FIRST)
+FIRST_STEP = (step_size.RATE_OVERFLOW, step_size.PROBE_LENGTH, step_size.LONGEST_FIRST)
 """Those of the first step."""
 
 
@@ -117,7 +116,7 @@ def memory_data(memory: IntegratorState) -> dict[str, Any]:
     """``memory`` as the kernel reads it."""
     return {
         "rate": np.ascontiguousarray(memory.rate),
-        "magnitude": np.ascontiguousarray(memory.magnitude),
+        "magnitude": np.ascontiguousarray(memory.state_scale),
         "sigma": memory.sigma,
         "sigma_slope": memory.sigma_slope,
         "steps": memory.steps,

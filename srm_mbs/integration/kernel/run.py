@@ -134,6 +134,8 @@ class CompiledRun:
         """The step made last."""
         data = dict(self._run.last())
         threshold, history = data.pop("zone_threshold"), data.pop("history")
+        data["state_scale"] = data.pop("magnitude")
+        data["constraint_residual"] = data.pop("gap")
         known = None if history is None else history_from(history)
         near = None if known is None else Zone(threshold, known.predict_near, known.normals)
         return StepResult(zone=near, history=known, multiplier=None, **data)
@@ -167,7 +169,7 @@ class CompiledRun:
     def arrive(self, passing: BreakpointHandler) -> None:
         """Prepare for the end beside a singular configuration before which the kernel stopped."""
         run = self._run
-        self.remember(passing.arrive(run.t, run.state, self.memory(), run.piece))
+        self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.piece))
 
     def remember(self, memory: IntegratorState) -> None:
         """Carry ``memory`` to the next step."""
@@ -186,8 +188,8 @@ class CompiledRun:
                 "state": np.ascontiguousarray(state),
                 "memory": memory_data(memory),
                 "control": fresh,
-                "seen": driver.OPEN,
-                "near": singular_endpoints.LOOK,
+                "seen": driver.RESIDUAL_EXAMINED,
+                "near": singular_endpoints.NEAR_SINGULAR_SIGMA,
             }
         )
 

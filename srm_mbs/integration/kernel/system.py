@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from srm_mbs._kernel import core
@@ -13,6 +14,7 @@ from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.control.step_size import initial_step
 from srm_mbs.integration.kernel.marshalling import FIRST_STEP
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 KEPT = 4
 """Idle workspaces that a mechanism keeps at most."""
@@ -43,35 +45,38 @@ def shared(system: ClosedSystem | OpenSystem) -> bool:
     )
 
 
-def taken(system: ClosedSystem | OpenSystem) -> Any:
-    """A twin of ``system`` for one user: an idle one of its mechanism, or a new one.
+@per_model
+def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
+    """The pool of a mechanism: kernel systems of :func:`shared` ones that no run uses."""
+    return deque(maxlen=KEPT)
 
-    :func:`given_back` returns it.  One that is not, because a run raised, is simply lost.
+
+@contextmanager
+def workspace(system: ClosedSystem | OpenSystem) -> Iterator[Any]:
+    """A kernel system of ``system`` for one user: an idle one of its mechanism, or a new one.
+
+    It returns to the pool afterwards, if it is :func:`shared` and there are not KEPT already.  One
+    whose user raised is left to the garbage collector.
     """
+    kernel_system = _idle_or_new(system)
+    yield kernel_system
+    if shared(system):
+        idle_workspaces(system.mechanism).append(kernel_system)
+
+
+def _idle_or_new(system: ClosedSystem | OpenSystem) -> Any:
     if shared(system):
         with suppress(IndexError):  # deque: two threads never get the same
-            kernel_system = _idle(system).pop()
+            kernel_system = idle_workspaces(system.mechanism).pop()
             kernel_system.renew(**system.constants_of_start())
             return kernel_system
     return make_kernel_system(system)
 
 
-def given_back(system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
-    """Nobody uses ``kernel_system`` any more: keep it for the mechanism's next run, if it is
-    :func:`shared` and there are not KEPT already."""
-    if shared(system):
-        _idle(system).append(kernel_system)
-
-
-def _idle(system: ClosedSystem | OpenSystem) -> deque[Any]:
-    idle: deque[Any] = system.mechanism.derived("idle twins", lambda: deque(maxlen=KEPT))
-    return idle
-
-
 class _TwinTerms:
     """Terms of a regular stage, evaluated by the kernel."""
 
-    weak = False
+    rank_deficient = False
     held = False
 
     def __init__(self, found: dict[str, Any]) -> None:
@@ -119,7 +124,7 @@ class Evaluator:
         """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
         try:
             return self._kernel_system.first_step(  # type: ignore[no-any-return]
-                t, state, memory.rate, memory.magnitude, norm.atol, norm.one, norm.rtol, span,
+                t, state, memory.rate, memory.state_scale, norm.atol, norm.one, norm.rtol, span,
                 order, FIRST_STEP,
             )  # fmt: skip
         except ArithmeticError:  # the reference says why

@@ -1,7 +1,7 @@
-"""The contract of a method: make one step, say how good it is.
+"""The contract of a one-step method: make a step, and estimate its error.
 
-A method is a tableau plus where its multiplier comes from.  It proposes a state; whether the
-step stands is for step-size control to judge, and only :meth:`Method.accept` moves the memory.
+A method is a Runge-Kutta tableau and a source of multipliers.  It proposes a state.  Step-size
+control decides whether the step is accepted, and only :meth:`Method.accept` changes the memory.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 
 NEGLIGIBLE = 1e-3
-"""Fraction of the tolerance that is not worth an evaluation."""
+"""Effect of an evaluation, over the tolerance, below which it is not made."""
 
 
 @dataclass(frozen=True)
@@ -43,52 +43,17 @@ class ErrorNorm:
 
     @property
     def one(self) -> FloatArray:
-        """What the tolerances call "one" (n,), a unit for each component."""
+        """atol / rtol (n,): the size at which both tolerances allow the same error."""
         return self.atol / self.rtol
 
-    def weights(self, magnitude: FloatArray) -> FloatArray:
+    def weights(self, state_scale: FloatArray) -> FloatArray:
         """atol + rtol |x| (n,)."""
-        return self.atol + self.rtol * magnitude
+        return self.atol + self.rtol * state_scale
 
     def __call__(self, error: FloatArray, weights: FloatArray) -> float:
         """The norm of ``error`` (n,) for ``weights`` (n,)."""
         scaled = error / weights
         return float(np.sqrt(scaled @ scaled / scaled.size))
-
-
-@dataclass(frozen=True, eq=False)
-class SweepNode:
-    """Where one sweep stands at the end of a step.
-
-    Attributes
-    ----------
-    state : (nx,)
-        The sweep's own state.
-    multiplier
-        Its multiplier there, in the form that the system's sweeps carry.
-    rate : (n,) or None
-        Its tangent rate there; None if the next step has to evaluate it.
-    eps
-        The regularisation (s) of that rate.
-    history
-        Its multipliers at recent step ends outside the zone; None where sweeps need no zone.
-    off
-        How far it is off the closures, in units.
-    given
-        With own histories, y_0: the constant multiplier that the first sweep is given; None for 0.
-    passing
-        Whether the split form passes a singular configuration for the sweeps
-        (:mod:`srm_mbs.integration.methods.iterated_sweeps`).
-    """
-
-    state: FloatArray
-    multiplier: FloatArray
-    rate: FloatArray | None
-    eps: float
-    history: MultiplierHistory | None
-    off: float = 0.0
-    given: FloatArray | None = None
-    passing: bool = False
 
 
 @dataclass
@@ -101,7 +66,7 @@ class IntegratorState:
         Tangent rate at the current state: the first stage of the next step.
     sigma
         sigma there.
-    magnitude : (n,)
+    state_scale : (n,)
         |x| of the error weights there.
     history
         Multipliers at recent step ends outside the zone; None without closures.
@@ -109,17 +74,24 @@ class IntegratorState:
         |d sigma / dt| (1/s) seen by step-size control; it widens the zone for fast passages.
     steps
         Number of accepted steps.
-    sweeps
-        For methods with sweeps: where each one stands, the last one last.
     """
 
     rate: FloatArray
     sigma: float
-    magnitude: FloatArray
+    state_scale: FloatArray
     history: MultiplierHistory | None = None
     sigma_slope: float = 0.0
     steps: int = 0
-    sweeps: tuple[SweepNode, ...] = ()
+
+    def set_first_stage(
+        self, rate: FloatArray, multiplier: FloatArray, history: MultiplierHistory
+    ) -> None:
+        """Replace the first stage of a step next to a singular configuration, where the direct
+        solve is inaccurate, by ``rate`` (n,) and ``multiplier`` (nv,), with the ``history`` of
+        known multipliers."""
+        self.rate = rate
+        if self.history is not None:
+            self.history = history
 
 
 @dataclass(slots=True)
@@ -131,8 +103,8 @@ class StepResult:
     state
         State at the end, corrected.
     rates : (s + 1, n) or (s + 1 + e, n)
-        Chart rates of the stages and of the end point; what the dense output is made of.  Methods
-        with sweeps add those of the e extra stages of the tableau's extension.
+        Chart rates of the stages and of the end point, from which dense output is computed; also
+        of the e extra stages of the tableau's extension, where a method evaluates them.
     end_rate : (n,)
         Tangent rate at the corrected end point.
     correction : (n,)
@@ -146,30 +118,19 @@ class StepResult:
     zone
         The zone, if any stage fell into it, else None.
     history
-        The multiplier history behind that zone, else None.
+        The multiplier history that the zone predicts from, else None.
     multiplier : (m,) or None
         yhat at the end point; None if the end point lies in the zone.
-    magnitude : (n,)
+    state_scale : (n,)
         |x| of the error weights at the end.
-    sweeps
-        For methods with sweeps: where each one stands at the end.
-    drift_ratio
-        For methods with sweeps and an embedded pair: constraint error that the last sweep has left
-        at the end, over tolerance; else 0.
-    off
-        For methods with sweeps: how far any of them is off the closures at the end, in units.
-    restarted
-        Whether sweeps with own histories started from the accepted state in this step.
-    passing
-        For methods with sweeps: whether the split form made this step for them.
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
     quiet
-        Whether the whole step is so far from singular configurations that nothing needs a look.
+        Whether the whole step is so far from singular configurations that no check is needed.
     slope
         Of a quiet step: |d sigma / dt| (1/s), the largest over the step and to its middle stage.
-    gap
+    constraint_residual
         Largest closure error before a full correction, in row units, rows that are not in use
         included; 0 if the correction is partial.
     held
@@ -190,22 +151,22 @@ class StepResult:
     zone: Zone | None
     history: MultiplierHistory | None
     multiplier: FloatArray | None
-    magnitude: FloatArray
-    sweeps: tuple[SweepNode, ...] = ()
-    drift_ratio: float = 0.0
-    off: float = 0.0
-    restarted: bool = False
-    passing: bool = False
+    state_scale: FloatArray
     placement: str = ""
     quiet: bool = False
     slope: float = 0.0
-    gap: float = 0.0
+    constraint_residual: float = 0.0
     held: bool = False
     normals: FloatArray | None = None
 
 
 class Method(Protocol):
-    """One-step method on a :class:`~srm_mbs.dynamics.system.System`."""
+    """One-step method on a :class:`~srm_mbs.dynamics.system.System`.
+
+    A method may also have ``run_messages(steps, norm)``: sentences for the message of a run about
+    the limits of the method that its accepted steps met
+    (:func:`srm_mbs.integration.messages.method_messages`).
+    """
 
     @property
     def scheme(self) -> ButcherTableau:
@@ -239,8 +200,8 @@ class Method(Protocol):
     def resume(
         self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
     ) -> IntegratorState:
-        """``memory`` behind a breakpoint at ``t``, where forces may have jumped: nothing that
-        depends on those before it is kept.
+        """``memory`` after a breakpoint at ``t``, where forces may have jumped: nothing that
+        depends on the forces before it is kept.
 
         Raises
         ------

@@ -68,8 +68,6 @@ AMBIGUOUS = 0.1
 Newton might lead to another branch."""
 HELD = 0.1
 """Part of the tolerance up to which a slow motion is held on its branch, not extrapolated."""
-TURNS = 2.0
-"""Margin for what a constraint error changes by because the closures turn."""
 ROUNDING = 16.0 * np.finfo(float).eps
 """Rounding of the positions, in units: at most."""
 USUAL = 1.0 / 32.0
@@ -96,8 +94,6 @@ class BranchStages:
         What the zone of the step predicts from; None for sweeps that need no zone.
     end
         End of the step (s).
-    memory_span
-        How long the method keeps a constraint error, eps (s); 0 if every step removes it.
 
     Attributes
     ----------
@@ -125,7 +121,6 @@ class BranchStages:
     sigma_change: float
     history: MultiplierHistory | None
     end: float
-    memory_span: float = 0.0
     near: bool = field(init=False)
     zone: Zone | None = field(init=False)
     excused: float = field(init=False)
@@ -135,11 +130,7 @@ class BranchStages:
     def __post_init__(self) -> None:
         self.floor = np.zeros_like(self.weights)
         # All stages of a step or none: a mixture of both loses the order.
-        # By time, not by steps alone: errors kept over many short steps grow like 1/sigma^2 in the
-        # multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
-        spans = max(1.0, self.memory_span / self.h)
-        reach = NEAR * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED
-        self.near = self.memory.sigma < reach
+        self.near = self.memory.sigma < self.reach()
         threshold = ZONE_LARGEST
         lingering = False
         self.excused = 0.0
@@ -159,6 +150,10 @@ class BranchStages:
         self.zone = zone_from(self.history, threshold, self.end)
         if self.zone is not None and lingering:
             self.zone = replace(self.zone, predict=lambda _: None)
+
+    def reach(self) -> float:
+        """sigma below which the step is next to a singular configuration."""
+        return NEAR * self.sigma_change if self.sigma_change > 0.0 else WATCHED
 
     def __call__(
         self, terms: Terms, t: float, c: float, x: FloatArray
@@ -182,12 +177,12 @@ class BranchStages:
         change = max(self.sigma_change, abs(terms.sigma - self.memory.sigma) / c)
         for _ in range(PROJECTIONS):
             sigma = terms.sigma
-            if terms.weak or not sigma > 0.0:
+            if terms.rank_deficient or not sigma > 0.0:
                 break
             error = terms.correction()
-            if self.system.size(error) > AMBIGUOUS * sigma:
+            if self.system.position_norm(error) > AMBIGUOUS * sigma:
                 break
-            effect = self.norm(self._turning(error, sigma, change), self.weights)
+            effect = self.norm(self.effect_on_rates(error, sigma, change), self.weights)
             if effect <= self.norm.negligible:
                 break
             if effect <= self.norm(self.rounding(sigma, change, True), self.weights):
@@ -198,7 +193,7 @@ class BranchStages:
             self.projected = True
         return terms, x, moved
 
-    def _turning(self, error: FloatArray, sigma: float, change: float) -> FloatArray:
+    def effect_on_rates(self, error: FloatArray, sigma: float, change: float) -> FloatArray:
         """Change (n,) of h times the tangent rate by the normal ``error`` (n,) of a stage."""
         part = self.system.multiplier_part
         reach = change / sigma
@@ -207,15 +202,6 @@ class BranchStages:
         if part.start:
             out[part] += (reach * reach / self.h) * np.abs(error[: part.start])
         return out
-
-    def turning(self, off: FloatArray, sigma: float) -> FloatArray:
-        """Change (n,), at most, over the step of how far a sweep is ``off`` (n,) the closures by
-        their turning next to ``sigma``.
-
-        It is a part of ``off`` however short the step: nothing for a shorter one to mend.
-        """
-        reach = self.sigma_change / sigma
-        return TURNS * (self._turning(off, sigma, self.sigma_change) + reach * np.abs(off))
 
     def rounding(self, sigma: float, change: float, projected: bool) -> FloatArray:
         """What rounding at a stage with ``sigma`` does to h times the tangent rate (n,).
@@ -228,7 +214,7 @@ class BranchStages:
         part = self.system.multiplier_part
         if part.start:
             error[part] = change / (self.h * sigma) * error[: part.start]
-        return self._turning(error, sigma, change)
+        return self.effect_on_rates(error, sigma, change)
 
     def _floor(self) -> FloatArray:
         change = self.sigma_change
@@ -262,7 +248,7 @@ class BranchStages:
         if not part.start or self.memory.history is None or self.memory.history.normals is None:
             return False
         v, a = self.memory.rate[: part.start], self.memory.rate[part]
-        speed = self.system.size(np.concatenate([v, a]))
+        speed = self.system.position_norm(np.concatenate([v, a]))
         error = np.zeros_like(self.weights)
         error[part] = self.h * (threshold * np.abs(a) + speed * np.abs(v))
         return self.norm(error, self.weights) < HELD

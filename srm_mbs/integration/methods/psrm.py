@@ -1,30 +1,38 @@
 r"""The Predicted Sequential Regularization Method in all its forms.
 
-Its split form, the default, is made by :mod:`srm_mbs.integration.methods.split_step`, the others by
-:mod:`srm_mbs.integration.methods.iterated_sweeps`.
+:mod:`srm_mbs.integration.methods.split_step` makes the steps of its split form, the default, and
+:mod:`srm_mbs.integration.methods.thesis.iterated_sweeps` those of the others.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
-from srm_mbs.integration.methods.iterated_sweeps import First, IteratedSweeps
-from srm_mbs.integration.methods.regularisation import Regularisation, parse_eps
 from srm_mbs.integration.methods.split_step import (
     split_accept,
     split_resume,
     split_start,
     split_step,
 )
-from srm_mbs.integration.methods.sweep import INTERPOLATIONS, checked_regulariser, interpolant
 from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.thesis.iterated_sweeps import IteratedSweeps, psrm_eps, psrm_sweeps
+from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
+from srm_mbs.integration.methods.thesis.sweep import (
+    INTERPOLATIONS,
+    SweepResult,
+    SweepState,
+    checked_regulariser,
+    interpolant,
+)
 
 _FORMS = {"exact": ("split", "sweep", "fused"), "simple": ("sweep",)}
 """Corrections of each prediction, the default first."""
@@ -63,15 +71,16 @@ class PSRM:
     eps
         Regularisation parameter: seconds, or ``"h"``, ``"5h"``, ``"h^(2/3)"`` with the step h
         (s).  None for the default of the form.  Explicit schemes need h/eps below their real
-        stability limit (:func:`~srm_mbs.integration.methods.regularisation.real_stability_limit`).
+        stability limit
+        (:func:`~srm_mbs.integration.methods.thesis.regularisation.real_stability_limit`).
     T
         For DAEs: ``"identity"``, ``"transpose"`` (GB)^T or ``"inverse"`` (GB)^-1, in the sweeps.
         Mechanisms have no such choice, and the split form is the same for all.
     interpolation
         Of the predicted multiplier, with ``correction="sweep"``: ``"stages"``, the predictor's own
         stages, the default: full order with a fixed eps; or as in the thesis, ``"auto"`` or
-        ``"linear"`` (:func:`~srm_mbs.integration.methods.sweep.interpolant`), which leave larger
-        constraint errors and need more steps: with dopr54, the slider-crank to t = 20 at a
+        ``"linear"`` (:func:`~srm_mbs.integration.methods.thesis.sweep.interpolant`), which leave
+        larger constraint errors and need more steps: with dopr54, the slider-crank to t = 20 at a
         tolerance of 1e-4, 95 for ``"stages"``, 101 for ``"auto"``, some 770 for ``"linear"``, which
         is of order 2.
 
@@ -115,22 +124,17 @@ class PSRM:
             return parse_eps(self.eps)
         if self.correction == "split":
             return None
-        if self.prediction == "simple":
-            return parse_eps("h")
-        return parse_eps("h^(1/3)" if self.scheme.order >= 5 else "h^(2/3)")
+        return psrm_eps(self.prediction, self.scheme.order)
 
     @cached_property
-    def _sweeps(self) -> IteratedSweeps | None:
-        """What makes the steps of all forms but the split one."""
-        if self.correction == "split" or self.regularisation is None:
+    def sweeps(self) -> IteratedSweeps | None:
+        """The sweeps of all forms but the split one, which has none."""
+        if self.correction in (None, "split") or self.regularisation is None:
             return None
-        fused = self.correction == "fused"
-        first = First.FUSED if fused else First.EXACT
-        return IteratedSweeps(
+        return psrm_sweeps(
             self.scheme,
-            First.HELD if self.prediction == "simple" else first,
-            1,
-            fused,
+            self.prediction,
+            self.correction,
             self.regularisation,
             self._interpolant(),
         )
@@ -144,8 +148,8 @@ class PSRM:
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm
     ) -> IntegratorState:
         """First stage, and the first node of the multiplier history."""
-        if self._sweeps is not None:
-            return self._sweeps.start(system, t, state, norm)
+        if self.sweeps is not None:
+            return self.sweeps.start(system, t, state, norm)
         return split_start(system, t, state)
 
     def step(
@@ -158,23 +162,27 @@ class PSRM:
         norm: ErrorNorm,
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        if self._sweeps is not None:
-            return self._sweeps.step(system, t, h, state, memory, norm)
+        if self.sweeps is not None:
+            return self.sweeps.step(system, t, h, state, cast(SweepState, memory), norm)
         eps = self.regularisation
         theta = 1.0 if eps is None else -math.expm1(-h / eps(h))
         return split_step(system, self.scheme, t, h, state, memory, norm, theta)
 
     def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
-        if self._sweeps is not None:
-            self._sweeps.accept(memory, result)
+        if self.sweeps is not None:
+            self.sweeps.accept(cast(SweepState, memory), cast(SweepResult, result))
             return
         split_accept(memory, result)
 
     def resume(
         self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
     ) -> IntegratorState:
-        """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        if self._sweeps is not None:
-            return self._sweeps.resume(system, t, state, memory, norm)
+        """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        if self.sweeps is not None:
+            return self.sweeps.resume(system, t, state, cast(SweepState, memory), norm)
         return split_resume(system, t, state, memory)
+
+    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+        """Sentences about sweeps in the message of a run; none for the split form."""
+        return "" if self.sweeps is None else self.sweeps.run_messages(steps, norm)

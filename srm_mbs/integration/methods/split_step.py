@@ -32,8 +32,8 @@ from srm_mbs.integration.methods.near_singular import (
     BranchStages,
 )
 
-GAP_EVERY = 16
-"""Steps, after the first GAP_EVERY, from one look at all closure rows to the next."""
+RESIDUAL_EVERY = 16
+"""Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
 
 
 @lru_cache(maxsize=64)
@@ -45,7 +45,7 @@ def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
 def split_start(system: System, t: float, state: FloatArray) -> IntegratorState:
     """First stage, and the first node of the multiplier history."""
     terms = system.evaluate(t, state)
-    memory = IntegratorState(terms.rate().copy(), terms.sigma, system.magnitudes(state))
+    memory = IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
     if system.has_constraints:
         memory.history = MultiplierHistory.begin(t, terms.multiplier())
     return memory
@@ -75,7 +75,7 @@ def split_step(
     branch: BranchStages | None = None
     zone = None
     if history is not None and start < WATCHED + FAR * sigma_change:
-        weights = norm.weights(memory.magnitude)
+        weights = norm.weights(memory.state_scale)
         branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
         zone = branch.zone
     # Zeros, because each stage weighs all s rates: those still to come with 0.
@@ -83,7 +83,7 @@ def split_step(
     weighed = rates[:s]
     all_sigmas = [start]
     rates[0] = memory.rate
-    weak: list[tuple[int, int, bool]] = []
+    deficient: list[tuple[int, int, bool]] = []
     for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
         delta = stage_weights.dot(weighed)
         x = system.retract(state, delta)
@@ -93,12 +93,12 @@ def split_step(
             terms, x, moved = branch(terms, t + fraction * h, fraction, x)
         rate = terms.rate()
         rates[j] = system.chart_rate(delta, rate)
-        if terms.weak:
-            weak.append((j, terms.rank, terms.held))
+        if terms.rank_deficient:
+            deficient.append((j, terms.rank, terms.held))
     sigma = terms.sigma
     change = abs(sigma - start)
     quiet = branch is None and sigma > WATCHED + FAR * change
-    magnitude = system.magnitudes(x)
+    state_scale = system.state_scale(x)
     multiplier = normals = None
     if history is None:
         correction = np.zeros(0)
@@ -109,7 +109,7 @@ def split_step(
             correction = theta * correction
         new_state = system.retract(x, -correction)
         end_rate = rate - system.rate_change(correction)
-        if not (quiet or terms.weak) and (branch is not None or sigma < WATCHED):
+        if not (quiet or terms.rank_deficient) and (branch is not None or sigma < WATCHED):
             multiplier = terms.multiplier()
             if sigma < WATCHED:
                 normals = terms.normals()
@@ -120,11 +120,11 @@ def split_step(
     error_ratio = 0.0
     if scheme.error is not None:
         error = h * (scheme.error @ rates)
-        weights = norm.weights(np.maximum(memory.magnitude, magnitude))
+        weights = norm.weights(np.maximum(memory.state_scale, state_scale))
         if branch is not None and history is not None:
-            if weak and sigma_change > COUNT_UNCERTAINTY_ABOVE:
+            if deficient and sigma_change > COUNT_UNCERTAINTY_ABOVE:
                 error = np.abs(error)
-                for j, *_ in weak:
+                for j, *_ in deficient:
                     if j < s:
                         uncertainty = history.uncertainty(t + scheme.c[j] * h)
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
@@ -143,11 +143,15 @@ def split_step(
         zone=None,
         history=None,
         multiplier=multiplier,
-        magnitude=magnitude,
+        state_scale=state_scale,
     )
     steps = memory.steps
-    if (steps < GAP_EVERY or steps % GAP_EVERY == 0) and history is not None and theta == 1.0:
-        result.gap = terms.gap()
+    if (
+        (steps < RESIDUAL_EVERY or steps % RESIDUAL_EVERY == 0)
+        and history is not None
+        and theta == 1.0
+    ):
+        result.constraint_residual = terms.constraint_residual()
     if quiet:
         middle, c = scheme.middle
         halfway = abs(all_sigmas[middle] - start) / c
@@ -155,9 +159,9 @@ def split_step(
         result.slope = (change if change > halfway else halfway) / h
         return result
     result.normals = normals
-    if weak:
-        result.rank = min(rank for _, rank, _ in weak)
-        result.held = any(held for *_, held in weak)
+    if deficient:
+        result.rank = min(rank for _, rank, _ in deficient)
+        result.held = any(held for *_, held in deficient)
         result.zone, result.history = zone, history
     return result
 
@@ -176,7 +180,7 @@ def split_accept(memory: IntegratorState, result: StepResult) -> None:
     memory.steps += 1
     memory.rate = result.end_rate
     memory.sigma = float(result.sigmas[-1])
-    memory.magnitude = result.magnitude
+    memory.state_scale = result.state_scale
     if memory.history is not None:
         memory.history = history_after(memory.history, result)
 

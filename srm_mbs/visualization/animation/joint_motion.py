@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 
 if TYPE_CHECKING:
     from srm_mbs.visualization.animation.playback import Embedded

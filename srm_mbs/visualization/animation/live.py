@@ -15,9 +15,9 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat, node_names
 from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays

@@ -15,9 +15,9 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import WORLD
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, Picture, View
 from srm_mbs.visualization.animation.shapes import Box, Colour, Cylinder, Mesh, Shape, Sphere
 from srm_mbs.visualization.animation.trajectory import ActiveIntervals, BodyMotion

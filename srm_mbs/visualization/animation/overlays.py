@@ -14,12 +14,12 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, resolve_moving
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import SpringDamper
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.shapes import Colour, Cylinder, Mesh, Shape, Sphere
 from srm_mbs.visualization.animation.trajectory import (
     ActiveIntervals,
@@ -364,7 +364,7 @@ def _draw_reactions(
     InputError
         If the reactions are not known.
     """
-    if not isinstance(motion, Solution):
+    if not isinstance(motion, SimulationResult):
         raise InputError(
             "a motion that was not simulated has no reactions",
             element="reactions",

@@ -19,7 +19,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError
 from srm_mbs.integration.singular_passages import Crossing
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.scene import ASPECT, Picture
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
@@ -55,7 +55,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     """
     times = picture.motion.times
     data: dict[str, Any] = {"times": [], "values": [], "passages": []}
-    if panel and isinstance(motion, Solution):
+    if panel and isinstance(motion, SimulationResult):
         data = values_over_time(motion, times)
     return data | {
         "start": float(times[0]),
@@ -65,7 +65,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     }
 
 
-def values_over_time(solution: Solution, times: FloatArray) -> dict[str, Any]:
+def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str, Any]:
     """Drift, energy and sigma of a run at the ``times`` (n,) s of its key frames.
 
     Returns
@@ -121,7 +121,7 @@ def _passage_text(crossing: Crossing, *, named: bool) -> str:
     return f"{text}: {crossing.participants.names}" if named else text
 
 
-def sigma_at(solution: Solution, times: FloatArray) -> FloatArray:
+def sigma_at(solution: SimulationResult, times: FloatArray) -> FloatArray:
     """sigma (relative) at ``times`` (n,) s.
 
     Linear interpolation between the stages of the run, which record it, as in the plot of the run,

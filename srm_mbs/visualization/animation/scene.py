@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.model.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.visualization.animation.overlays import (
     OverlayOptions,
     Overlays,

@@ -21,10 +21,10 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.formats.xml import parse_urdf
+from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import Mechanism
 from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
 log = logging.getLogger(__name__)
@@ -157,7 +157,7 @@ def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
     source, model = mechanism.source, mechanism.model
     if source is None:
         return
-    root = parse_urdf(source.urdf, source.urdf_path)
+    root = parse_xml(source.urdf, source.urdf_path)
     # A colour may be defined anywhere, and be used by its name anywhere else.
     materials: dict[str, Element] = {}
     for material in root.iter("material"):

@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.overlays import OverlayOptions, active_springs
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
 from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Shape
@@ -50,7 +50,7 @@ AMBIENT = 0.45
 BACKGROUND = (1.0, 1.0, 1.0)
 
 
-def draw_snapshot(solution: Solution, t: float) -> bytes:
+def draw_snapshot(solution: SimulationResult, t: float) -> bytes:
     """The bodies and springs at ``t`` (s) as a PNG file.
 
     Raises

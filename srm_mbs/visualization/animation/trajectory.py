@@ -18,8 +18,8 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import Mechanism
 
 log = logging.getLogger(__name__)
 

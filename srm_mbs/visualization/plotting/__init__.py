@@ -23,8 +23,8 @@ from srm_mbs.visualization.plotting.run import draw_run, draw_sigma
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from srm_mbs.simulation.dae_result import DaeSolution
-    from srm_mbs.simulation.result import Solution
+    from srm_mbs.simulation.dae_result import DaeResult
+    from srm_mbs.simulation.result import SimulationResult
 
 __all__ = ["FORMATS", "KINDS", "Kind", "check_options", "plot_dae", "plot_solution"]
 
@@ -87,14 +87,14 @@ def check_options(
 
 
 def plot_solution(
-    solution: Solution, path: str | Path | None = None, kind: str = "run", **options: Any
+    solution: SimulationResult, path: str | Path | None = None, kind: str = "run", **options: Any
 ) -> Figure:
     """Plot a run; see :meth:`srm_mbs.Solution.plot`."""
     check_options(kind, options)
     return _drawn(partial(KINDS[kind].draw, solution, **options), path)
 
 
-def plot_dae(solution: DaeSolution, path: str | Path | None = None, kind: str = "run") -> Figure:
+def plot_dae(solution: DaeResult, path: str | Path | None = None, kind: str = "run") -> Figure:
     """Plot a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
     check_options(kind, kinds=DAE_KINDS)
     return _drawn(partial(DAE_KINDS[kind].draw, solution), path)

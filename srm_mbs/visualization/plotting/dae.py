@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srm_mbs.simulation.dae_result import DaeSolution
+from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     FONT_SIZE,
@@ -35,13 +35,13 @@ MAX_LINES = 4 * len(LINES)
 """Most lines of states, or of multipliers, on a page."""
 
 
-def draw_dae_run(solution: DaeSolution) -> Figure:
+def draw_dae_run(solution: DaeResult) -> Figure:
     """Drift at ``solution.t``, sigma and step sizes."""
     drift: Draw = partial(_drift, solution=solution)
     return time_panels(solution, [drift, sigma_panel(solution), step_panel(solution)])
 
 
-def draw_dae_state(solution: DaeSolution) -> Figure:
+def draw_dae_state(solution: DaeResult) -> Figure:
     """States and multipliers over time, several lines in a panel."""
     ends = solution.steps.times[solution.steps.times < solution.span[1]]
     t = between(np.append(ends, solution.span[1]), solution.steps.count)
@@ -58,7 +58,7 @@ def draw_dae_state(solution: DaeSolution) -> Figure:
     return time_panels(solution, draws, notes)
 
 
-def _drift(axes: Axes, solution: DaeSolution) -> str:
+def _drift(axes: Axes, solution: DaeResult) -> str:
     drift = finite(solution.drift)
     shown = np.maximum(drift, SMALLEST_DRIFT)
     draw_line(axes, solution.t, shown, color=BLACK, **curve(len(shown)))

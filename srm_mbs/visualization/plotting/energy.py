@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     LINES,
@@ -37,7 +37,7 @@ MAX_PIECES = 400
 """Number of parts from which steps are divided no further: works are integrated in each part."""
 
 
-def draw_balance(solution: Solution) -> Figure:
+def draw_balance(solution: SimulationResult) -> Figure:
     """Kinetic and potential energy, the work of all forces, and the residual of the balance.
 
     The residual is drawn at ``solution.t``; between the steps it is that of the dense output.
@@ -62,7 +62,11 @@ def draw_balance(solution: Solution) -> Figure:
 
 
 def _lines(
-    axes: Axes, solution: Solution, t: FloatArray, lines: Mapping[str, FloatArray], name: str
+    axes: Axes,
+    solution: SimulationResult,
+    t: FloatArray,
+    lines: Mapping[str, FloatArray],
+    name: str,
 ) -> None:
     mark_times(axes, solution, labelled=False)
     factor = linear_axis(axes, list(lines.values()), name, "J", size=0.0)
@@ -70,7 +74,7 @@ def _lines(
         draw_line(axes, t, values / factor, label=plain(label), **style)
 
 
-def _energies(axes: Axes, solution: Solution, balance: EnergyBalance) -> str:
+def _energies(axes: Axes, solution: SimulationResult, balance: EnergyBalance) -> str:
     # The zero of potential energy is a convention.
     potential = balance.potential - balance.potential[:1]
     total = balance.kinetic + potential
@@ -79,7 +83,9 @@ def _energies(axes: Axes, solution: Solution, balance: EnergyBalance) -> str:
     return "energies, the potential one from its start"
 
 
-def _works(axes: Axes, solution: Solution, t: FloatArray, works: Mapping[str, FloatArray]) -> str:
+def _works(
+    axes: Axes, solution: SimulationResult, t: FloatArray, works: Mapping[str, FloatArray]
+) -> str:
     lines = dict(works)
     if len(lines) > len(LINES):
         sizes = {name: np.abs(finite(work)) for name, work in works.items()}
@@ -91,7 +97,7 @@ def _works(axes: Axes, solution: Solution, t: FloatArray, works: Mapping[str, Fl
     return "work done on the mechanism"
 
 
-def _residual(axes: Axes, solution: Solution, balance: EnergyBalance) -> str:
+def _residual(axes: Axes, solution: SimulationResult, balance: EnergyBalance) -> str:
     mark_times(axes, solution, labelled=False)
     residual = balance.residual
     factor = linear_axis(axes, [residual], "residual ", "J", size=0.0)

@@ -26,7 +26,7 @@ from matplotlib.ticker import (
 )
 
 from srm_mbs.errors import InputError
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinned
 
 if TYPE_CHECKING:
@@ -330,7 +330,7 @@ def finish(figure: Figure, solution: Run, notes: Sequence[str] = ()) -> None:
 def run_title(solution: Run) -> str:
     """Mechanism, method, tableau and tolerance; status and end time if the run failed."""
     settings, unit = solution.settings, " s" if seconds(solution) else ""
-    name = solution.mechanism.name if isinstance(solution, Solution) else "index-2 DAE"
+    name = solution.mechanism.name if isinstance(solution, SimulationResult) else "index-2 DAE"
     control = f"rtol = {settings.rtol:.3g}"
     if settings.step is not None:
         control = f"fixed step {settings.step:.6g}{unit}"
@@ -343,7 +343,7 @@ def run_title(solution: Run) -> str:
 
 def seconds(solution: Run) -> str:
     """The unit of time after a word; a DAE has none."""
-    return " (s)" if isinstance(solution, Solution) else ""
+    return " (s)" if isinstance(solution, SimulationResult) else ""
 
 
 def some_of(names: Sequence[str]) -> str:

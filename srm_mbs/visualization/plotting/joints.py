@@ -14,10 +14,10 @@ import pinocchio as pin
 from matplotlib.figure import Figure
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import coordinate_units, joint_turns
 from srm_mbs.errors import InputError
-from srm_mbs.model.mechanism import Mechanism
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     BLUE,
@@ -131,7 +131,7 @@ def checked_names(names: Any, element: str, remedy: str) -> tuple[str, ...]:
     return found
 
 
-def components(run: Solution, joint: str) -> Iterator[Component]:
+def components(run: SimulationResult, joint: str) -> Iterator[Component]:
     """The components of a joint at the times ``run.t``."""
     mechanism = run.mechanism
     data = mechanism.joint(joint)
@@ -167,7 +167,7 @@ def components(run: Solution, joint: str) -> Iterator[Component]:
         yield component("", slice(0, data.nv), same, names, turns=kind != "Translation")
 
 
-def noise(run: Solution) -> float:
+def noise(run: SimulationResult) -> float:
     """Part of the typical magnitude below which changes of coordinates of ``run`` are noise."""
     return NOISE_RATIO * min(run.settings.rtol, LARGEST_NOISE_TOLERANCE)
 
@@ -191,7 +191,7 @@ def rotation_vectors(quaternions: FloatArray) -> FloatArray:
     return out
 
 
-def draw_state(solution: Solution, joints: Sequence[str] | None = None) -> Figure:
+def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
     """Position and rate of each joint over time.
 
     Parameters
@@ -244,7 +244,7 @@ def draw_state(solution: Solution, joints: Sequence[str] | None = None) -> Figur
 
 def _panel(
     axes: Axes,
-    solution: Solution,
+    solution: SimulationResult,
     t: FloatArray,
     values: FloatArray,
     names: tuple[str, ...],
@@ -258,7 +258,7 @@ def _panel(
         draw_line(axes, t, own / factor, label=name or None, **style)
 
 
-def draw_phase(solution: Solution, joints: Sequence[str] | None = None) -> Figure:
+def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
     """Rate over position of joints with one degree of freedom.
 
     Parameters
@@ -305,7 +305,12 @@ def draw_phase(solution: Solution, joints: Sequence[str] | None = None) -> Figur
 
 
 def _portrait(
-    axes: Axes, solution: Solution, run: Solution, passages: Solution | None, name: str, alone: bool
+    axes: Axes,
+    solution: SimulationResult,
+    run: SimulationResult,
+    passages: SimulationResult | None,
+    name: str,
+    alone: bool,
 ) -> None:
     prepare(axes, "both")
     (component,) = components(run, name)

@@ -14,7 +14,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs.dynamics.scaling import coordinate_units
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, resolve_moving
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     FONT_SIZE,
     LINES,
@@ -48,7 +48,7 @@ Places = dict[str, tuple[int, pin.SE3]]
 """Points by name: joint, and placement in it."""
 
 
-def draw_path(solution: Solution, points: Sequence[Anchor] | None = None) -> Figure:
+def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None) -> Figure:
     """Paths of points, with equal axes, their starts and ends marked.
 
     One view if they lie in planes normal to an axis of the world, otherwise three views.
@@ -104,7 +104,7 @@ def _name(anchor: Anchor) -> str:
     return f"{anchor.where} ({', '.join(f'{x:.4g}' for x in anchor.xyz)})"
 
 
-def _paths(run: Solution, places: Places) -> dict[str, FloatArray]:
+def _paths(run: SimulationResult, places: Places) -> dict[str, FloatArray]:
     """Positions (n, 3) m in the world of each point."""
     model = run.mechanism.model
     data = workspace(model)
@@ -116,7 +116,7 @@ def _paths(run: Solution, places: Places) -> dict[str, FloatArray]:
     return paths
 
 
-def _default_paths(solution: Solution, run: Solution) -> dict[str, FloatArray]:
+def _default_paths(solution: SimulationResult, run: SimulationResult) -> dict[str, FloatArray]:
     """Paths of the origins of joints, of the anchors of closures, or of centres of mass."""
     mechanism = solution.mechanism
     model = mechanism.model

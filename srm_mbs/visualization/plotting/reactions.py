@@ -10,7 +10,7 @@ import numpy as np
 
 from srm_mbs.dynamics.scaling import joint_turns
 from srm_mbs.errors import ControllerError, EvaluationError, InputError
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     LINES,
     Draw,
@@ -49,7 +49,7 @@ Lines = Mapping[str, "FloatArray"]
 
 
 def draw_reactions(
-    solution: Solution, loops: Sequence[str] | None = None, rows: bool = False
+    solution: SimulationResult, loops: Sequence[str] | None = None, rows: bool = False
 ) -> Figure:
     """Forces and moments in the closures, and the forces of couplings and drives.
 
@@ -98,7 +98,7 @@ def draw_reactions(
     return time_panels(solution, draws, notes, height=1.9)
 
 
-def _readable(solution: Solution) -> Solution:
+def _readable(solution: SimulationResult) -> SimulationResult:
     """The run at smooth times; without the end of a failed run if there are no forces there."""
     run = read_smoothly(solution, MAX_PIECES)
     try:
@@ -116,7 +116,7 @@ def _readable(solution: Solution) -> Solution:
     return run
 
 
-def _indeterminate(solution: Solution, loops: Sequence[str]) -> list[str]:
+def _indeterminate(solution: SimulationResult, loops: Sequence[str]) -> list[str]:
     own = [row for row in solution.indeterminate_reactions if row.rpartition(".")[0] in loops]
     if not own:
         return []
@@ -124,7 +124,7 @@ def _indeterminate(solution: Solution, loops: Sequence[str]) -> list[str]:
 
 
 def _by_loop(
-    run: Solution, found: Mapping[str, LoopClosure], names: Sequence[str] | None
+    run: SimulationResult, found: Mapping[str, LoopClosure], names: Sequence[str] | None
 ) -> tuple[list[Draw], list[str]]:
     """Norms of force and moment of closures, couplings by the force on their first joint."""
     tied = [name for name in names or found if found[name].anchors]
@@ -166,7 +166,7 @@ def _takes_moments(loop: LoopClosure) -> bool:
 
 
 def _by_row(
-    run: Solution, found: Mapping[str, LoopClosure], names: Sequence[str] | None
+    run: SimulationResult, found: Mapping[str, LoopClosure], names: Sequence[str] | None
 ) -> tuple[list[Draw], list[str]]:
     """The multipliers of each closure, rows of one unit in a panel."""
     draws: list[Draw] = []
@@ -193,7 +193,7 @@ def _by_row(
     return draws, left
 
 
-def _drives(run: Solution) -> list[Draw]:
+def _drives(run: SimulationResult) -> list[Draw]:
     model = run.mechanism.model
     turning = {
         drive.name: drive.joint is not None and joint_turns(model, drive.joint)
@@ -208,11 +208,11 @@ def _drives(run: Solution) -> list[Draw]:
     return draws
 
 
-def _panel(run: Solution, lines: Lines, name: str, unit: str, title: str) -> Draw:
+def _panel(run: SimulationResult, lines: Lines, name: str, unit: str, title: str) -> Draw:
     return partial(_draw, run=run, lines=lines, name=name, unit=unit, title=title)
 
 
-def _draw(axes: Axes, run: Solution, lines: Lines, name: str, unit: str, title: str) -> str:
+def _draw(axes: Axes, run: SimulationResult, lines: Lines, name: str, unit: str, title: str) -> str:
     mark_times(axes, run, labelled=False)
     top = AXIS_RATIO * _percentile(list(lines.values()))
     cut = _largest(lines) > PEAK_RATIO / AXIS_RATIO * top > 0.0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srm_mbs.dynamics.scaling import row_dimensions
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     BLUE,
@@ -45,7 +45,7 @@ SMALLEST_SIGMA = 1e-16
 """Ordinate of a sigma of exactly zero on the logarithmic axis."""
 
 
-def draw_run(solution: Solution) -> Figure:
+def draw_run(solution: SimulationResult) -> Figure:
     """Drift, energy, sigma and step sizes of a run over time, in panels with one time axis.
 
     Drift and energy are drawn at ``solution.t``, sigma and step sizes at the steps.  Open chains
@@ -59,7 +59,7 @@ def draw_run(solution: Solution) -> Figure:
     return time_panels(solution, draws)
 
 
-def _drift(axes: Axes, solution: Solution) -> str:
+def _drift(axes: Axes, solution: SimulationResult) -> str:
     found = {part for each in solution.segments for part in row_dimensions(each.mechanism)}
     parts = [part for part in ("m", "rad") if part in found]
     units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
@@ -77,7 +77,7 @@ def _drift(axes: Axes, solution: Solution) -> str:
     return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
 
 
-def _energy(axes: Axes, solution: Solution) -> str:
+def _energy(axes: Axes, solution: SimulationResult) -> str:
     change = finite(solution.energy - solution.energy[:1])
     factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
     draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))
@@ -102,7 +102,7 @@ def step_panel(solution: Run, *, kinds: bool = False) -> Draw:
     return partial(_step_sizes, solution=solution, kinds=kinds)
 
 
-def draw_sigma(solution: Solution) -> Figure:
+def draw_sigma(solution: SimulationResult) -> Figure:
     """sigma, step sizes and error estimates of a run (figures 5.14 to 5.16 of the thesis)."""
     draws = [sigma_panel(solution, log=True)] if constrained(solution) else []
     draws.append(step_panel(solution, kinds=True))
@@ -179,7 +179,7 @@ def _special(solution: Run) -> list[tuple[str, BoolArray, str, str, float]]:
     ]
 
 
-def _errors(axes: Axes, solution: Solution) -> str:
+def _errors(axes: Axes, solution: SimulationResult) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=False)
     axes.axhline(1.0, color=BLACK, linewidth=0.7, linestyle="--")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.simulation.dae_result import DaeSolution
-from srm_mbs.simulation.result import Solution
+from srm_mbs.simulation.dae_result import DaeResult
+from srm_mbs.simulation.result import SimulationResult
 
 PIECES_PER_STEP = 8
 """Number of parts of each step: curves bend between the ends of steps of high order."""
@@ -18,28 +18,28 @@ COLUMNS, ROWS = 1600, 800
 """Resolution of a plot: about twice as many as a page or a screen distinguishes."""
 
 
-Run = Solution | DaeSolution
+Run = SimulationResult | DaeResult
 
 
 def passages(solution: Run) -> list[float]:
     """Times (s) of the singular passages; a DAE has none."""
-    found = solution.crossings if isinstance(solution, Solution) else ()
+    found = solution.crossings if isinstance(solution, SimulationResult) else ()
     return [crossing.time for crossing in found]
 
 
 def jumps(solution: Run) -> list[float]:
     """Times (s) of the actions of events."""
-    if not isinstance(solution, Solution):
+    if not isinstance(solution, SimulationResult):
         return []
     return [segment.span[0] for segment in solution.segments[1:]]
 
 
-def constrained(solution: Solution) -> bool:
+def constrained(solution: SimulationResult) -> bool:
     """Whether any segment of the run has closures or drives."""
     return any(segment.mechanism.constrained for segment in solution.segments)
 
 
-def read_smoothly(solution: Solution, most: int = MAX_PIECES) -> Solution:
+def read_smoothly(solution: SimulationResult, most: int = MAX_PIECES) -> SimulationResult:
     """The run at the ends of its steps and between them, so that curves are smooth.
 
     The times increase.  Each action of an event has two: the preceding floating-point number, with
@@ -57,7 +57,7 @@ def read_smoothly(solution: Solution, most: int = MAX_PIECES) -> Solution:
     return solution.at(times)
 
 
-def _times(solution: Solution, most: int) -> FloatArray:
+def _times(solution: SimulationResult, most: int) -> FloatArray:
     segments = solution.segments
     steps = sum(segment.steps.count for segment in segments)
     parts = []
@@ -81,7 +81,9 @@ def between(ends: FloatArray, steps: int, most: int = MAX_PIECES) -> FloatArray:
     return np.append(ends[:-1, None] + np.diff(ends)[:, None] * inside, ends[-1])
 
 
-def broken(solution: Solution, t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def broken(
+    solution: SimulationResult, t: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """``t`` (n,) and ``values`` (n, ...) with a gap (nan) at each jump."""
     at = np.searchsorted(t, jumps(solution))
     return np.insert(t, at, np.nan), np.insert(values, at, np.nan, axis=0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from srm_mbs.dynamics.constraints.projection import Projection, pivoted_qr, swept_qr
-from srm_mbs.dynamics.constraints.row_algebra import LARGE, graph_order
+from srm_mbs.dynamics.constraints.row_algebra import GRAPH_ORDER_ABOVE, graph_order
 
 
 def pattern_of(supports: list[list[int]], nv: int) -> np.ndarray:
@@ -57,10 +57,11 @@ def test_each_branch_of_a_tree_of_loops_is_ordered_in_one_piece() -> None:
 
 def test_ancestors_make_rows_meet() -> None:
     """Rows that have no coordinate in common, on bodies that one chain carries."""
-    supports = [[k] for k in range(LARGE + 1)]
-    carried = [-1, *range(LARGE)]
-    assert graph_order(pattern_of(supports, LARGE + 1), [-1] * (LARGE + 1)) != ()
-    assert graph_order(pattern_of(supports, LARGE + 1), carried) == ()
+    many = GRAPH_ORDER_ABOVE + 1
+    supports = [[k] for k in range(many)]
+    carried = [-1, *range(GRAPH_ORDER_ABOVE)]
+    assert graph_order(pattern_of(supports, many), [-1] * many) != ()
+    assert graph_order(pattern_of(supports, many), carried) == ()
 
 
 def test_few_coordinates_and_full_rows_have_no_order() -> None:

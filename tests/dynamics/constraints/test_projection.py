@@ -167,7 +167,7 @@ def test_sigma_is_the_last_structural_pivot_over_its_reference() -> None:
     p = Projection(3, 0.25)
     p.factor(problem.M, problem.G, problem.f, problem.bias, None)
     assert p.sigma == pytest.approx(last / 0.25, rel=1e-12)
-    assert (p.rank, p.weak) == (3, False)
+    assert (p.rank, p.rank_deficient) == (3, False)
 
 
 def test_pivots_are_the_distances_of_each_row_from_those_before_it() -> None:
@@ -204,7 +204,7 @@ def test_redundant_rows_change_neither_rank_nor_multiplier(kind: str, told: bool
     structural = 4 if told else min(9, len(problem.G))
     p = problem.factor(structural)
     assert p.rank == 4
-    assert p.weak == (structural > 4)
+    assert p.rank_deficient == (structural > 4)
     assert_close(yhat(p), yhat(plain.factor()), atol=1e-11)
     assert_close(matrices(p, len(problem.G))[1], matrices(plain.factor(), 4)[1], atol=1e-12)
     w = problem.rng.standard_normal(9)
@@ -215,7 +215,7 @@ def test_no_rows_of_any_size_leave_the_motion_free() -> None:
     problem = Problem(4, 2)
     problem.G = np.zeros((2, 4))
     p = problem.factor(2)
-    assert (p.rank, p.weak, p.sigma) == (0, True, 0.0)
+    assert (p.rank, p.rank_deficient, p.sigma) == (0, True, 0.0)
     np.testing.assert_array_equal(yhat(p), np.zeros(4))
     np.testing.assert_array_equal(p.project(np.ones(4)), np.zeros(4))
 
@@ -290,7 +290,7 @@ def test_a_joint_that_moves_no_inertia_is_an_error() -> None:
         "point_on_plane", srm.Anchor("tip", xyz=(1, 0, 0)), srm.Anchor("world"), (0, 0, 1)
     )
     with pytest.raises(
-        srm.InputError, match=r"last.*neither .tip. nor anything behind it has inertia"
+        srm.InputError, match=r"last.*neither .tip. nor anything that it carries has inertia"
     ):
         make_system(srm.Mechanism(model, (loop,)))
 
@@ -323,7 +323,7 @@ def test_acceleration_stays_accurate_next_to_a_singular_configuration(phi: float
         for sign in (1.0, -1.0):
             state, exact = folded(sign * phi * (1.0 + 0.01 * rate), rate)
             terms = system.evaluate(0.0, state)
-            assert not terms.weak
+            assert not terms.rank_deficient
             found = terms.rate()
             errors += [abs(found[2] - exact), abs(found[3] + 2.0 * exact)]
     assert max(errors) < 2e-13 / phi  # e / phi for a closure error e of round-off
@@ -380,7 +380,7 @@ def test_the_zone_drops_every_weak_pivot_and_keeps_the_strong_rows_exact(angle: 
     system, state = crossing_four_bars(angle)
     prediction = np.array([0.3, -0.7, 1.1, 0.4, -0.2])
     terms = system.evaluate(0.0, state)
-    assert (terms.rank, terms.weak) == (4, False)
+    assert (terms.rank, terms.rank_deficient) == (4, False)
     threshold = 4.0 * terms.sigma  # above both weak pivots, which differ by a factor below 3
 
     asked: list[float] = []
@@ -390,7 +390,7 @@ def test_the_zone_drops_every_weak_pivot_and_keeps_the_strong_rows_exact(angle: 
         return prediction
 
     terms = system.evaluate(0.25, state, Zone(threshold, predict))
-    assert (terms.rank, terms.weak) == (2, True)
+    assert (terms.rank, terms.rank_deficient) == (2, True)
     assert asked == [0.25]
     M, rows, f, bias = dense_terms(system, state)
     strong, gamma = rows[system.projection.order], bias[system.projection.order]
@@ -592,7 +592,7 @@ def test_an_open_chain_calls_aba_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = counted_pinocchio(monkeypatch)
     terms = system.evaluate(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
     assert calls == {"aba": 1}
-    assert (terms.sigma, terms.rank, terms.weak) == (np.inf, 0, False)
+    assert (terms.sigma, terms.rank, terms.rank_deficient) == (np.inf, 0, False)
     assert not any(
         x.any() for x in (terms.multiplier(), terms.correction(), terms.project(np.ones(3)))
     )

@@ -11,6 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.local_analysis import (
@@ -19,7 +20,6 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
 )
 from srm_mbs.integration.singular_passages import find_crossings
-from srm_mbs.model.mechanism import Mechanism
 from tests.support import reduced
 from tests.support.mechanisms import ball_dead_point, floating_slider_crank
 

@@ -48,7 +48,7 @@ class Twins:
     def __init__(self, text: str) -> None:
         made = self.made = translated(text)
         self.entries = made.entries
-        self.model = build_urdf(made.urdf, "x.urdf", made.entries.get("base", "fixed")).model
+        self.model = build_urdf(made.tree, "x.urdf", made.entries.get("base", "fixed")).model
         self.model.gravity.linear = np.array(made.entries["gravity"])
         keys = {key: value for key, value in made.entries.items() if key != "loop"}
         toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})

@@ -12,6 +12,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.joint_graph import Joint, NoTreeError, spanning_tree
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, rpy
 from srm_mbs.formats.sdf.reader import translate
@@ -21,12 +22,12 @@ from tests.support.sdf_files import CASSIES, cassie, four_bar, joint, link, sdf
 
 
 def translated(text: str, *cut: str, file: str = "robot.sdf") -> Translation:
-    return translate(text, file, Options(cut))
+    return translate(Document(text, file), Options(cut))
 
 
 def tree(text: str, *cut: str) -> pin.Model:
     made = translated(text, *cut)
-    return build_urdf(made.urdf, "robot.urdf", made.entries.get("base", "fixed")).model
+    return build_urdf(made.tree, "robot.urdf", made.entries.get("base", "fixed")).model
 
 
 def loaded(folder: Path, text: str, **options: Any) -> srm.Mechanism:
@@ -248,7 +249,7 @@ def test_an_older_thread_pitch_counts_turns_as_libsdformat_does() -> None:
         version="1.6",
     )
     made = translated(text)
-    model = build_urdf(made.urdf, "robot.urdf", "fixed").model
+    model = build_urdf(made.tree, "robot.urdf", "fixed").model
     np.testing.assert_allclose(placed(model, "nut", np.array([1.0])).translation, [0, 0, 0.2])
     assert any("thread_pitch" in note for note in made.notes)
 
@@ -262,7 +263,7 @@ def test_masses_and_moments_are_those_of_the_file() -> None:
         joint("other", "revolute", "world", "bare"),
     )
     made = translated(text)
-    model = build_urdf(made.urdf, "robot.urdf", "fixed").model
+    model = build_urdf(made.tree, "robot.urdf", "fixed").model
     turn = pin.rpy.rpyToMatrix(0.3, 0.4, 0.0)
     own = np.array([[0.2, 0.01, 0.0], [0.01, 0.3, 0.0], [0.0, 0.0, 0.4]])
     arm = model.inertias[model.getJointId("hinge")]
@@ -488,7 +489,7 @@ def test_every_cassie_file_is_posed_and_weighs_what_it_says(name: str) -> None:
     """The files place all links in the model's frame."""
     path = cassie(name)
     made = translated(path.read_text(), file=str(path))
-    model = build_urdf(made.urdf, str(path), made.entries.get("base", "fixed")).model
+    model = build_urdf(made.tree, str(path), made.entries.get("base", "fixed")).model
     root = ElementTree.parse(path).getroot()
     mass = 0.0
     for node in root.iter("link"):

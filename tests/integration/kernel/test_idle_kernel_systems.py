@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.skipif(kernel.core is None, reason="needs the compiled 
 
 
 def idle(mechanism: srm.Mechanism) -> list[Any]:
-    return list(mechanism.derived("idle twins", list))
+    return list(twins.idle_workspaces(mechanism))
 
 
 def run(mechanism: srm.Mechanism, **options: Any) -> srm.Solution:
@@ -73,10 +74,9 @@ def test_runs_at_the_same_time_do_not_share() -> None:
 
 def test_no_more_than_a_few_are_kept() -> None:
     system = make_system(fresh())
-    taken = [twins.taken(system) for _ in range(2 * twins.KEPT)]
-    assert len(set(map(id, taken))) == 2 * twins.KEPT
-    for kernel_system in taken:
-        twins.given_back(system, kernel_system)
+    with ExitStack() as stack:
+        borrowed = [stack.enter_context(twins.workspace(system)) for _ in range(2 * twins.KEPT)]
+        assert len(set(map(id, borrowed))) == 2 * twins.KEPT
     assert len(idle(system.mechanism)) == twins.KEPT
 
 
@@ -131,17 +131,16 @@ def test_a_run_that_raises_does_not_spoil_the_next() -> None:
 def test_forces_held_in_one_run_do_not_act_in_the_next() -> None:
     mechanism = fresh()
     system = make_system(mechanism)
-    kernel_system = twins.taken(system)
-    state = np.concatenate([mechanism.q0, mechanism.v0])
-    free = kernel_system.terms(0.0, state)["rate"]
-    kernel_system.hold(0.0, np.full(7, 1.0), True)
-    kernel_system.between(5.0, 6.0)
-    assert not np.array_equal(kernel_system.terms(0.0, state)["rate"], free)
-    twins.given_back(system, kernel_system)
-    again = twins.taken(system)
-    assert again is kernel_system
-    assert again.evaluations == 0
-    assert np.array_equal(again.terms(0.0, state)["rate"], free)
+    with twins.workspace(system) as kernel_system:
+        state = np.concatenate([mechanism.q0, mechanism.v0])
+        free = kernel_system.terms(0.0, state)["rate"]
+        kernel_system.hold(0.0, np.full(7, 1.0), True)
+        kernel_system.between(5.0, 6.0)
+        assert not np.array_equal(kernel_system.terms(0.0, state)["rate"], free)
+    with twins.workspace(system) as again:
+        assert again is kernel_system
+        assert again.evaluations == 0
+        assert np.array_equal(again.terms(0.0, state)["rate"], free)
 
 
 def test_stages_that_could_not_be_evaluated_are_not_read_as_zeros_later() -> None:

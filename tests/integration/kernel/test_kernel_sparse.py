@@ -11,7 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints import row_algebra
-from srm_mbs.dynamics.constraints.row_algebra import LARGE
+from srm_mbs.dynamics.constraints.row_algebra import GRAPH_ORDER_ABOVE
 from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.kernel import backend as kernel
@@ -154,7 +154,7 @@ def test_its_terms_are_the_dense_ones_up_to_the_singularity_of_a_chain(n: int) -
     for angle in (1.5, 0.8, 0.3, 1e-2, 1e-4, 1e-6):
         x = flat(mechanism, angle)
         found = sparse.terms(0.0, x)
-        alike(found, dense.terms(0.0, x), same_pivots=system.nv <= LARGE)
+        alike(found, dense.terms(0.0, x), same_pivots=system.nv <= GRAPH_ORDER_ABOVE)
         alike(found, reference_terms(system, x))
 
 
@@ -173,7 +173,7 @@ def test_it_drops_the_pivots_that_the_dense_algebra_drops(n: int) -> None:
                 ranks.add(expected["rank"])
                 weakest = max(threshold, 1e-3) if expected["rank"] < 2 * n else None
                 found = sparse.terms(0.0, x, threshold)
-                if system.nv <= LARGE:
+                if system.nv <= GRAPH_ORDER_ABOVE:
                     alike(found, expected, weakest)
                     continue
                 # Pivots of 0.05 or so lie on either side of the threshold with another order.
@@ -375,7 +375,7 @@ def test_loops_hung_on_each_other_run_as_with_the_largest_pivots(
     system = ClosedSystem(mechanism)
     assert system.constants()["order"]
     assert int(mechanism.structure.kept.sum()) > mechanism.structure.rank
-    monkeypatch.setattr(row_algebra, "LARGE", 10**6)
+    monkeypatch.setattr(row_algebra, "GRAPH_ORDER_ABOVE", 10**6)
     other, expected = run()
     assert not ClosedSystem(other).constants()["order"]
     assert other.structure.rank == mechanism.structure.rank

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.methods.regularisation import real_stability_limit
+from srm_mbs.integration.methods.thesis.regularisation import real_stability_limit
 from tests.support.daes import START_TWO, problem_two
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.methods.regularisation import parse_eps, real_stability_limit
+from srm_mbs.integration.methods.thesis.regularisation import parse_eps, real_stability_limit
 from tests.support import reduced
 from tests.support.bundled import load
 from tests.support.convergence import observed_order, turning
@@ -179,9 +179,10 @@ def test_a_mechanism_that_turns_in_many_short_steps_is_reported(
     """Stages evaluated where they are, and constraint errors that pile up uncounted: sweeps off
     the closures turn at the passage."""
     monkeypatch.setattr("srm_mbs.integration.methods.near_singular.NEAR", 0.0)
-    monkeypatch.setattr("srm_mbs.integration.methods.iterated_sweeps.LASTS", 0.0)
+    monkeypatch.setattr("srm_mbs.integration.methods.thesis.sweep.NEAR", 0.0)
+    monkeypatch.setattr("srm_mbs.integration.methods.thesis.iterated_sweeps.SETTLING_RATIO", 0.0)
     monkeypatch.setattr(
-        "srm_mbs.integration.methods.iterated_sweeps.can_hand_over", lambda *_: False
+        "srm_mbs.integration.methods.thesis.iterated_sweeps.may_be_taken_over", lambda *_: False
     )
     method = srm.PSRM("dopr54", correction="sweep", interpolation="linear")
     solution = srm.simulate(load("slider_crank"), 1.5, method=method, rtol=1e-4, atol=1e-4)

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import srm_mbs as srm
-from srm_mbs.simulation.result import Solution
+from srm_mbs.api import Solution
 from srm_mbs.visualization.plotting import KINDS, sampling
 from srm_mbs.visualization.plotting import figure as style
 from srm_mbs.visualization.plotting import joints as phase

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import srm_mbs as srm
-from srm_mbs.simulation.result import Solution
+from srm_mbs.api import Solution
 from srm_mbs.visualization.plotting import figure as panels
 from srm_mbs.visualization.plotting import run
 from tests.support.bundled import load

@@ -26,7 +26,7 @@ from tools import plot_pictures, singular_pictures
 from tools.method_tables import filled
 from tools.singular_pictures import by_scipy
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SOURCE = ROOT / "srm_mbs"
 PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
@@ -207,7 +207,7 @@ def test_the_readme_starts_with_exactly_two_commands() -> None:
 
 def test_the_page_on_control_says_what_is_out_of_scope() -> None:
     page = PAGES["control.md"].read_text(encoding="utf-8")
-    assert "Contact between bodies" in page[page.index("## What this is not for") :]
+    assert "Contact between bodies" in page[page.index("## Out of scope") :]
 
 
 def test_the_run_with_an_impact_on_the_page_on_control_has_segments(ran: Ran) -> None:
@@ -248,7 +248,7 @@ def test_the_table_on_the_page_on_methods_is_that_of_the_committed_benchmark() -
 
 def test_the_page_on_methods_has_every_tableau_with_its_order_and_stages() -> None:
     page = PAGES["methods.md"].read_text(encoding="utf-8")
-    for line in page[page.index("## Tableau") : page.index("The README lists")].splitlines():
+    for line in page[page.index("## Tableau") : page.index("the observed orders.")].splitlines():
         if line.startswith("| `"):
             names, orders, stages, estimate, _ = (
                 cell.strip() for cell in line.strip("|").split("|")
@@ -300,9 +300,11 @@ def test_the_pictures_of_a_page_can_be_drawn_again(
 def test_the_roles_of_docstrings_become_links_and_formulae_code() -> None:
     roles = pytest.importorskip("tools.docstring_roles", reason="needs the extra docs")
     text = roles.without_roles(
-        r"See :class:`~srm_mbs.model.mechanism.Mechanism`, :math:`\dot G v`."
+        r"See :class:`~srm_mbs.dynamics.mechanism.Mechanism`, :math:`\dot G v`."
     )
-    link = '<autoref optional identifier="srm_mbs.model.mechanism.Mechanism">`Mechanism`</autoref>'
+    link = (
+        '<autoref optional identifier="srm_mbs.dynamics.mechanism.Mechanism">`Mechanism`</autoref>'
+    )
     assert text == rf"See {link}, `\dot G v`."
 
 

@@ -7,8 +7,8 @@ tableau, the end of the step, and the extra stages of its continuous extension i
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,8 +16,10 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms, Zone
 from srm_mbs.errors import InputError
+from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
-from srm_mbs.integration.methods.near_singular import BranchStages
+from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+from srm_mbs.integration.methods.near_singular import NEAR, WATCHED, BranchStages
 
 Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
 """(terms, node) -> tangent rate and multiplier there; the equation that a sweep integrates."""
@@ -26,7 +28,8 @@ INTERPOLATIONS = ("auto", "linear")
 """Those of SRM; PSRM has ``"stages"`` as well."""
 GOOD_EXTENSION = 4
 """Order from which an extension is used to interpolate the multiplier."""
-
+ROTATION_MARGIN = 2.0
+"""Safety factor of the change of a constraint error by the rotation of the closures."""
 
 REGULARISERS = ("identity", "transpose", "inverse")
 """The matrices T of (2.2): I, (GB)^T, (GB)^-1."""
@@ -49,8 +52,141 @@ def checked_regulariser(T: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
+class SweepNode:
+    """One sweep at the end of a step.
+
+    Attributes
+    ----------
+    state : (nx,)
+        The sweep's own state.
+    multiplier
+        Its multiplier there, in the form that the system's sweeps carry.
+    rate : (n,) or None
+        Its tangent rate there; None if the next step has to evaluate it.
+    eps
+        The regularisation (s) of that rate.
+    history
+        Its multipliers at recent step ends outside the zone; None where sweeps need no zone.
+    closure_distance
+        Its distance from the closures (rad, scene diagonals).
+    first_multiplier
+        With own histories, y_0: the constant multiplier of the first sweep; None for 0.
+    taken_over
+        Whether the split form makes the steps of the sweeps here (split takeover,
+        :mod:`srm_mbs.integration.methods.thesis.iterated_sweeps`).
+    """
+
+    state: FloatArray
+    multiplier: FloatArray
+    rate: FloatArray | None
+    eps: float
+    history: MultiplierHistory | None
+    closure_distance: float = 0.0
+    first_multiplier: FloatArray | None = None
+    taken_over: bool = False
+
+
+@dataclass
+class SweepState(IntegratorState):
+    """Memory of a method with sweeps.
+
+    Attributes
+    ----------
+    sweeps
+        The sweeps at the current state, the last one last.
+    """
+
+    sweeps: tuple[SweepNode, ...] = ()
+
+    def set_first_stage(
+        self, rate: FloatArray, multiplier: FloatArray, history: MultiplierHistory
+    ) -> None:
+        """As for other methods, and for each sweep that carries a multiplier or a history."""
+        super().set_first_stage(rate, multiplier, history)
+        self.sweeps = tuple(
+            replace(
+                node,
+                multiplier=multiplier if np.any(node.multiplier) else node.multiplier,
+                history=None if node.history is None else history,
+            )
+            for node in self.sweeps
+        )
+
+
+@dataclass(slots=True)
+class SweepResult(StepResult):
+    """A proposed step of a method with sweeps.
+
+    Attributes
+    ----------
+    sweeps
+        The sweeps at the end.
+    drift_ratio
+        With an embedded pair: constraint error of the last sweep at the end, over tolerance;
+        else 0.
+    closure_distance
+        Largest distance of any sweep from the closures at the end (rad, scene diagonals).
+    restarted
+        Whether sweeps with own histories started from the accepted state in this step.
+    taken_over
+        Whether the split form made this step (split takeover).
+    """
+
+    sweeps: tuple[SweepNode, ...] = ()
+    drift_ratio: float = 0.0
+    closure_distance: float = 0.0
+    restarted: bool = False
+    taken_over: bool = False
+
+
+def sweep_nodes(memory: IntegratorState) -> tuple[SweepNode, ...]:
+    """The sweeps of ``memory``; none for a method without sweeps."""
+    return memory.sweeps if isinstance(memory, SweepState) else ()
+
+
+def carried_multipliers(
+    start: Sequence[SweepNode], steps: Sequence[StepResult]
+) -> list[FloatArray]:
+    """The last sweep's multiplier at the start and at the end of each step; none without sweeps."""
+    ends = [step.sweeps for step in steps if isinstance(step, SweepResult)]
+    return [nodes[-1].multiplier for nodes in (start, *ends) if nodes]
+
+
+@dataclass
+class SweepStages(BranchStages):
+    """:class:`~srm_mbs.integration.methods.near_singular.BranchStages` of a step of sweeps.
+
+    Parameters
+    ----------
+    memory_span
+        How long a sweep keeps a constraint error, eps (s).
+    """
+
+    memory_span: float = 0.0
+
+    def reach(self) -> float:
+        """sigma below which the step is next to a singular configuration.
+
+        By time, not by steps alone: errors kept over many short steps grow like 1/sigma^2 in the
+        multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
+        """
+        spans = max(1.0, self.memory_span / self.h)
+        return NEAR * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED
+
+    def rotation_drift(self, off: FloatArray, sigma: float) -> FloatArray:
+        """Largest change (n,) over the step of the distance ``off`` (n,) of a sweep from the
+        closures, because these rotate next to ``sigma``.
+
+        It is a part of ``off`` however short the step: no shorter step makes it smaller.
+        """
+        reach = self.sigma_change / sigma
+        effect = self.effect_on_rates(off, sigma, self.sigma_change)
+        return ROTATION_MARGIN * (effect + reach * np.abs(off))
+
+
+@dataclass(frozen=True, eq=False)
 class Nodes:
-    """Where the sweeps of a scheme are evaluated: s stages, the end, e extra stages.
+    """The nodes at which the sweeps of a scheme are evaluated: s stages, the end, e extra stages.
 
     Attributes
     ----------
@@ -112,7 +248,7 @@ class Start:
         Tangent rate.
     multiplier : (k,)
         The sweep's multiplier.
-    sigma, rank, weak
+    sigma, rank, rank_deficient
         Of the evaluation.
     """
 
@@ -120,7 +256,7 @@ class Start:
     multiplier: FloatArray
     sigma: float
     rank: int
-    weak: bool = False
+    rank_deficient: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +278,7 @@ class Sweep:
     sigmas : (s + 1,)
     rank
         The smallest of any node.
-    weak
+    rank_deficient
         Nodes with dropped rows.
     exact
         yhat by the exact prediction at the end point if it was asked for, else None.
@@ -159,7 +295,7 @@ class Sweep:
     end_rate: FloatArray
     sigmas: FloatArray
     rank: int
-    weak: tuple[int, ...]
+    rank_deficient: tuple[int, ...]
     exact: FloatArray | None
     off: FloatArray | None
     off_before: FloatArray | None = None
@@ -181,7 +317,7 @@ class OnBranch:
         Regularisation (s); None for a sweep without terms in 1/eps.
     """
 
-    stages: BranchStages
+    stages: SweepStages
     eps: float | None
 
     def __call__(
@@ -243,13 +379,13 @@ def sweep_over(
     if start is None:
         terms = system.evaluate(t, state, zone)
         rate, multiplier = answer(terms, 0)
-        start = Start(rate, multiplier, terms.sigma, terms.rank, terms.weak)
+        start = Start(rate, multiplier, terms.sigma, terms.rank, terms.rank_deficient)
     rates = np.empty((n, system.tangent_size))
     multipliers = np.empty((n, start.multiplier.size))
     sigmas = np.empty(s + 1)
     rates[0], multipliers[0], sigmas[0] = start.rate, start.multiplier, start.sigma
     rank = start.rank
-    weak = [0] if start.weak else []
+    weak = [0] if start.rank_deficient else []
     end_state, end_rate = state, start.rate
     end_exact: FloatArray | None = None
     end_off: FloatArray | None = None
@@ -267,11 +403,11 @@ def sweep_over(
             rate, multipliers[j] = answer(terms, j)
         rates[j] = system.chart_rate(delta, rate)
         rank = min(rank, terms.rank)
-        if terms.weak:
+        if terms.rank_deficient:
             weak.append(j)
         if j == s:
             end_state, end_rate = x, rate.copy()
-            if exact and not terms.weak:
+            if exact and not terms.rank_deficient:
                 end_exact = terms.multiplier().copy()
             if off:
                 end_off = terms.correction() + (0.0 if moved is None else moved)

@@ -9,8 +9,10 @@ DAEs, (2.2) or (2.4) (:class:`srm_mbs.SemiExplicitDAE`).  The result is sweep m.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -19,10 +21,15 @@ from srm_mbs.dynamics.system import System
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.iterated_sweeps import First, IteratedSweeps
-from srm_mbs.integration.methods.regularisation import Regularisation, parse_eps
-from srm_mbs.integration.methods.sweep import checked_regulariser, interpolant
 from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
+from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
+from srm_mbs.integration.methods.thesis.sweep import (
+    SweepResult,
+    SweepState,
+    checked_regulariser,
+    interpolant,
+)
 
 LARGEST_CARRIED = 3
 """Number of sweeps up to which restarting with the carried multiplier is stable (measured)."""
@@ -41,7 +48,7 @@ class SRM:
 
     With step-size control, singular configurations that rounding keeps such short steps from
     passing within the tolerance are passed by the split form of the same tableau
-    (:mod:`srm_mbs.integration.methods.iterated_sweeps`; slider-crank: from 1e-7 on), and the
+    (:mod:`srm_mbs.integration.methods.thesis.iterated_sweeps`; slider-crank: from 1e-7 on), and the
     message says so.
 
     With step-size control, ``restart`` and ``carry``, measured with tvd32 and m = 3: slider-crank
@@ -76,7 +83,7 @@ class SRM:
         For DAEs: ``"identity"``, ``"transpose"`` (GB)^T or ``"inverse"`` (GB)^-1.
     interpolation
         Of the multiplier between the sweeps: ``"auto"`` or ``"linear"``
-        (:func:`~srm_mbs.integration.methods.sweep.interpolant`).
+        (:func:`~srm_mbs.integration.methods.thesis.sweep.interpolant`).
 
     Raises
     ------
@@ -127,7 +134,7 @@ class SRM:
                 remedy=f"Use at most {LARGEST_CARRIED} sweeps, or carry=False",
             )
         checked_regulariser(self.T)
-        self._sweeps  # noqa: B018 - bad eps or interpolation is refused now
+        self.sweeps  # noqa: B018 - bad eps or interpolation is refused now
 
     @property
     def scheme(self) -> ButcherTableau:
@@ -140,7 +147,8 @@ class SRM:
         return parse_eps(self.eps)
 
     @cached_property
-    def _sweeps(self) -> IteratedSweeps:
+    def sweeps(self) -> IteratedSweeps:
+        """The sweeps of a step."""
         return IteratedSweeps(
             self.scheme,
             First.HELD if self.carry else First.ZERO,
@@ -154,7 +162,7 @@ class SRM:
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm
     ) -> IntegratorState:
         """All sweeps at the initial state."""
-        return self._sweeps.start(system, t, state, norm)
+        return self.sweeps.start(system, t, state, norm)
 
     def step(
         self,
@@ -166,14 +174,18 @@ class SRM:
         norm: ErrorNorm,
     ) -> StepResult:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        return self._sweeps.step(system, t, h, state, memory, norm)
+        return self.sweeps.step(system, t, h, state, cast(SweepState, memory), norm)
 
     def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""
-        self._sweeps.accept(memory, result)
+        self.sweeps.accept(cast(SweepState, memory), cast(SweepResult, result))
 
     def resume(
         self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
     ) -> IntegratorState:
-        """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        return self._sweeps.resume(system, t, state, memory, norm)
+        """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        return self.sweeps.resume(system, t, state, cast(SweepState, memory), norm)
+
+    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+        """Sentences about sweeps in the message of a run."""
+        return self.sweeps.run_messages(steps, norm)

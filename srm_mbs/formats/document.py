@@ -1,0 +1,83 @@
+"""A file that is being read: its text, parsed at most once in each language."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+from srm_mbs.errors import InputError
+from srm_mbs.formats.toml.description import parse_toml
+from srm_mbs.formats.xml import parse_xml, root_tag
+
+
+class Document:
+    """Text of a file, and the results of parsing it.
+
+    Parameters
+    ----------
+    text, file
+        The text, and its name for messages.
+
+    Attributes
+    ----------
+    toml
+        The tables of a TOML text.
+    xml
+        The root element of an XML text; whoever translates it may change it.
+    root_tag
+        The tag of the root element, found without parsing; None if the text is no XML.
+    """
+
+    def __init__(self, text: str, file: str) -> None:
+        self.text, self.file = text, file
+
+    @classmethod
+    def read(cls, path: Path) -> Document:
+        """The document in the file ``path``.
+
+        Raises
+        ------
+        InputError
+            If there is none, or it is not UTF-8.
+        """
+        try:
+            return cls(path.read_text(encoding="utf-8-sig"), str(path))  # Windows editors mark it
+        except FileNotFoundError as error:
+            raise InputError(
+                "there is no such file", file=str(path), remedy="Check the path"
+            ) from error
+        except UnicodeDecodeError as error:
+            if path.suffix.lower() == ".npz":
+                raise InputError(
+                    "it is not the file of a mechanism",
+                    file=str(path),
+                    remedy="Give a saved run to srm.load_solution, or to srm-mbs plot, play or "
+                    "report",
+                ) from error
+            raise InputError(
+                f"it is not UTF-8 text: {error}", file=str(path), remedy="Save it as UTF-8"
+            ) from error
+        except OSError as error:
+            raise InputError(
+                f"it cannot be read: {error.strerror}",
+                file=str(path),
+                remedy="Give the path of a readable file",
+            ) from error
+        except ValueError as error:  # a null character
+            raise InputError(
+                f"it is not a file name: {error}", file=repr(path), remedy="Correct the path"
+            ) from error
+
+    @cached_property
+    def toml(self) -> dict[str, Any]:
+        return parse_toml(self.text, self.file)
+
+    @cached_property
+    def xml(self) -> Element:
+        return parse_xml(self.text, self.file)
+
+    @property
+    def root_tag(self) -> str | None:
+        return root_tag(self.text)

@@ -1,0 +1,1 @@
+"""The thesis' own methods, apart from the default path: sweeps, their regularisation and SRM."""

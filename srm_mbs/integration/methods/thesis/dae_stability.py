@@ -1,0 +1,95 @@
+"""Whether the sweeps of a DAE that carry y damp their constraint errors.
+
+Their terms in 1/eps make of a constraint error d
+
+    d' = -G B T d/eps,    T = I or (GB)^T,
+
+so that a step multiplies it by R(-h mu/eps) for every eigenvalue mu of G B T, with the stability
+function R of the scheme.  With T = (GB)^-1 all mu are 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import EvaluationError
+from srm_mbs.integration.driver import RunRecord
+from srm_mbs.integration.methods.base import StepResult
+from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.thesis.regularisation import (
+    real_stability_limit,
+    stability_function,
+)
+from srm_mbs.integration.methods.thesis.sweep import SweepNode, SweepResult
+
+EXAMINED_STEPS = 10
+"""Steps before a failure whose sweeps are examined."""
+EIGENVALUE_ROUNDING = 1e-9
+"""Rounding of an eigenvalue, over the largest."""
+
+
+class DampedSystem(Protocol):
+    """A system whose sweeps damp their constraint errors at known rates."""
+
+    def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:
+        """Eigenvalues of G B T at a state: the rates at which sweeps reduce g, times eps."""
+
+
+def _sweeps_of(result: StepResult) -> Sequence[SweepNode]:
+    return result.sweeps if isinstance(result, SweepResult) else ()
+
+
+def instability(
+    system: DampedSystem,
+    scheme: ButcherTableau,
+    record: RunRecord,
+    start: Sequence[SweepNode],
+    eps: Callable[[float], float] | None,
+) -> str:
+    """A sentence that says why the sweeps of a failed run are unstable; empty if they are not.
+
+    Parameters
+    ----------
+    record
+        The run.
+    start
+        The sweeps at its start.
+    eps
+        The regularisation (s) of a step; None if it is not known.
+    """
+    cases: list[tuple[float, float, float, SweepNode]] = []
+    nodes, t = start, record.t0
+    for result in record.steps[-EXAMINED_STEPS:]:
+        nodes, t = _sweeps_of(result), result.t + result.h
+        cases += [(t, result.h, node.eps, node) for node in nodes if node.eps > 0.0]
+    if record.attempts and record.attempts[-1].t == t and eps is not None:
+        h = record.attempts[-1].h
+        cases += [(t, h, eps(h), node) for node in nodes]
+    worst, sentence = 1.0 + EIGENVALUE_ROUNDING, ""
+    for t, h, size, node in reversed(cases):
+        try:
+            damped = system.damping(t, node.state)
+        except EvaluationError:
+            continue
+        largest = float(np.abs(damped).max())
+        lowest = float(damped.real.min())
+        if lowest < -EIGENVALUE_ROUNDING * largest:
+            return (
+                f" At t = {t:.6g} G B has an eigenvalue of {lowest:.3g} (real part), and T = I "
+                'drives sweeps away from the constraints along it: use T = "transpose" or '
+                '"inverse".'
+            )
+        growth = max(abs(stability_function(scheme, -h * mu / size)) for mu in damped.tolist())
+        if growth > worst:
+            worst, radius = growth, h * largest / size
+            sentence = (
+                f" The sweeps are unstable: at t = {t:.6g} h |G B T|/eps = {radius:.3g} "
+                f"(spectral radius), and {scheme.name} is stable up to "
+                f'{real_stability_limit(scheme):.3g}: use T = "inverse", or a larger eps.'
+            )
+    return sentence

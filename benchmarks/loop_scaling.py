@@ -25,6 +25,7 @@ import srm_mbs as srm
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.integration.kernel.marshalling import system_struct
 
 LOOPS = (1, 2, 5, 10, 20, 40, 80, 160, 320)
 ANGLES = {"regular": 0.5 * np.pi, "half-way": 0.8, "singular": 1e-3}
@@ -100,7 +101,7 @@ def main() -> None:
         for choice in ("auto", "dense", "sparse"):
             if choice in cells:
                 continue
-            kernel_system = core.System(model, constants | {"algebra": choice}, None)
+            kernel_system = core.System(model, system_struct(constants | {"algebra": choice}), None)
             name = "sparse" if kernel_system.sparse else "dense"
             chosen = name if choice == "auto" else chosen
             cells[name] = [

@@ -24,6 +24,7 @@ from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.multibody import OpenSystem, make_system
 from srm_mbs.formats.urdf.parser import lock_joints
 from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.methods import split_step
 from srm_mbs.simulation import runner
 from srm_mbs.visualization.animation.shapes import visuals_of
@@ -177,7 +178,7 @@ def _islands() -> Item:
 
     def evaluate(algebra: str) -> Callable[[], None]:
         constants = system.constants() | {"algebra": algebra}
-        kernel_system = kernel.core.System(double.model, constants, None)
+        kernel_system = kernel.core.System(double.model, system_struct(constants), None)
         return lambda: kernel_system.repeat(0.0, state, 10000)
 
     return Item(
@@ -217,7 +218,7 @@ def _lazy_results() -> Item:
 def _placement() -> Item:
     mechanism = srm.load("four_bar")
     run = lambda: _run(mechanism, 5.0)  # noqa: E731
-    near = lambda: patch.object(split_step, "FAR", 1e300)  # noqa: E731
+    near = lambda: patch.object(split_step, "FAR_STEPS", 1e300)  # noqa: E731
     return Item(
         "placement and zone while sigma is far", "four_bar, 5 s", run, _under(near, run), _last
     )
@@ -226,7 +227,7 @@ def _placement() -> Item:
 def _history() -> Item:
     mechanism = srm.load("four_bar")
     run = lambda: _run(mechanism, 5.0)  # noqa: E731
-    always = lambda: patch.object(split_step, "WATCHED", 1e300)  # noqa: E731
+    always = lambda: patch.object(split_step, "WATCHED_SIGMA", 1e300)  # noqa: E731
     return Item(
         "multiplier history while sigma is far", "four_bar, 5 s", run, _under(always, run), _last
     )

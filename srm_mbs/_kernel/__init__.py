@@ -8,17 +8,16 @@ the srm-mbs that is installed for the same Python, if that was built from the sa
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from importlib.machinery import PathFinder
-from importlib.metadata import distributions, version
+from importlib.metadata import version
 from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from srm_mbs._kernel.build_hash import fingerprint
+from srm_mbs._kernel.build_hash import fingerprint, install_command, installation_records
 
 PACKAGE = "srm_mbs._kernel"
 INSTALL_AGAIN = (
@@ -80,7 +79,7 @@ def _load_from(place: Path, folder: Path, sources: str, search: Sequence[str]) -
         return Kernel(
             None,
             f"it was built from other sources than those in {folder.parents[1]}",
-            f"Run: {_install_checkout(folder, search)}",
+            f"Run: {install_command(folder, search)}",
         )
     built_against: str = built.PINOCCHIO
     installed = version("pin")
@@ -91,7 +90,7 @@ def _load_from(place: Path, folder: Path, sources: str, search: Sequence[str]) -
         return Kernel(
             None,
             f"it was built against Pinocchio {built_against}, but pin {installed} is installed",
-            f"Run: {_install_checkout(folder, search) if sources else pin}",
+            f"Run: {install_command(folder, search) if sources else pin}",
         )
     import pinocchio  # noqa: F401 - loads the libraries that the kernel links to
 
@@ -101,7 +100,7 @@ def _load_from(place: Path, folder: Path, sources: str, search: Sequence[str]) -
         return Kernel(
             None,
             f"it cannot be loaded: {error}",
-            f"Run: {_install_checkout(folder, search) if sources else INSTALL_AGAIN}",
+            f"Run: {install_command(folder, search) if sources else INSTALL_AGAIN}",
         )
     return Kernel(core)
 
@@ -120,32 +119,20 @@ def _module(name: str, place: Path) -> ModuleType:
 
 def _not_built(folder: Path, sources: str, search: Sequence[str]) -> Kernel:
     """Why no kernel was built for the package in ``folder``."""
-    if sources and next(_installed(search), None) is None:
+    if sources and next(installation_records(search), None) is None:
         return Kernel(
             None,
             "a checkout of the source has none of its own, and no srm-mbs is installed for "
             f"{sys.executable}",
-            f"Run: {_install_checkout(folder, search)}",
+            f"Run: {install_command(folder, search)}",
         )
-    command = _install_checkout(folder, search) if sources else INSTALL_AGAIN
+    command = install_command(folder, search) if sources else INSTALL_AGAIN
     return Kernel(
         None,
         "it was not built when srm-mbs was installed, because there was no C++17 compiler or "
         "because it failed",
         f"With a C++17 compiler, run: {command} -v",
     )
-
-
-def _installed(search: Sequence[str]) -> Iterator[str]:
-    """Records of where each srm-mbs in ``search`` was installed from (PEP 610; may be empty)."""
-    for found in distributions(name="srm-mbs", path=list(search)):
-        yield found.read_text("direct_url.json") or ""
-
-
-def _install_checkout(folder: Path, search: Sequence[str]) -> str:
-    """The command that installs the checkout of ``folder``, in place where it is so now."""
-    editable = '"editable": true' in next(_installed(search), "")
-    return f"pip install {'-e ' * editable}{shlex.quote(str(folder.parents[1]))}"
 
 
 core, missing, remedy = load(Path(__file__).parent, sys.path)

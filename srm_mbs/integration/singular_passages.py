@@ -33,7 +33,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     smallest_singular_value,
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
-from srm_mbs.integration.dense_output import PLACEMENTS, DenseOutput, StepData
+from srm_mbs.integration.dense_output import STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 SLOPE_MARGIN = 1.5
@@ -372,9 +372,9 @@ def _placement(steps: StepData, i: int) -> str:
     # At the end of a step the next one's stages may be those that came too close.
     if any(k in steps.zones for k in (i - 1, i, i + 1)):
         return "zone"
-    here = PLACEMENTS[int(steps.placements[i])]
+    here = STEP_PLACEMENTS[int(steps.placements[i])]
     # Placing may shorten the step before, so that the next one passes in the middle.
-    return here or (PLACEMENTS[int(steps.placements[i - 1])] if i else "")
+    return here or (STEP_PLACEMENTS[int(steps.placements[i - 1])] if i else "")
 
 
 def crossing_at(

@@ -27,8 +27,8 @@ from srm_mbs.integration.dense_output import StepData
 NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
 
-ROUNDING = 1e-13
-"""Part of the energies that add up to it which rounding leaves of a sum, with much to spare."""
+RELATIVE_ROUNDING = 1e-13
+"""Bound of the rounding error of a sum of energies, relative to its terms."""
 
 Powers = dict[str, FloatArray]
 """Power (n,) W of each thing that does work, by name."""
@@ -205,12 +205,12 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
 
 
 def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
-    """What rounding may leave (J) of these energies, whose zero is where potentials cancel."""
+    """Rounding error (J) of sums of these energies, whose zero is where potentials cancel."""
     model = mechanism.model
     mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
     weight = mass * float(np.linalg.norm(model.gravity.linear))
     largest = float(np.abs(energies).max(initial=0.0))
-    return float(ROUNDING * (weight * mechanism.structure.units.length + largest))
+    return float(RELATIVE_ROUNDING * (weight * mechanism.structure.units.length + largest))
 
 
 def joined_balance(

@@ -88,7 +88,7 @@ REFRESH = 0.1
 def progress_of(
     progress: bool | Tick, system: System, t_end: float
 ) -> AbstractContextManager[Tick | None]:
-    """What the option ``progress`` asks for: the caller's own tick, a bar, or nothing."""
+    """The callback of the option ``progress``: the caller's own, a progress bar, or none."""
     if callable(progress):
         return nullcontext(progress)
     return progress_bar(system, t_end) if progress else nullcontext(None)
@@ -140,7 +140,7 @@ def progress_bar(system: System, t_end: float) -> Iterator[Tick | None]:
 
 @contextmanager
 def counting(progress: bool | Counted, what: str, total: int) -> Iterator[Counted | None]:
-    """What is told after each of ``total`` things: the caller's function, a bar, or nothing."""
+    """The callback after each of ``total`` items: the caller's own, a progress bar, or none."""
     if callable(progress):
         yield progress
     elif not progress:

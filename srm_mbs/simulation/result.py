@@ -87,7 +87,7 @@ it was ``"rejected"`` for its error or ``"replaced"`` because of a singular conf
 
 def attempt_array(attempts: Iterable[Any]) -> NDArray[np.void]:
     """The ``attempts`` of a run as a structured array (k,) of :data:`ATTEMPT`."""
-    rows = [(a.t, a.h, a.error_ratio, a.verdict.value) for a in attempts]
+    rows = [(a.t, a.h, a.error_ratio, a.decision.value) for a in attempts]
     return np.array(rows, dtype=ATTEMPT)
 
 
@@ -217,7 +217,7 @@ class SimulationResult(RunOutcome):
 
     @property
     def held(self) -> HeldForce | None:
-        """What a sampled controller held; None without one."""
+        """Forces that a sampled controller held; None without one."""
         return self._system.held
 
     @property
@@ -356,7 +356,7 @@ class SimulationResult(RunOutcome):
         return energy_balance(self, self._system)
 
     def _need_controller(self, what: str) -> None:
-        acting = self._system.controlled or self._system.calls_forces
+        acting = self._system.controlled or self._system.has_user_forces
         if self.settings.controlled and not acting:
             raise InputError(
                 f"the {what} of a loaded run with a controller cannot be computed: "

@@ -326,7 +326,7 @@ def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
 def event_watch(
     events: Any, system: OpenSystem | ClosedSystem, method: Method, state: FloatArray
 ) -> EventWatch | None:
-    """What looks for the events (t, q, v) -> float; None if none are given."""
+    """The detector of the events (t, q, v) -> float; None if none are given."""
     if events is None:
         return None
 
@@ -339,7 +339,7 @@ def event_watch(
 def sampler(
     system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, kernel_system: Any
 ) -> Callable[[float, FloatArray], None]:
-    """What samples ``controller`` at (t, state), for ``held`` and for the kernel."""
+    """A function (t, state) that samples ``controller`` for ``held`` and for the kernel."""
 
     def sample(t: float, state: FloatArray) -> None:
         force = evaluate_controller(controller, t, *system.split(state))
@@ -523,7 +523,7 @@ def statistics(
     """Counts of a run, ``placed`` and ``replaced`` by its step placement."""
     return Statistics(
         steps=data.count,
-        rejected=sum(attempt.verdict is StepDecision.REJECTED for attempt in record.attempts),
+        rejected=sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
         placements=placed,
         replaced=replaced,
         zone_steps=len(data.zones),
@@ -568,7 +568,9 @@ def assemble_result(
         placed = sum(wrapper.placed for wrapper in wrappers)
         replaced = sum(wrapper.replaced for wrapper in wrappers)
         suspects = suspected(wrappers)
-    controlled = options.controller is not None or system.calls_forces
+    # Counted before anything below reads the dense output, which evaluates stages.
+    stats = statistics(system, record, data, placed, replaced)
+    controlled = options.controller is not None or system.has_user_forces
     by = "kernel" if problem.on_kernel else "python"
     return result_type(
         mechanism,
@@ -585,13 +587,13 @@ def assemble_result(
         + method_messages(options.method, record.steps, problem.norm)
         + _limits_left(mechanism, dense)
         + _driven_too_far(mechanism, record),
-        stats=statistics(system, record, data, placed, replaced),
+        stats=stats,
         settings=settings(options, problem.norm, controlled, by),
     )
 
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
-    """What else may be the cause where a driven mechanism cannot go on."""
+    """A sentence on drives as a possible cause of a failure; empty without them."""
     if record.status is not RunStatus.FAILED or not mechanism.drives:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)

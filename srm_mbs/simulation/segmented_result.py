@@ -81,7 +81,7 @@ class SegmentedResult(SimulationResult):
         self._parts = tuple(segment.at(t[index == k]) for k, segment in enumerate(self.segments))
 
     def rows_of_parts(self, read: Callable[[Any], FloatArray]) -> FloatArray:
-        """What ``read`` gives for each segment, in the order of ``t``."""
+        """Rows that ``read`` returns for the segments, in the order of ``t``."""
         rows = np.concatenate([read(part) for part in self._parts])
         rows = rows if self._parts is self.segments else rows[self._order]
         rows.setflags(write=False)
@@ -114,7 +114,7 @@ class SegmentedResult(SimulationResult):
 
     @property
     def held(self) -> HeldForce | None:
-        """What a sampled controller held in the first segment; None without one."""
+        """Forces that a sampled controller held in the first segment; None without one."""
         return self.segments[0].held
 
     @cached_property

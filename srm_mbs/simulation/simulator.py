@@ -131,7 +131,7 @@ class Simulator:
 
     @property
     def mechanism(self) -> Mechanism:
-        """What is simulated."""
+        """The simulated mechanism."""
         return self._mechanism
 
     @property

@@ -20,6 +20,7 @@ from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
+from srm_mbs.integration.kernel.marshalling import control_struct
 from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
@@ -28,21 +29,9 @@ from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
 
 
-def control_state(control: Any) -> dict[str, Any]:
-    """What a control of the reference remembers, in the words of control.hpp."""
-    state: dict[str, Any] = {
-        "h": 0.0,
-        "xi_old": 1.0,
-        "just_rejected": False,
-        "index": 1,
-        "slope": 0.0,
-        "zero": np.nan,
-        "redo": 0.0,
-        "redone": 0,
-        "limit": np.inf,
-        "tries": 0,
-        "arrival": 0,
-    }
+def control_state(control: Any) -> Any:
+    """The state of a control of the reference, as a struct of the kernel."""
+    state: dict[str, Any] = {}
     while True:
         if isinstance(control, BranchGuard):
             state |= {"limit": control._limit, "tries": control._tries}
@@ -57,14 +46,15 @@ def control_state(control: Any) -> dict[str, Any]:
         elif isinstance(control, SlopeOfSigma):
             state |= {"slope": control._slope}
         elif isinstance(control, PIControl):
-            return state | {
+            state |= {
                 "h": control._h,
                 "xi_old": control._xi_old,
                 "just_rejected": control._just_rejected,
             }
+            return control_struct(**state)
         else:
             assert isinstance(control, FixedStep)
-            return state | {"index": control._index}
+            return control_struct(**state, index=control._index)
         control = control._inner
 
 

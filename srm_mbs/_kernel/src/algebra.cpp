@@ -5,30 +5,16 @@
 #include <utility>
 #include <vector>
 
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
 #include "projection.hpp"
-
-namespace nb = nanobind;
+#include "struct_binding.hpp"
 
 namespace srm {
 
 namespace {
 
-using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Columns = nb::ndarray<const double, nb::f_contig, nb::device::cpu>;
 
-nb::object array_of(const double* values, std::initializer_list<std::size_t> shape) {
-    std::size_t size = 1;
-    for (std::size_t n : shape) size *= n;
-    auto* kept = new std::vector<double>(values, values + size);
-    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), shape.size(), shape.begin(), owner));
-}
-
-// Twin of srm_mbs/dynamics/constraints/row_algebra.py.
+// See dynamics/constraints/row_algebra.py.
 class Algebra {
 public:
     Algebra(std::vector<int> parents, std::vector<std::vector<int>> supports,
@@ -45,7 +31,7 @@ public:
         if (M.ndim() != 2 || G.ndim() != 2 || static_cast<int>(M.shape(0)) != nv_ ||
             static_cast<int>(M.shape(1)) != nv_ || static_cast<int>(G.shape(0)) != rows_ ||
             static_cast<int>(G.shape(1)) != nv_)
-            throw nb::value_error("not (nv, nv) and (rows, nv)");
+            throw nb::value_error("M and G are not (nv, nv) and (rows, nv)");
         for (int j = 0; j < rows_; ++j) {
             double* const out = projection_->column(j);
             const double* const row = G.data() + static_cast<std::size_t>(j) * nv_;
@@ -55,41 +41,41 @@ public:
     }
 
     nb::object tangential(const Array& w) const {
-        std::vector<double> x = taken(w, nv_);
+        std::vector<double> x = checked(w, nv_);
         projection_->whiten_velocity(x.data());
         projection_->remove_normal(x.data());
         projection_->unwhiten(x.data());
-        return array_of(x.data(), {x.size()});
+        return owned_array(std::move(x));
     }
 
     nb::object solve(const Array& g) const {
-        const std::vector<double> right = taken(g, rows_);
+        const std::vector<double> right = checked(g, rows_);
         std::vector<double> x(nv_);
         projection_->normal(right.data(), x.data());
         projection_->unwhiten(x.data());
-        return array_of(x.data(), {x.size()});
+        return owned_array(std::move(x));
     }
 
     nb::object multiplier(const Array& white) const {
-        const std::vector<double> x = taken(white, nv_);
+        const std::vector<double> x = checked(white, nv_);
         std::vector<double> g(rows_);
         projection_->multiplier(x.data(), g.data());
-        return array_of(g.data(), {g.size()});
+        return owned_array(std::move(g));
     }
 
-    // Row by row the basis, which is its columns in Python.
+    // The basis, one vector per row.
     nb::object complement() const {
         const auto count = static_cast<std::size_t>(nv_ - projection_->rank);
         const auto n = static_cast<std::size_t>(nv_);
         std::vector<double> out(count * n);
         projection_->complement(out.data());
-        return array_of(out.data(), {count, n});
+        return owned_array(std::move(out), {count, n});
     }
 
     const Projection& projection() const { return *projection_; }
 
 private:
-    static std::vector<double> taken(const Array& values, int size) {
+    static std::vector<double> checked(const Array& values, int size) {
         if (values.ndim() != 1 || static_cast<int>(values.size()) != size)
             throw nb::value_error("not a vector of the right size");
         return std::vector<double>(values.data(), values.data() + size);
@@ -118,12 +104,10 @@ void bind_algebra(nb::module_& m) {
         .def_prop_ro("sparse", [](const Algebra& a) { return a.projection().sparse(); })
         .def_prop_ro("entries", [](const Algebra& a) { return a.projection().entries(); })
         .def_prop_ro("pivots", [](const Algebra& a) {
-            const std::vector<double>& found = a.projection().pivots();
-            return array_of(found.data(), {found.size()});
+            return owned_array(a.projection().pivots());
         })
         .def_prop_ro("row_squares", [](const Algebra& a) {
-            const std::vector<double>& found = a.projection().row_squares();
-            return array_of(found.data(), {found.size()});
+            return owned_array(a.projection().row_squares());
         });
 }
 

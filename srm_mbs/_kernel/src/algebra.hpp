@@ -1,4 +1,4 @@
-// The constraint algebra on its own, for the analysis of a mechanism.
+// The projection of given M and G, for the analysis of a mechanism.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -21,13 +21,14 @@ void each_bit(Word word, int first, const Act& act) {
     for (; word; word &= word - 1) act(first + __builtin_ctzll(word));
 }
 
-// Sets of bits, each with the range of its words that are not zero.
+// Sets of bits, each with the range of its words that may be nonzero.
 class BitSets {
 public:
     BitSets(int sets, int bits)
         : first(sets), last(sets), stride_(words_for(bits)), words_(sets * std::size_t(stride_)) {}
 
-    // Empty sets, no more and no larger than at first.
+    // Empties the sets and changes their number and size, which may not exceed those at
+    // construction.
     void clear(int sets, int bits) {
         stride_ = words_for(bits);
         std::fill_n(words_.begin(), sets * stride_, Word{0});
@@ -48,7 +49,7 @@ public:
 
     void add(int which, const Word* bits, int from, int to) {
         Word* own = &words_[which * stride_];
-        // Mostly one word: a loop that the compiler unrolls would cost more than the rest.
+        // Mostly there is one word, for which an unrolled loop would cost more than all else.
         own[from] |= bits[from];
         for (int w = from + 1; w <= to; ++w) own[w] |= bits[w];
         first[which] = std::min(first[which], from);

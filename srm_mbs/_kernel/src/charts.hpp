@@ -1,19 +1,24 @@
-// Twin of srm_mbs/dynamics/manifold.py: tangent charts of ball, free and planar joints.
+// Tangent charts of ball, free and planar joints: dynamics/manifold.py.
 #pragma once
 
 #include <vector>
+
+#include "struct_fields.hpp"
 
 namespace srm {
 
 enum class Group { so3, se3, se2 };
 
-struct GroupJoint {
-    Group group;
-    int start;     // first velocity index
-    int size;
-    int position;  // first configuration index
+#define SRM_GROUP_JOINT(field)                        \
+    field(Group, group)                               \
+    field(int, start)    /* first velocity index */   \
+    field(int, size)                                  \
+    field(int, position) /* first configuration index */
 
-    // Size of the joint's angular part of the tangent vector v (nv,).
+struct GroupJoint {
+    SRM_FIELDS(SRM_GROUP_JOINT)
+
+    // Norm of the joint's angular part of the tangent vector v (nv,).
     double rotation(const double* v) const;
     // out = [u, v] on the group's algebra.
     void bracket(const double* u, const double* v, double* out) const;

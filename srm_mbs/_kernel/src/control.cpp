@@ -13,7 +13,7 @@ namespace {
 constexpr double inf = std::numeric_limits<double>::infinity();
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 
-std::vector<double> with_end(const Scheme& scheme) {
+std::vector<double> with_end(const ButcherTableau& scheme) {
     std::vector<double> out(scheme.c);
     out.push_back(1.0);
     return out;
@@ -39,48 +39,48 @@ Proposal until(double t, double h, double end) {
 
 }  // namespace
 
-Proposal PIControl::propose(double t, double limit, Memory&) {
+Proposal PIControl::propose(double t, double limit, IntegratorState&) {
     return until(t, std::min(h_, limit), t_end_);
 }
 
-Verdict PIControl::judge(const Proposal& proposal, const StepResult* result) {
-    const ControlConstants& c = constants_;
+StepDecision PIControl::decide(const Proposal& proposal, const StepResult* result) {
+    const Constants& c = constants_;
     double xi = result ? result->error_ratio : c.failed_evaluation;
     if (!(xi < c.failed_evaluation)) xi = c.failed_evaluation;
     const double k = order_;
     if (xi > 1.0) {
         h_ = proposal.h * std::max(c.min_factor, c.safety * std::pow(xi, -1.0 / k));
         just_rejected_ = true;
-        return Verdict::rejected;
+        return StepDecision::rejected;
     }
-    double factor = c.safety * std::pow(std::max(xi, c.xi_floor), -c.integral / k) *
+    double factor = c.safety * std::pow(std::max(xi, c.error_floor), -c.integral / k) *
                     std::pow(xi_old_, c.proportional / k);
     factor = std::min(c.max_factor, std::max(c.min_factor, factor));
     if (just_rejected_) factor = std::min(factor, 1.0);
     double h = proposal.h * factor;
-    // Cut to end there: behind a breakpoint the step wanted before is the better guess.
+    // The step was cut to end there: after a breakpoint the step wanted before is the better guess.
     if (proposal.t_new == t_end_ && proposal.h < h_) h = std::max(h, h_);
     h_ = h;
-    xi_old_ = std::max(xi, c.xi_old_floor);
+    xi_old_ = std::max(xi, c.previous_error_floor);
     just_rejected_ = false;
-    return Verdict::accepted;
+    return StepDecision::accepted;
 }
 
-Proposal FixedStep::propose(double t, double limit, Memory&) {
+Proposal FixedStep::propose(double t, double limit, IntegratorState&) {
     double target = t0_ + static_cast<double>(index_) * step_;
     if (target > t_end_ - 1e-9 * step_) target = t_end_;
     if (limit < target - t) return {limit, t + limit};
     return {target - t, target};
 }
 
-Verdict FixedStep::judge(const Proposal& proposal, const StepResult* result) {
+StepDecision FixedStep::decide(const Proposal& proposal, const StepResult* result) {
     if (!result || !finite(result->state.data(), static_cast<int>(result->state.size())))
-        return Verdict::rejected;
+        return StepDecision::rejected;
     while (proposal.t_new >= t0_ + static_cast<double>(index_) * step_ - sliver()) ++index_;
-    return Verdict::accepted;
+    return StepDecision::accepted;
 }
 
-Gaps::Gaps(const Scheme& scheme, double clearance) {
+Gaps::Gaps(const ButcherTableau& scheme, double clearance) {
     centre_ = scheme.gap_centres[0];
     clearance_ = clearance * scheme.gap_half_widths[0];
     first_ = 1.0;
@@ -113,35 +113,34 @@ bool Gaps::ends_on(double distance, double h) const {
 
 double Gaps::step_over(double distance) const { return distance / wide_ends_.back(); }
 
-SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner, const Scheme& scheme,
-                                           double t_end, const ControlConstants& constants,
-                                           bool arrivals)
-    : inner_(std::move(inner)),
+SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner,
+                                           const ButcherTableau& scheme, double t_end,
+                                           const Constants& constants, bool arrivals)
+    : ControlWrapper(std::move(inner)),
       constants_(constants),
       t_end_(t_end),
-      watched_(arrivals && inner_->adaptive ? Arrival::watched : Arrival::none),
-      arrival_(watched_),
+      first_arrival_(arrivals && inner_->adaptive ? Arrival::watched : Arrival::none),
+      arrival_(first_arrival_),
       gaps_(scheme, constants.clearance),
       abscissae_(with_end(scheme)),
       zero_(nan) {
-    adaptive = inner_->adaptive;
     middle_ = 0;
     for (std::size_t k = 1; k < abscissae_.size(); ++k)
         if (std::abs(abscissae_[k] - 0.5) < std::abs(abscissae_[middle_] - 0.5))
             middle_ = static_cast<int>(k);
 }
 
-Proposal SingularityPlacement::propose(double t, double limit, Memory& memory) {
+Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& memory) {
     if (redo_ > 0.0) limit = std::min(limit, redo_);
-    if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.sigma_change / slope_);
+    if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.max_sigma_change / slope_);
     memory.sigma_slope = slope_;
     const Proposal proposal = inner_->propose(t, limit, memory);
     if (arrives(t, proposal)) {
         arrival_ = Arrival::none;
         return {proposal.h, proposal.t_new, proposal.placed, true};
     }
-    // Where the multipliers are known, stages may lie anywhere.
-    known_ = memory.has_history && memory.history.known_until >= t_end_;
+    // Where the multipliers are known, stages may be on the singular configuration.
+    known_ = memory.history && memory.history->known_until >= t_end_;
     if (known_) return proposal;
     if (!(redo_ > 0.0) && zero_ > t) {
         const double h = placed_step(zero_ - t, proposal.h, t);
@@ -153,18 +152,20 @@ Proposal SingularityPlacement::propose(double t, double limit, Memory& memory) {
     return proposal;
 }
 
-// Whether the end beside a singular configuration is to be prepared for.
+// Whether Python is to prepare for the end next to a singular configuration.
 bool SingularityPlacement::arrives(double t, const Proposal& proposal) const {
     if (arrival_ != Arrival::watched) return arrival_ == Arrival::due;
-    if (!(zero_ > t) || !(std::abs(zero_ - t_end_) * slope_ < constants_.beside)) return false;
-    return proposal.t_new >= t_end_ || (t_end_ - t) * slope_ <= constants_.arrival_change;
+    if (!(zero_ > t) || !(std::abs(zero_ - t_end_) * slope_ < constants_.singular_end))
+        return false;
+    return proposal.t_new >= t_end_ ||
+           (t_end_ - t) * slope_ <= constants_.arrival_sigma_change;
 }
 
 double SingularityPlacement::placed_step(double distance, double h, double t) const {
-    // The run, or its piece, ends there.
+    // The run, or its interval, ends there.
     if (t + h >= t_end_ && gaps_.ends_on(distance, h)) return h;
     if (adaptive) return gaps_.longest_step(distance, h);
-    // A fixed step may cross its grid point where that is singular: it could only creep up.
+    // Where a grid point is singular, a fixed step may pass it: no shorter step could.
     if (!gaps_.ends_on(distance, h)) return distance < h ? gaps_.longest_step(distance, h) : h;
     const double over = gaps_.step_over(distance);
     return t + over <= t_end_ ? over : h;
@@ -187,7 +188,7 @@ double SingularityPlacement::better_step(double h, const std::vector<double>& si
     return gaps_.longest_step(zero * h, 0.98 * h);
 }
 
-Verdict SingularityPlacement::judge(const Proposal& proposal, const StepResult* result) {
+StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepResult* result) {
     const double h = proposal.h;
     double slope = 0.0;
     if (result && result->quiet) {
@@ -198,67 +199,68 @@ Verdict SingularityPlacement::judge(const Proposal& proposal, const StepResult* 
     } else if (result) {
         slope = sigma_slope(abscissae_, result->sigmas, h);
         const bool last = proposal.t_new >= t_end_;
-        if (last && arrival_ == Arrival::watched && result->sigmas.back() < constants_.beside) {
+        if (last && arrival_ == Arrival::watched &&
+            result->sigmas.back() < constants_.singular_end) {
             arrival_ = Arrival::due;
             redo_ = h;
             ++replaced;
-            return Verdict::replaced;
+            return StepDecision::replaced;
         }
-        if (redone_ < constants_.max_redone && !known_) {
+        if (redone_ < constants_.max_placements && !known_) {
             const double better = better_step(h, result->sigmas, slope, last);
             if (0.0 < better && better < h) {
                 redo_ = better;
                 ++redone_;
                 ++replaced;
-                return Verdict::replaced;
+                return StepDecision::replaced;
             }
         }
     }
-    const Verdict verdict = inner_->judge(proposal, result);
+    const StepDecision decision = inner_->decide(proposal, result);
     redo_ = 0.0;
     redone_ = 0;
-    if (verdict == Verdict::accepted && result) {
+    if (decision == StepDecision::accepted && result) {
         slope_ = std::max(slope, 0.5 * slope_);
         zero_ = result->quiet
                     ? nan
                     : result->t + h * zero_ahead(abscissae_[middle_], result->sigmas[0],
                                                  result->sigmas[middle_],
-                                                 result->sigmas.back(), constants_.ahead);
+                                                 result->sigmas.back(), constants_.zero_horizon);
     }
-    return verdict;
+    return decision;
 }
 
-SlopeOfSigma::SlopeOfSigma(std::unique_ptr<Control> inner, const Scheme& scheme)
-    : inner_(std::move(inner)), abscissae_(with_end(scheme)) {
-    adaptive = inner_->adaptive;
-}
+SlopeOfSigma::SlopeOfSigma(std::unique_ptr<Control> inner, const ButcherTableau& scheme)
+    : ControlWrapper(std::move(inner)), abscissae_(with_end(scheme)) {}
 
-Proposal SlopeOfSigma::propose(double t, double limit, Memory& memory) {
+Proposal SlopeOfSigma::propose(double t, double limit, IntegratorState& memory) {
     memory.sigma_slope = slope_;
     return inner_->propose(t, limit, memory);
 }
 
-Verdict SlopeOfSigma::judge(const Proposal& proposal, const StepResult* result) {
-    const Verdict verdict = inner_->judge(proposal, result);
-    if (verdict == Verdict::accepted && result)
+StepDecision SlopeOfSigma::decide(const Proposal& proposal, const StepResult* result) {
+    const StepDecision decision = inner_->decide(proposal, result);
+    if (decision == StepDecision::accepted && result)
         slope_ = std::max(sigma_slope(abscissae_, result->sigmas, proposal.h), 0.5 * slope_);
-    return verdict;
+    return decision;
 }
 
 BranchGuard::BranchGuard(std::unique_ptr<Control> inner, const System& system,
-                         const ControlConstants& constants)
-    : inner_(std::move(inner)), system_(system), constants_(constants), work_(2 * system.nv) {
-    adaptive = inner_->adaptive;
-}
+                         const Constants& constants)
+    : ControlWrapper(std::move(inner)),
+      system_(system),
+      constants_(constants),
+      work_(2 * system.nv) {}
 
-Proposal BranchGuard::propose(double t, double limit, Memory& memory) {
+Proposal BranchGuard::propose(double t, double limit, IntegratorState& memory) {
     const Proposal proposal = inner_->propose(t, std::min(limit, limit_), memory);
     placed = inner_->placed;
     return proposal;
 }
 
-// Whether the velocity of a step next to a singular configuration took another direction.
-bool BranchGuard::turned(const StepResult& result) const {
+// Whether the velocity changed, in a step next to a singular configuration, by more than its
+// accelerations explain.
+bool BranchGuard::velocity_jumps(const StepResult& result) const {
     const auto [low, high] = std::minmax_element(result.sigmas.begin(), result.sigmas.end());
     if (!(2.0 * *low < *high)) return false;
     const int nv = system_.nv;
@@ -268,28 +270,28 @@ bool BranchGuard::turned(const StepResult& result) const {
         halfway[i] = 0.5 * result.h * (start[nv + i] + end[nv + i]);
         jump[i] = end[i] - start[i] - halfway[i];
     }
-    const double size =
-        std::max({system_.size(start), system_.size(end), system_.size(halfway)});
-    return system_.size(jump) > constants_.turned * size;
+    const double size = std::max({system_.position_norm(start), system_.position_norm(end),
+                                  system_.position_norm(halfway)});
+    return system_.position_norm(jump) > constants_.branch_change * size;
 }
 
-Verdict BranchGuard::judge(const Proposal& proposal, const StepResult* result) {
-    const bool suspect = result && !result->quiet && turned(*result);
-    if (suspect && tries_ < constants_.guard_max_redone) {
+StepDecision BranchGuard::decide(const Proposal& proposal, const StepResult* result) {
+    const bool suspect = result && !result->quiet && velocity_jumps(*result);
+    if (suspect && tries_ < constants_.max_guard_retries) {
         limit_ = 0.5 * proposal.h;
         ++tries_;
         ++replaced;
-        return Verdict::replaced;
+        return StepDecision::replaced;
     }
     const long before = inner_->replaced;
-    const Verdict verdict = inner_->judge(proposal, result);
+    const StepDecision decision = inner_->decide(proposal, result);
     replaced += inner_->replaced - before;
-    if (verdict == Verdict::accepted && result) {
-        if (suspect) suspects.push_back(proposal.t_new);
+    if (decision == StepDecision::accepted && result) {
+        if (suspect) suspect_times.push_back(proposal.t_new);
         limit_ = inf;
         tries_ = 0;
     }
-    return verdict;
+    return decision;
 }
 
 namespace {
@@ -372,10 +374,10 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
     return zero;
 }
 
-double zero_ahead(double c, double start, double middle, double end, double ahead) {
+double zero_ahead(double c, double start, double middle, double end, double horizon) {
     if (!(end < start)) return nan;
     const double line = start / (start - end);
-    const double within = line > ahead ? nan : line;
+    const double within = line > horizon ? nan : line;
     double zero = line;
     if (0.1 < c && c < 0.9) {
         // sigma = start + a x + b x^2 through (c, middle) and (1, end)
@@ -388,8 +390,8 @@ double zero_ahead(double c, double start, double middle, double end, double ahea
             return within;
         }
     }
-    if (1.0 < zero && zero < ahead) return zero;
-    return 1.0 < line && line < ahead && zero <= 1.0 ? line : nan;
+    if (1.0 < zero && zero < horizon) return zero;
+    return 1.0 < line && line < horizon && zero <= 1.0 ? line : nan;
 }
 
 }  // namespace srm

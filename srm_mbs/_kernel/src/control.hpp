@@ -1,5 +1,5 @@
-// Twin of srm_mbs/integration/control/step_size.py, placement.py, singular_times.py (SlopeOfSigma) and
-// guard.py: how long the next step is, and whether the last one stands.
+// Step size, placement and branch guard: control/step_size.py, control/placement.py,
+// control/branch_guard.py and SlopeOfSigma of control/prescribed_times.py.
 #pragma once
 
 #include <algorithm>
@@ -8,10 +8,11 @@
 #include <vector>
 
 #include "step.hpp"
+#include "struct_fields.hpp"
 
 namespace srm {
 
-enum class Verdict { accepted = 0, rejected = 1, replaced = 2 };
+enum class StepDecision { accepted = 0, rejected = 1, replaced = 2 };
 
 struct Proposal {
     double h, t_new;
@@ -19,53 +20,53 @@ struct Proposal {
     bool arriving = false;  // to be proposed again, after Python has prepared for the end
 };
 
-// The constants of srm_mbs/stepping, passed in from Python.
-struct ControlConstants {
-    double safety, min_factor, max_factor, proportional, integral, xi_old_floor, xi_floor,
-        failed_evaluation;                                  // stepsize.py
-    double sigma_change, too_close, clearance, ahead;       // placement.py, kinks.py
-    int max_redone;
-    double beside, arrival_change;
-    double turned;                                          // turning.py
-    int guard_max_redone;
-};
+#define SRM_CONTROL_STATE(field)                                                            \
+    /* Step-size control: next step (s), last error ratio. */                               \
+    field(double, h)                                                                        \
+    field(double, xi_old)                                                                   \
+    field(bool, just_rejected)                                                              \
+    /* Fixed steps: number of the next grid point. */                                       \
+    field(long, index)                                                                      \
+    /* Placement: |d sigma / dt| (1/s), predicted zero of sigma (s) or NaN, step that replaces \
+       the last one (s) or 0, its tries, state of the arrival. */                           \
+    field(double, slope)                                                                    \
+    field(double, zero)                                                                     \
+    field(double, redo)                                                                     \
+    field(int, redone)                                                                      \
+    field(int, arrival)                                                                     \
+    /* Branch guard: longest step (s), tries. */                                            \
+    field(double, limit)                                                                    \
+    field(int, tries)
 
-// What a control remembers from step to step, for comparison with the reference.
+// The values that a control carries from step to step.
 struct ControlState {
-    double h = 0.0, xi_old = 1.0;
-    bool just_rejected = false;
-    long index = 1;
-    double slope = 0.0, zero = std::numeric_limits<double>::quiet_NaN(), redo = 0.0;
-    int redone = 0;
-    double limit = std::numeric_limits<double>::infinity();
-    int tries = 0;
-    int arrival = 0;
+    SRM_FIELDS(SRM_CONTROL_STATE)
 };
 
 class Control {
 public:
     virtual ~Control() = default;
     virtual void resume(const ControlState& state) = 0;
-    // What `resume` goes on from.
     virtual void save(ControlState& state) const = 0;
-    // A grid of fixed steps starts anew.
-    virtual void grid(double, double) {}
-    virtual Proposal propose(double t, double limit, Memory& memory) = 0;
+    // Counts fixed steps of length `step` from t0.
+    virtual void start_grid(double t0, double step) = 0;
+    virtual Proposal propose(double t, double limit, IntegratorState& memory) = 0;
     // `result` is null if a stage could not be evaluated.
-    virtual Verdict judge(const Proposal& proposal, const StepResult* result) = 0;
+    virtual StepDecision decide(const Proposal& proposal, const StepResult* result) = 0;
     // A step ends on `end`: a breakpoint, or the end of the run.
-    virtual void aim(double end) = 0;
+    virtual void set_target_time(double end) = 0;
     bool adaptive = true;
     long placed = 0, replaced = 0;
 };
 
 class PIControl : public Control {
 public:
-    PIControl(double t_end, double first_step, int order, const ControlConstants& constants)
+    PIControl(double t_end, double first_step, int order, const Constants& constants)
         : t_end_(t_end), h_(first_step), order_(order), constants_(constants) {}
-    Proposal propose(double t, double limit, Memory& memory) override;
-    Verdict judge(const Proposal& proposal, const StepResult* result) override;
-    void aim(double end) override { t_end_ = end; }
+    Proposal propose(double t, double limit, IntegratorState& memory) override;
+    StepDecision decide(const Proposal& proposal, const StepResult* result) override;
+    void set_target_time(double end) override { t_end_ = end; }
+    void start_grid(double, double) override {}
     void resume(const ControlState& s) override {
         h_ = s.h;
         xi_old_ = s.xi_old;
@@ -80,7 +81,7 @@ public:
 private:
     double t_end_, h_;
     int order_;
-    ControlConstants constants_;
+    Constants constants_;
     double xi_old_ = 1.0;
     bool just_rejected_ = false;
 };
@@ -90,10 +91,10 @@ public:
     FixedStep(double t0, double t_end, double step) : t0_(t0), t_end_(t_end), step_(step) {
         adaptive = false;
     }
-    Proposal propose(double t, double limit, Memory& memory) override;
-    Verdict judge(const Proposal& proposal, const StepResult* result) override;
-    void aim(double end) override { t_end_ = end; }
-    void grid(double t0, double step) override {
+    Proposal propose(double t, double limit, IntegratorState& memory) override;
+    StepDecision decide(const Proposal& proposal, const StepResult* result) override;
+    void set_target_time(double end) override { t_end_ = end; }
+    void start_grid(double t0, double step) override {
         t0_ = t0;
         step_ = step;
         index_ = 1;
@@ -108,10 +109,10 @@ private:
     long index_ = 1;
 };
 
-// Where, as a fraction of the step, a zero of sigma does no harm.
+// Intervals between the abscissae, in which a zero of sigma does no harm.
 class Gaps {
 public:
-    Gaps(const Scheme& scheme, double clearance);
+    Gaps(const ButcherTableau& scheme, double clearance);
     double longest_step(double distance, double h) const;
     bool ends_on(double distance, double h) const;
     double step_over(double distance) const;
@@ -121,16 +122,29 @@ private:
     std::vector<double> wide_centres_, wide_ends_;  // ascending
 };
 
-class SingularityPlacement : public Control {
+// A control that limits the steps of another one.
+class ControlWrapper : public Control {
 public:
-    SingularityPlacement(std::unique_ptr<Control> inner, const Scheme& scheme, double t_end,
-                         const ControlConstants& constants, bool arrivals);
-    Proposal propose(double t, double limit, Memory& memory) override;
-    Verdict judge(const Proposal& proposal, const StepResult* result) override;
-    void aim(double end) override {
+    explicit ControlWrapper(std::unique_ptr<Control> inner) : inner_(std::move(inner)) {
+        adaptive = inner_->adaptive;
+    }
+    void set_target_time(double end) override { inner_->set_target_time(end); }
+    void start_grid(double t0, double step) override { inner_->start_grid(t0, step); }
+
+protected:
+    std::unique_ptr<Control> inner_;
+};
+
+class SingularityPlacement : public ControlWrapper {
+public:
+    SingularityPlacement(std::unique_ptr<Control> inner, const ButcherTableau& scheme, double t_end,
+                         const Constants& constants, bool arrivals);
+    Proposal propose(double t, double limit, IntegratorState& memory) override;
+    StepDecision decide(const Proposal& proposal, const StepResult* result) override;
+    void set_target_time(double end) override {
         t_end_ = end;
-        arrival_ = watched_;
-        inner_->aim(end);
+        arrival_ = first_arrival_;
+        inner_->set_target_time(end);
     }
     void resume(const ControlState& s) override {
         inner_->resume(s);
@@ -148,35 +162,33 @@ public:
         s.redo = redo_;
         s.redone = redone_;
     }
-    void grid(double t0, double step) override { inner_->grid(t0, step); }
 
 private:
     double placed_step(double distance, double h, double t) const;
     double better_step(double h, const std::vector<double>& sigmas, double slope, bool last) const;
     bool arrives(double t, const Proposal& proposal) const;
 
-    // What is known of an end beside a singular configuration.
+    // Whether the end next to a singular configuration is prepared for: never or done, if one is
+    // found, or now.
     enum class Arrival { none = 0, watched = 1, due = 2 };
 
-    std::unique_ptr<Control> inner_;
-    ControlConstants constants_;
+    Constants constants_;
     double t_end_;
-    Arrival watched_, arrival_;
-    bool known_ = false;
+    Arrival first_arrival_, arrival_;
+    bool known_ = false;  // the multipliers up to the end are known
     Gaps gaps_;
     std::vector<double> abscissae_;
-    int middle_;
+    int middle_;  // stage next to the middle of the step
     double slope_ = 0.0, zero_, redo_ = 0.0;
     int redone_ = 0;
 };
 
-// Only the slope of sigma.
-class SlopeOfSigma : public Control {
+// Measures |d sigma / dt|, and places nothing.
+class SlopeOfSigma : public ControlWrapper {
 public:
-    SlopeOfSigma(std::unique_ptr<Control> inner, const Scheme& scheme);
-    Proposal propose(double t, double limit, Memory& memory) override;
-    Verdict judge(const Proposal& proposal, const StepResult* result) override;
-    void aim(double end) override { inner_->aim(end); }
+    SlopeOfSigma(std::unique_ptr<Control> inner, const ButcherTableau& scheme);
+    Proposal propose(double t, double limit, IntegratorState& memory) override;
+    StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void resume(const ControlState& s) override {
         inner_->resume(s);
         slope_ = s.slope;
@@ -185,21 +197,18 @@ public:
         inner_->save(s);
         s.slope = slope_;
     }
-    void grid(double t0, double step) override { inner_->grid(t0, step); }
 
 private:
-    std::unique_ptr<Control> inner_;
     std::vector<double> abscissae_;
     double slope_ = 0.0;
 };
 
-class BranchGuard : public Control {
+// Halves steps that may have changed the branch.
+class BranchGuard : public ControlWrapper {
 public:
-    BranchGuard(std::unique_ptr<Control> inner, const System& system,
-                const ControlConstants& constants);
-    Proposal propose(double t, double limit, Memory& memory) override;
-    Verdict judge(const Proposal& proposal, const StepResult* result) override;
-    void aim(double end) override { inner_->aim(end); }
+    BranchGuard(std::unique_ptr<Control> inner, const System& system, const Constants& constants);
+    Proposal propose(double t, double limit, IntegratorState& memory) override;
+    StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void resume(const ControlState& s) override {
         inner_->resume(s);
         limit_ = s.limit;
@@ -210,23 +219,22 @@ public:
         s.limit = limit_;
         s.tries = tries_;
     }
-    void grid(double t0, double step) override { inner_->grid(t0, step); }
-    std::vector<double> suspects;
+    std::vector<double> suspect_times;  // ends (s) of steps that were accepted although suspect
 
 private:
-    bool turned(const StepResult& result) const;
+    bool velocity_jumps(const StepResult& result) const;
 
-    std::unique_ptr<Control> inner_;
     const System& system_;
-    ControlConstants constants_;
+    Constants constants_;
     double limit_ = std::numeric_limits<double>::infinity();
     int tries_ = 0;
     mutable std::vector<double> work_;
 };
 
-// Where in (0, 1 + a little] a step passes a zero of sigma; NaN if it does not.
+// The zero of sigma in (0, 1 + a little] of a step; NaN without one.
 double zero_within(const std::vector<double>& abscissae, const std::vector<double>& sigmas);
-// Where sigma will vanish, in steps from the start of the last one; NaN if not soon.
-double zero_ahead(double c, double start, double middle, double end, double ahead);
+// The next zero of sigma, in steps from the start of the last one; NaN if it is further than
+// `horizon`.
+double zero_ahead(double c, double start, double middle, double end, double horizon);
 
 }  // namespace srm

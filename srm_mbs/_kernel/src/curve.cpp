@@ -5,6 +5,13 @@
 
 namespace srm {
 
+void Curve::check() const {
+    const std::size_t count = breaks.size();
+    if (count == 0) throw std::invalid_argument("breaks is empty");
+    expect_size("pieces", pieces.size(), pieces.size() / count * count);
+    expect_size("sines", sines.size(), sines.size() / 3 * 3);
+}
+
 void Curve::at(double t, double out[3]) const {
     const auto after = std::upper_bound(breaks.begin(), breaks.end(), t) - breaks.begin();
     const std::size_t i = after > 0 ? static_cast<std::size_t>(after - 1) : 0;

@@ -8,17 +8,26 @@
 
 namespace srm {
 
+void Extension::check() const {
+    const std::size_t width = static_cast<std::size_t>(n_rates);
+    if (n_rates < 1) throw std::invalid_argument("n_rates is not positive");
+    expect_size("rows", rows.size(), rows.size() / width * width);
+    expect_size("extra_A", extra_A.size(), extra_c.size() * width);
+}
+
+void DenseConstants::check() const { expect_size("nodes", nodes.size(), 3); }
+
 DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double> abscissae,
-                         HermiteConstants hermite, StepArrays steps)
+                         DenseConstants constants, StepArrays steps)
     : extension_(std::move(extension)),
       abscissae_(std::move(abscissae)),
-      hermite_(std::move(hermite)),
+      constants_(std::move(constants)),
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
       extra_(steps_.count),
-      smooth_(steps_.count),
-      near_(steps_.count, 0),
+      polynomials_(steps_.count),
+      places_(steps_.count, Place::unknown),
       delta_(n_),
       x_(nx_),
       weights_(extension_.n_rates),
@@ -30,7 +39,7 @@ DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double
 void DenseOutput::states(System& system, const double* t, long k, double* out) {
     const double* times = steps_.times;
     const long count = steps_.count;
-    const double slack = steps_.slack * std::max(std::abs(times[0]), std::abs(steps_.end));
+    const double slack = constants_.slack * std::max(std::abs(times[0]), std::abs(steps_.end));
     for (long i = 0; i < k; ++i)
         if (!(t[i] >= times[0] - slack && t[i] <= steps_.end + slack))
             throw std::out_of_range("outside the run");
@@ -38,17 +47,19 @@ void DenseOutput::states(System& system, const double* t, long k, double* out) {
         const long found = std::upper_bound(times, times + count + 1, t[i]) - times - 1;
         const long step = std::clamp(found, 0L, count - 1);
         const double theta = (t[i] - times[step]) / (times[step + 1] - times[step]);
-        if (near_[step] == 0) near_[step] = close_to_singular(step) ? 2 : 1;
-        if (near_[step] == 1) {
-            regular(system, step, theta, out);
+        if (places_[step] == Place::unknown)
+            places_[step] = close_to_singular(step) ? Place::near_singular : Place::regular;
+        if (places_[step] == Place::regular) {
+            extended(system, step, theta, out);
         } else {
-            value(smooth(system, step), theta, delta_.data());
+            value(best_polynomial(system, step), theta, delta_.data());
             system.retract(steps_.states + step * nx_, delta_.data(), out);
         }
     }
 }
 
-std::pair<long, long> DenseOutput::piece(long step) const {
+// First and last end of a step between the breakpoints around a step.
+std::pair<long, long> DenseOutput::smooth_interval(long step) const {
     const auto& breaks = steps_.breaks;
     const auto next = std::upper_bound(breaks.begin(), breaks.end(), step);
     return {next == breaks.begin() ? 0 : *(next - 1), next == breaks.end() ? steps_.count : *next};
@@ -58,11 +69,12 @@ const double* DenseOutput::rate_at(long node, long last) const {
     if (node < last) return steps_.rates + node * steps_.width * n_;
     if (node == steps_.count) return steps_.end_rate;
     const auto& breaks = steps_.breaks;
-    return steps_.break_rates + (std::lower_bound(breaks.begin(), breaks.end(), node) - breaks.begin()) * n_;
+    const auto at = std::lower_bound(breaks.begin(), breaks.end(), node);
+    return steps_.break_rates + (at - breaks.begin()) * n_;
 }
 
 bool DenseOutput::close_to_singular(long step) const {
-    const auto [first, last] = piece(step);
+    const auto [first, last] = smooth_interval(step);
     if (last - first < 2) return false;  // without neighbours there is no polynomial
     if (steps_.in_zone[step]) return true;
     const int width = static_cast<int>(abscissae_.size());
@@ -73,27 +85,27 @@ bool DenseOutput::close_to_singular(long step) const {
         change = std::max(change, std::abs(sigmas[j] - sigmas[0]) / abscissae_[j]);
         lowest = std::min(lowest, sigmas[j]);
     }
-    return lowest < hermite_.close * change;
+    return lowest < constants_.close * change;
 }
 
 void DenseOutput::weights(double theta, double* out) const {
     const int width = extension_.n_rates;
     std::fill(out, out + width, 0.0);
-    for (int k = extension_.degree - 1; k >= 0; --k) {
+    for (int k = extension_.degree() - 1; k >= 0; --k) {
         const double factor = k % 2 ? 1.0 - theta : theta;
         const double* row = &extension_.rows[k * width];
         for (int i = 0; i < width; ++i) out[i] = factor * (out[i] + row[i]);
     }
 }
 
-const std::vector<double>& DenseOutput::extra(System& system, long step, double h) {
+const std::vector<double>& DenseOutput::extra_rates(System& system, long step, double h) {
     std::vector<double>& kept = extra_[step];
-    if (!kept.empty() || extension_.n_extra == 0) return kept;
+    if (!kept.empty() || extension_.extra_stages() == 0) return kept;
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     std::vector<double> rate(n_);
-    out.assign(static_cast<std::size_t>(extension_.n_extra) * n_, 0.0);
-    for (int i = 0; i < extension_.n_extra; ++i) {
+    out.assign(static_cast<std::size_t>(extension_.extra_stages()) * n_, 0.0);
+    for (int i = 0; i < extension_.extra_stages(); ++i) {
         const double* a = &extension_.extra_A[i * extension_.n_rates];
         std::fill(delta_.begin(), delta_.end(), 0.0);
         for (int k = 0; k < steps_.width + i; ++k) {
@@ -112,9 +124,9 @@ const std::vector<double>& DenseOutput::extra(System& system, long step, double 
     return kept;
 }
 
-void DenseOutput::regular(System& system, long step, double theta, double* out) {
+void DenseOutput::extended(System& system, long step, double theta, double* out) {
     const double h = steps_.times[step + 1] - steps_.times[step];
-    const std::vector<double>& more = extra(system, step, h);
+    const std::vector<double>& more = extra_rates(system, step, h);
     const double* rates = steps_.rates + step * steps_.width * n_;
     weights(theta, weights_.data());
     std::fill(delta_.begin(), delta_.end(), 0.0);
@@ -137,11 +149,11 @@ void DenseOutput::regular(System& system, long step, double theta, double* out) 
 // Up to `count` ends of steps around the step, none too close together.
 std::vector<long> DenseOutput::nodes(const System& system, long step, int count) const {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
-    const double near = hermite_.spacing * (times[step + 1] - times[step]);
+    const double near = constants_.spacing * (times[step + 1] - times[step]);
     std::vector<long> before{step}, after{step + 1};
     long i = step - 1, j = step + 2;
-    // Rates jump at breakpoints: a polynomial goes no further.
-    auto [first, last] = piece(step);
+    // Rates jump at breakpoints: a polynomial has no nodes beyond.
+    auto [first, last] = smooth_interval(step);
     const auto reachable = [&](long node) {
         return system.reachable(start, steps_.states + node * nx_);
     };
@@ -165,9 +177,9 @@ std::vector<long> DenseOutput::nodes(const System& system, long step, int count)
     return before;
 }
 
-// Motion of the positions from the step to a node, in the charts of the steps between: turns
-// included, however the rates change within a step.
-void DenseOutput::moved(long step, long node, double* out) const {
+// Motion of the positions from the step to a node, whole turns included: the sum of the motions of
+// the steps between, each in its own chart.
+void DenseOutput::motion(long step, long node, double* out) const {
     const int nv = n_ / 2;
     std::fill(out, out + nv, 0.0);
     const double sign = node > step ? 1.0 : -1.0;
@@ -179,15 +191,15 @@ void DenseOutput::moved(long step, long node, double* out) const {
 }
 
 // Divided differences of the states and rates at ends of steps, in the chart of the step.
-DenseOutput::Polynomial DenseOutput::through(System& system, long step, int count) {
+DenseOutput::Polynomial DenseOutput::hermite(System& system, long step, int count) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
     Polynomial out;
     std::vector<double> slopes, rate(n_), near(n_ / 2);
-    const long last = piece(step).second;
+    const long last = smooth_interval(step).second;
     for (long i : nodes(system, step, count)) {
         const double at = (times[i] - times[step]) / h;
-        moved(step, i, near.data());
+        motion(step, i, near.data());
         system.difference(start, steps_.states + i * nx_, near.data(), delta_.data());
         system.chart_rate(delta_.data(), rate_at(i, last), rate.data());
         for (int twice = 0; twice < 2; ++twice) {
@@ -224,16 +236,17 @@ void DenseOutput::value(const Polynomial& polynomial, double theta, double* out)
     }
 }
 
-// Degree 11 where degree 15 confirms it better than it confirms degree 7.
-const DenseOutput::Polynomial& DenseOutput::smooth(System& system, long step) {
-    Polynomial& out = smooth_[step];
+// Of the polynomials of degree 7, 11 and 15, the middle one if it differs less from the last than
+// the first from it; else the first.
+const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long step) {
+    Polynomial& out = polynomials_[step];
     if (!out.points.empty()) return out;
     std::vector<Polynomial> tried;
-    for (int count : hermite_.nodes) tried.push_back(through(system, step, count));
+    for (int count : constants_.nodes) tried.push_back(hermite(system, step, count));
     double changes[2] = {0.0, 0.0};
     std::vector<double> a(n_), b(n_);
     for (int k = 0; k < 2; ++k)
-        for (double theta : hermite_.probes) {
+        for (double theta : constants_.probes) {
             value(tried[k], theta, a.data());
             value(tried[k + 1], theta, b.data());
             for (int i = 0; i < n_; ++i) changes[k] = std::max(changes[k], std::abs(b[i] - a[i]));

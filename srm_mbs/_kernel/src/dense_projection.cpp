@@ -10,10 +10,10 @@ namespace srm {
 
 namespace {
 
-// Up to this many coordinates the size is known to the compiler.
+// Largest nv that is a template argument.
 constexpr int largest_unrolled = 8;
 
-// size = nv, or 0 for one that is not known.
+// size = nv, or 0: nv is known at run time only.
 template <int size>
 class DenseProjection final : public Projection {
 public:
@@ -125,8 +125,8 @@ private:
         for (int k = 0; k < structural_rank; ++k) pivots_[k] = std::abs(A_[k * n + k]);
     }
 
-    // Cholesky's U of M in U_, and L^-1 applied to the rows and the forces on the way: row by row of
-    // U, because the updates that each row asks for do not wait for each other.
+    // Cholesky factor U of M in U_, and L^-1 applied to the rows of G and the forces.  Row by row
+    // of U, because the updates of one row are independent of each other.
     void whiten_all() {
         const int n = count();
         double* const U = U_.data();
@@ -154,9 +154,9 @@ private:
         for (int i = k + 1; i < n; ++i) x[i] -= row_[i] * value;
     }
 
-    // Householder QR with column pivoting, with the pivot rule of LAPACK's xGEQP3 so that both
-    // backends choose the same columns; it stops at the structural rank.  Column norms are computed
-    // anew in the loop that changes them, which LAPACK does only where updating loses digits.
+    // Householder QR with column pivoting down to the structural rank.  The pivot rule is that of
+    // LAPACK's xGEQP3, which the reference calls.  The loop that changes a column also computes its
+    // norm, where LAPACK updates the norm as long as that loses no digits.
     void pivoted_qr() {
         const int n = count();
         for (int j = 0; j < rows; ++j) {

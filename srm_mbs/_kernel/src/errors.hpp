@@ -1,4 +1,4 @@
-// What can go wrong in an evaluation; Python repeats the evaluation for the full message.
+// Failures of an evaluation; the reference repeats the evaluation and has the full message.
 #pragma once
 
 namespace srm {

@@ -17,14 +17,14 @@ using pinocchio::Motion;
 using pinocchio::SE3;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
 
-SE3 placement(const Held& held, const pinocchio::Data& data) {
-    const SE3 inside = pinocchio_model::placement(held.placement);
-    return held.joint ? data.oMi[held.joint] * inside : inside;
+SE3 placement(const Anchor& anchor, const pinocchio::Data& data) {
+    const SE3 inside = pinocchio_model::placement(anchor.placement.data());
+    return anchor.joint ? data.oMi[anchor.joint] * inside : inside;
 }
 
 // Spatial velocity of the body, in world axes at the world origin.
-Motion velocity(const Held& held, const pinocchio::Data& data) {
-    return held.joint ? data.oMi[held.joint].act(data.v[held.joint]) : Motion::Zero();
+Motion velocity(const Anchor& anchor, const pinocchio::Data& data) {
+    return anchor.joint ? data.oMi[anchor.joint].act(data.v[anchor.joint]) : Motion::Zero();
 }
 
 Vector3d point_velocity(const Motion& body, const Vector3d& point) {
@@ -82,7 +82,7 @@ void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double
     const SE3 at = placement(e.a, data);
     Vector3d force(over_time(e, 0, t), over_time(e, 1, t), over_time(e, 2, t));
     Vector3d moment(over_time(e, 3, t), over_time(e, 4, t), over_time(e, 5, t));
-    if (e.turns) {
+    if (e.in_link_axes) {
         force = at.rotation() * force;
         moment = at.rotation() * moment;
     }
@@ -109,11 +109,20 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, double* tau) {
         force += d_shift.cwiseProduct(rate);
         moment += d_turn.cwiseProduct(spin);
     }
-    const Vector3d acting = Tb.rotation() * force, turning = Tb.rotation() * (L * moment);
-    add_wrench(e, data, -acting, -turning, Ta.translation(), tau);
+    const Vector3d world_force = Tb.rotation() * force;
+    const Vector3d world_moment = Tb.rotation() * (L * moment);
+    add_wrench(e, data, -world_force, -world_moment, Ta.translation(), tau);
 }
 
 }  // namespace
+
+void ForceElement::check() const {
+    expect_size("signs", signs.size(), columns.size());
+    if (kind == ForceKind::wrench) expect_size("numbers", numbers.size(), 6);
+    if (kind == ForceKind::bushing) expect_size("numbers", numbers.size(), 12);
+    if (kind == ForceKind::limit_spring) expect_size("numbers", numbers.size(), 3);
+    if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
+}
 
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,

@@ -1,10 +1,11 @@
-// Twin of srm_mbs/dynamics/forces.py: generalised forces of the force elements.
+// Generalised forces of the force elements: dynamics/forces.py.
 #pragma once
 
-#include <string>
+#include <array>
 #include <vector>
 
 #include "curve.hpp"
+#include "struct_fields.hpp"
 
 namespace pinocchio_model {
 struct Workspace;
@@ -12,30 +13,45 @@ struct Workspace;
 
 namespace srm {
 
+// Numbered as by the `constants` of the elements in Python.
 enum class ForceKind { spring_damper, joint_torque, torsion_spring, wrench, bushing, limit_spring };
 
-// An anchor: a frame on a body.
-struct Held {
-    int joint = 0;
-    double placement[12];  // rotation row-major, translation
+using Placement = std::array<double, 12>;  // rotation row by row, translation
+
+#define SRM_ANCHOR(field)                                   \
+    field(int, joint)                                       \
+    field(Placement, placement) /* in the axes of the joint */
+
+// A frame on a body.
+struct Anchor {
+    SRM_FIELDS(SRM_ANCHOR)
 };
 
-// One element; which numbers count depends on its kind.
+#define SRM_FORCE_ELEMENT(field)                                                           \
+    field(ForceKind, kind)                                                                 \
+    field(Anchor, a)                 /* the only anchor of a wrench */                     \
+    field(Anchor, b)                                                                       \
+    field(std::vector<int>, columns) /* velocity components that move a against b, */      \
+    field(std::vector<double>, signs) /* +1 where they move a, -1 where b */               \
+    field(double, stiffness)                                                               \
+    field(double, damping)                                                                 \
+    field(double, rest)              /* length or angle */                                 \
+    field(int, in_q)                 /* first index of the joint in q, and in v */         \
+    field(int, in_v)                                                                       \
+    field(bool, in_link_axes)        /* of a wrench: else world axes */                    \
+    /* Torque; force and moment; stiffness (6) and damping (6); lower and upper limit, depth. */ \
+    field(std::vector<double>, numbers)                                                    \
+    field(std::vector<Curve>, curves) /* laws of the numbers: none, one for all or one for each */
+
+// One element; the fields that count depend on its kind, the others are zero or empty.
 struct ForceElement {
-    ForceKind kind;
-    Held a, b;                    // a is the only anchor of a wrench
-    std::vector<int> columns;     // velocity components that move a against b
-    std::vector<double> signs;
-    double stiffness = 0.0, damping = 0.0, rest = 0.0;
-    int in_q = 0, in_v = 0;
-    bool turns = false;           // a wrench in the axes of its link
-    // torque; force and moment; stiffness (6) and damping (6); lower and upper limit, and depth
-    std::vector<double> numbers;
-    std::vector<Curve> curves;    // laws of the numbers: none, one for all, or one for each
+    SRM_FIELDS(SRM_FORCE_ELEMENT)
+
+    void check() const;
 };
 
-// Adds the generalised forces at t, q, v to tau (nv,); placements, velocities and the world Jacobian
-// must be at hand.  Throws EvaluationError.
+// Adds the generalised forces at t, q, v to tau (nv,).  The workspace holds the placements, the
+// velocities and the world Jacobian there.  Throws EvaluationError.
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
                 const double* v, double* tau);

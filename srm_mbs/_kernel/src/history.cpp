@@ -5,20 +5,28 @@
 
 namespace srm {
 
-void History::empty() {
-    size = 0;
-    times.clear();
-    values.clear();
-    known_until = -std::numeric_limits<double>::infinity();
-    known_below = 0.0;
-    normals.clear();
-    normal_count = 0;
+void MultiplierHistory::check() const {
+    const std::size_t width = static_cast<std::size_t>(nv);
+    expect_size("values", values.size(), times.size() * width);
+    if (nv > 0) expect_size("normals", normals.size(), normals.size() / width * width);
 }
 
-void History::extend(double t, const double* value, const std::vector<double>& new_normals,
-                     int new_count) {
+void MultiplierHistory::clear() {
+    times.clear();
+    values.clear();
+    normals.clear();
+    forget_known();
+}
+
+void MultiplierHistory::forget_known() {
+    known_until = -std::numeric_limits<double>::infinity();
+    known_below = 0.0;
+}
+
+void MultiplierHistory::extend(double t, const double* value,
+                               const std::vector<double>& new_normals) {
     int kept = 0;
-    while (kept < size && times[kept] < t) ++kept;
+    while (kept < size() && times[kept] < t) ++kept;
     times.resize(kept);
     values.resize(static_cast<std::size_t>(kept) * nv);
     times.push_back(t);
@@ -28,20 +36,17 @@ void History::extend(double t, const double* value, const std::vector<double>& n
         times.erase(times.begin(), times.begin() + extra);
         values.erase(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(extra) * nv);
     }
-    size = static_cast<int>(times.size());
-    known_until = -std::numeric_limits<double>::infinity();
-    known_below = 0.0;
+    forget_known();
     normals = new_normals;
-    normal_count = new_count;
 }
 
-int History::first_around(double t) const {
-    const auto at = std::lower_bound(times.begin(), times.begin() + size, t);
+int MultiplierHistory::first_around(double t) const {
+    const auto at = std::lower_bound(times.begin(), times.end(), t);
     const int first = static_cast<int>(at - times.begin()) - window / 2;
-    return std::max(0, std::min(first, size - window));
+    return std::max(0, std::min(first, size() - window));
 }
 
-void History::interpolate(int first, int count, double t, double* out) const {
+void MultiplierHistory::interpolate(int first, int count, double t, double* out) const {
     std::fill(out, out + nv, 0.0);
     for (int i = first; i < first + count; ++i) {
         double weight = 1.0;
@@ -52,20 +57,20 @@ void History::interpolate(int first, int count, double t, double* out) const {
     }
 }
 
-void History::predict(double t, double* out) const {
+void MultiplierHistory::predict(double t, double* out) const {
     const int first = first_around(t);
-    interpolate(first, std::min(window, size - first), t, out);
+    interpolate(first, std::min(window, size() - first), t, out);
 }
 
-bool History::predict_near(double t, double* out) const {
-    const double span = times[size - 1] - times[0];
-    if (span > 0.0 && t > std::max(times[size - 1] + stale * span, known_until)) return false;
+bool MultiplierHistory::predict_near(double t, double* out) const {
+    const double span = times.back() - times.front();
+    if (span > 0.0 && t > std::max(times.back() + stale * span, known_until)) return false;
     predict(t, out);
     return true;
 }
 
-void History::uncertainty(double t, double* out) const {
-    const int first = first_around(t), count = std::min(window, size - first);
+void MultiplierHistory::uncertainty(double t, double* out) const {
+    const int first = first_around(t), count = std::min(window, size() - first);
     if (count < 2) {
         std::fill(out, out + nv, 0.0);
         return;

@@ -1,36 +1,45 @@
-// Twin of srm_mbs/integration/methods/multiplier_history.py: multipliers of recent steps, extrapolated into the zone.
+// Multipliers of recent steps, extrapolated into the zone: methods/multiplier_history.py.
 #pragma once
 
 #include <limits>
 #include <vector>
 
+#include "struct_fields.hpp"
+
 namespace srm {
 
-class History {
+#define SRM_MULTIPLIER_HISTORY(field)                                                     \
+    field(int, nv)                                                                        \
+    field(std::vector<double>, times)   /* (k,), ascending */                             \
+    field(std::vector<double>, values)  /* (k, nv) */                                     \
+    /* Up to known_until (s) the values hold for sigma below known_below. */              \
+    field(double, known_until)                                                            \
+    field(double, known_below)                                                            \
+    field(std::vector<double>, normals) /* (m, nv), of the weakest row last; or empty */
+
+class MultiplierHistory {
 public:
-    static constexpr int points = 5;
-    static constexpr int window = 9;
-    static constexpr double stale = 4.0;
+    SRM_FIELDS(SRM_MULTIPLIER_HISTORY)
 
-    int size = 0;                 // nodes
-    int nv = 0;
-    std::vector<double> times;    // (size,)
-    std::vector<double> values;   // (size, nv)
-    double known_until = -std::numeric_limits<double>::infinity();
-    double known_below = 0.0;
-    std::vector<double> normals;  // (nv, normal_count), empty: none
-    int normal_count = 0;
+    static constexpr int points = 5;      // nodes that are kept
+    static constexpr int window = 9;      // nodes of an interpolation
+    static constexpr double stale = 4.0;  // spans beyond which nothing is extrapolated
 
-    bool begun() const { return size > 0; }
-    void empty();
-    // Adds the multiplier at t; the newest `points` nodes are kept, those ahead of t dropped.
-    void extend(double t, const double* value, const std::vector<double>& normals,
-                int normal_count);
+    int size() const { return static_cast<int>(times.size()); }
+    int normal_count() const { return nv > 0 ? static_cast<int>(normals.size()) / nv : 0; }
+    bool begun() const { return !times.empty(); }
+    void clear();
+    // Adds the multiplier at t; the newest `points` nodes are kept, those after t dropped.
+    void extend(double t, const double* value, const std::vector<double>& normals);
     void predict(double t, double* out) const;
+    // Predicts unless t is too far from the nodes; whether it does.
     bool predict_near(double t, double* out) const;
+    // Difference of the predictions with all nodes and without the oldest.
     void uncertainty(double t, double* out) const;
+    void check() const;
 
 private:
+    void forget_known();
     int first_around(double t) const;
     void interpolate(int first, int count, double t, double* out) const;
 };

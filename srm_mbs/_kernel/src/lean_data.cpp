@@ -10,7 +10,8 @@ using pinocchio::Data;
 using pinocchio::JointIndex;
 using pinocchio::Model;
 
-// Which rows of M belong together: what the constructor finds for models without mimic joints.
+// The supports and subtrees of the rows of M, as the constructor finds them for models without
+// mimic joints.
 void find_rows(Data& data, const Model& model) {
     const auto count = static_cast<JointIndex>(model.njoints);
     data.nvSubtree.assign(count, 0);
@@ -35,7 +36,7 @@ void find_rows(Data& data, const Model& model) {
                               : parent > 0 ? model.idx_vs[parent] + model.nvs[parent] - 1
                                            : -1;
             data.parents_fromRow[at] = data.non_mimic_parents_fromRow[at] = above;
-            // Of rows after a joint's first, as the constructor has it.
+            // Set for the rows of a joint after its first, as by the constructor.
             if (row > first) data.mimic_parents_fromRow[at] = above;
             data.nvSubtree_fromRow[at] = data.nvSubtree[i] - (row - first);
             data.start_idx_v_fromRow[at] = first;
@@ -58,7 +59,8 @@ void prepare(Data& data, const Model& model) {
     const auto count = static_cast<std::size_t>(model.njoints);
     const Eigen::Index nv = model.nv;
     data.q_in = pinocchio::neutral(model);
-    for (auto* vector : {&data.v_in, &data.a_in, &data.tau_in, &data.tau, &data.ddq, &data.dq_after})
+    for (auto* vector : {&data.v_in, &data.a_in, &data.tau_in, &data.tau, &data.ddq,
+                         &data.dq_after})
         vector->setZero(nv);
     for (auto* vector : {&data.nle, &data.g, &data.u, &data.D, &data.Dinv, &data.tmp,
                          &data.torque_residual})

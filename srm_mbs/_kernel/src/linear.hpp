@@ -1,7 +1,7 @@
 // Dense linear algebra on small column-major arrays.
 //
-// Mechanisms have a few to a few dozen coordinates: loops over plain arrays beat any library's
-// set-up cost there.  Matrices are column-major, as in LAPACK.
+// Mechanisms have a few to a few dozen coordinates, for which a call of a library costs more than
+// a loop over plain arrays.  Matrices are column-major, as in LAPACK.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Pinocchio's objects behind and for Python, through Boost.Python's registry.
+// Pinocchio's objects from and for Python, through Boost.Python's registry.
 #pragma once
 
 #include <Python.h>

@@ -1,579 +1,52 @@
-// Bindings: data in from Python, runs, arrays out.
+// The Python module: structs that Python fills, systems, runs, dense output.
+#include <algorithm>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include "algebra.hpp"
+#include "constants.hpp"
 #include "dense.hpp"
 #include "errors.hpp"
 #include "linear.hpp"
 #include "model.hpp"
 #include "run.hpp"
+#include "struct_binding.hpp"
 
-namespace nb = nanobind;
 using namespace srm;
 
 namespace {
 
-using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+// ---- Support ------------------------------------------------------------------------------------
 
-std::vector<double> vector_of(const Array& array) {
-    return std::vector<double>(array.data(), array.data() + array.size());
+// The vector `array`, which has `size` numbers.
+const double* vector_of(const Array& array, int size, const char* name) {
+    if (array.ndim() != 1 || static_cast<int>(array.size()) != size)
+        throw nb::value_error((std::string(name) + " has not the shape (" + std::to_string(size) +
+                               ",)").c_str());
+    return array.data();
 }
 
-std::vector<double> vector_of(nb::handle object) {
-    return object.is_none() ? std::vector<double>{} : vector_of(nb::cast<Array>(object));
+std::vector<double> optional_vector(nb::handle object) {
+    return object.is_none() ? std::vector<double>{} : to_vector(nb::cast<Array>(object));
 }
 
-// A NumPy array that owns `values`.
-nb::object owned(std::vector<double> values, std::initializer_list<std::size_t> shape) {
-    auto* kept = new std::vector<double>(std::move(values));
-    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), shape.size(), shape.begin(), owner));
+// A view of `values`, which `owner` keeps alive.
+nb::object view(const std::vector<double>& values, std::initializer_list<std::size_t> shape,
+                nb::handle owner) {
+    return nb::cast(nb::ndarray<nb::numpy, double>(const_cast<double*>(values.data()), shape.size(),
+                                                   shape.begin(), owner));
 }
 
-double number(const nb::dict& d, const char* key) { return nb::cast<double>(d[key]); }
-int whole(const nb::dict& d, const char* key) { return nb::cast<int>(d[key]); }
-
-Scheme scheme_of(const nb::dict& d) {
-    Scheme out;
-    out.A = vector_of(d["A"]);
-    out.b = vector_of(d["b"]);
-    out.c = vector_of(d["c"]);
-    out.error = vector_of(d["error"]);
-    out.stages = static_cast<int>(out.b.size());
-    out.controller_order = whole(d, "controller_order");
-    out.gap_centres = vector_of(d["gap_centres"]);
-    out.gap_half_widths = vector_of(d["gap_half_widths"]);
-    return out;
-}
-
-StepConstants step_constants_of(const nb::dict& d) {
-    return {number(d, "watched"),      number(d, "near"),
-            number(d, "far"),          number(d, "ambiguous"),
-            number(d, "held"),         number(d, "rounding"),
-            number(d, "usual"),        number(d, "crosses"),
-            number(d, "lead"),         number(d, "most_floor"),
-            number(d, "zone_largest"), number(d, "count_uncertainty_above"),
-            number(d, "hit"),          whole(d, "projections"),
-            whole(d, "fewest"),        whole(d, "gap_every")};
-}
-
-ControlConstants control_constants_of(const nb::dict& d) {
-    return {number(d, "safety"),       number(d, "min_factor"),   number(d, "max_factor"),
-            number(d, "proportional"), number(d, "integral"),     number(d, "xi_old_floor"),
-            number(d, "xi_floor"),     number(d, "failed_evaluation"),
-            number(d, "sigma_change"), number(d, "too_close"),    number(d, "clearance"),
-            number(d, "ahead"),        whole(d, "max_redone"),    number(d, "beside"),
-            number(d, "arrival_change"), number(d, "turned"),
-            whole(d, "guard_max_redone")};
-}
-
-LoopConstants loop_constants_of(const nb::dict& d) {
-    return {number(d, "smallest_step"), number(d, "standstill"), number(d, "large_correction"),
-            number(d, "open"),          number(d, "lost"),       whole(d, "watched_steps"),
-            number(d, "look"),          number(d, "closer"),        number(d, "allowed")};
-}
-
-ErrorNorm norm_of(const nb::dict& d) {
-    ErrorNorm out;
-    out.atol = vector_of(d["atol"]);
-    out.one = vector_of(d["one"]);
-    out.rtol = number(d, "rtol");
-    out.negligible = number(d, "negligible");
-    return out;
-}
-
-History history_of(const nb::dict& d, int nv) {
-    History out;
-    out.nv = nv;
-    out.times = vector_of(d["times"]);
-    out.values = vector_of(d["values"]);
-    out.size = static_cast<int>(out.times.size());
-    out.known_until = number(d, "known_until");
-    out.known_below = number(d, "known_below");
-    out.normals = vector_of(d["normals"]);
-    out.normal_count = static_cast<int>(out.normals.size()) / nv;
-    return out;
-}
-
-nb::dict dict_of(const History& h) {
-    nb::dict out;
-    const auto k = static_cast<std::size_t>(h.size), nv = static_cast<std::size_t>(h.nv);
-    out["times"] = owned(h.times, {k});
-    out["values"] = owned(h.values, {k, nv});
-    out["known_until"] = h.known_until;
-    out["known_below"] = h.known_below;
-    // Column by column in both worlds: (k, nv) rows here are the columns there.
-    out["normals"] = h.normal_count == 0
-                         ? nb::none()
-                         : owned(h.normals, {static_cast<std::size_t>(h.normal_count), nv});
-    return out;
-}
-
-Memory memory_of(const nb::dict& d, int nv) {
-    Memory out;
-    out.rate = vector_of(d["rate"]);
-    out.magnitude = vector_of(d["magnitude"]);
-    out.sigma = number(d, "sigma");
-    out.sigma_slope = number(d, "sigma_slope");
-    out.steps = nb::cast<long>(d["steps"]);
-    out.has_history = !d["history"].is_none();
-    if (out.has_history) out.history = history_of(nb::cast<nb::dict>(d["history"]), nv);
-    return out;
-}
-
-nb::dict dict_of(const Memory& m) {
-    nb::dict out;
-    out["rate"] = owned(m.rate, {m.rate.size()});
-    out["magnitude"] = owned(m.magnitude, {m.magnitude.size()});
-    out["sigma"] = m.sigma;
-    out["sigma_slope"] = m.sigma_slope;
-    out["steps"] = m.steps;
-    out["history"] = m.has_history ? nb::object(dict_of(m.history)) : nb::none();
-    return out;
-}
-
-ControlState control_of(const nb::dict& d) {
-    ControlState c;
-    c.h = number(d, "h");
-    c.xi_old = number(d, "xi_old");
-    c.just_rejected = nb::cast<bool>(d["just_rejected"]);
-    c.index = nb::cast<long>(d["index"]);
-    c.slope = number(d, "slope");
-    c.zero = number(d, "zero");
-    c.redo = number(d, "redo");
-    c.redone = whole(d, "redone");
-    c.limit = number(d, "limit");
-    c.tries = whole(d, "tries");
-    c.arrival = whole(d, "arrival");
-    return c;
-}
-
-nb::dict dict_of(const ControlState& c) {
-    nb::dict out;
-    out["h"] = c.h;
-    out["xi_old"] = c.xi_old;
-    out["just_rejected"] = c.just_rejected;
-    out["index"] = c.index;
-    out["slope"] = c.slope;
-    out["zero"] = c.zero;
-    out["redo"] = c.redo;
-    out["redone"] = c.redone;
-    out["limit"] = c.limit;
-    out["tries"] = c.tries;
-    out["arrival"] = c.arrival;
-    return out;
-}
-
-// The velocity components that move one body against another.
-void take_support(const nb::dict& d, std::vector<int>& columns, std::vector<double>& signs) {
-    const std::vector<double> support = vector_of(d["support"]);
-    for (std::size_t j = 0; j < support.size(); ++j) {
-        if (support[j] == 0.0) continue;
-        columns.push_back(static_cast<int>(j));
-        signs.push_back(support[j]);
-    }
-}
-
-Held held_of(nb::handle item) {
-    const auto pair = nb::cast<nb::tuple>(item);
-    Held out;
-    out.joint = nb::cast<int>(pair[0]);
-    const std::vector<double> placement = vector_of(pair[1]);
-    std::copy_n(placement.begin(), 12, out.placement);
-    return out;
-}
-
-Curve curve_of(const nb::dict& d) {
-    return {vector_of(d["breaks"]), vector_of(d["pieces"]), vector_of(d["sines"])};
-}
-
-ForceElement force_of(const nb::dict& d) {
-    ForceElement out;
-    out.kind = static_cast<ForceKind>(whole(d, "kind"));
-    if (d.contains("a")) out.a = held_of(d["a"]);
-    if (d.contains("b")) out.b = held_of(d["b"]);
-    if (d.contains("support")) take_support(d, out.columns, out.signs);
-    if (d.contains("stiffness")) out.stiffness = number(d, "stiffness");
-    if (d.contains("damping")) out.damping = number(d, "damping");
-    if (d.contains("rest")) out.rest = number(d, "rest");
-    if (d.contains("in_q")) out.in_q = whole(d, "in_q");
-    if (d.contains("in_v")) out.in_v = whole(d, "in_v");
-    if (d.contains("turns")) out.turns = nb::cast<bool>(d["turns"]);
-    if (d.contains("numbers")) out.numbers = vector_of(d["numbers"]);
-    if (d.contains("curves"))
-        for (nb::handle curve : nb::cast<nb::list>(d["curves"]))
-            out.curves.push_back(curve_of(nb::cast<nb::dict>(curve)));
-    return out;
-}
-
-struct PySystem {
-    nb::object model, controller;  // kept alive
-    std::unique_ptr<System> system;
-
-    PySystem(nb::object model_, const nb::dict& d, nb::object controller_)
-        : model(model_), controller(controller_) {
-        const void* found = model_in(model.ptr());
-        if (!found) throw nb::type_error("not a pinocchio.Model");
-        SystemData data;
-        for (nb::handle item : nb::cast<nb::list>(d["loops"])) {
-            const nb::dict loop = nb::cast<nb::dict>(item);
-            LoopRows rows;
-            rows.joint_a = whole(loop, "joint_a");
-            rows.joint_b = whole(loop, "joint_b");
-            const std::vector<double> a = vector_of(loop["at_a"]), b = vector_of(loop["at_b"]);
-            std::copy_n(a.begin(), 3, rows.at_a);
-            std::copy_n(b.begin(), 3, rows.at_b);
-            rows.directions = vector_of(loop["directions"]);
-            rows.distances = vector_of(loop["distances"]);
-            rows.alignments = vector_of(loop["alignments"]);
-            take_support(loop, rows.columns, rows.signs);
-            rows.first_row = whole(loop, "first_row");
-            data.loops.push_back(std::move(rows));
-        }
-        for (nb::handle item : nb::cast<nb::list>(d["joint_rows"])) {
-            const nb::dict row = nb::cast<nb::dict>(item);
-            data.joint_rows.push_back({whole(row, "row"), vector_of(row["coefficients"]),
-                                       nb::cast<std::vector<int>>(row["in_q"]),
-                                       nb::cast<std::vector<int>>(row["in_v"]),
-                                       number(row, "offset")});
-        }
-        for (nb::handle item : nb::cast<nb::list>(d["eliminations"])) {
-            const auto e = nb::cast<nb::tuple>(item);
-            data.eliminations.push_back({nb::cast<int>(e[0]), nb::cast<int>(e[1]),
-                                         nb::cast<double>(e[2]),
-                                         nb::cast<std::vector<int>>(e[3])});
-        }
-        for (nb::handle item : nb::cast<nb::list>(d["drives"])) {
-            const nb::dict drive = nb::cast<nb::dict>(item);
-            data.drives.push_back({whole(drive, "row"), number(drive, "factor"),
-                                   whole(drive, "in_q"), whole(drive, "in_v"),
-                                   nb::cast<bool>(drive["wound"]),
-                                   curve_of(nb::cast<nb::dict>(drive["curve"]))});
-        }
-        data.rows = whole(d, "rows");
-        data.structural_rank = whole(d, "structural_rank");
-        data.sigma_ref = number(d, "sigma_ref");
-        data.algebra = nb::cast<std::string>(d["algebra"]);
-        data.order = nb::cast<std::vector<int>>(d["order"]);
-        data.pivot_share = number(d, "pivot_share");
-        data.pivot_window = whole(d, "pivot_window");
-        data.gap_scale = vector_of(d["gap_scale"]);
-        data.unit = vector_of(d["unit"]);
-        data.position_of = nb::cast<std::vector<int>>(d["position_of"]);
-        data.damping = vector_of(d["damping"]);
-        data.friction = vector_of(d["friction"]);
-        data.friction_speed = number(d, "friction_speed");
-        for (nb::handle item : nb::cast<nb::list>(d["forces"]))
-            data.forces.push_back(force_of(nb::cast<nb::dict>(item)));
-        data.coincident = number(d, "coincident");
-        for (nb::handle item : nb::cast<nb::list>(d["groups"])) {
-            const auto group = nb::cast<nb::tuple>(item);
-            const auto name = nb::cast<std::string>(group[0]);
-            data.groups.push_back({name == "so3"   ? Group::so3
-                                   : name == "se3" ? Group::se3
-                                                   : Group::se2,
-                                   nb::cast<int>(group[1]), nb::cast<int>(group[2]),
-                                   nb::cast<int>(group[3])});
-        }
-        data.series = vector_of(d["series"]);
-        data.turning = nb::cast<std::vector<int>>(d["turning"]);
-        data.largest_rotation = number(d, "largest_rotation");
-        data.farthest_node = number(d, "farthest_node");
-        data.rotation_per_step = number(d, "rotation_per_step");
-        Controller act;
-        if (!controller.is_none()) {
-            const auto call = [this](double t, const double* q, const double* v, double* tau) {
-                nb::gil_scoped_acquire held;
-                const auto nq = static_cast<std::size_t>(system->nq);
-                const auto nv = static_cast<std::size_t>(system->nv);
-                nb::object out = controller(t, owned(std::vector<double>(q, q + nq), {nq}),
-                                            owned(std::vector<double>(v, v + nv), {nv}));
-                const Array forces = nb::cast<Array>(out);
-                std::copy_n(forces.data(), nv, tau);
-            };
-            act = call;
-        }
-        system = std::make_unique<System>(found, std::move(data), std::move(act));
-    }
-
-    // The terms of one stage, for comparison with the reference.
-    nb::dict terms(double t, const Array& state, double threshold) {
-        System::ZoneView zone;
-        zone.threshold = threshold;
-        system->evaluate(t, state.data(), zone);
-        const auto n = static_cast<std::size_t>(2 * system->nv);
-        nb::dict out;
-        std::vector<double> rate(n), correction(n), multiplier(n / 2);
-        system->rate(rate.data());
-        system->correction(correction.data());
-        system->multiplier(multiplier.data());
-        out["rate"] = owned(rate, {n});
-        out["correction"] = owned(correction, {n});
-        out["multiplier"] = owned(multiplier, {n / 2});
-        out["sigma"] = system->sigma();
-        out["rank"] = system->rank();
-        out["gap"] = system->gap();
-        return out;
-    }
-
-    // Length of the first step; see initial_step.
-    double first_step(double t, const Array& state, const Array& rate, const Array& magnitude,
-                      const Array& atol, const Array& one, double rtol, double span, int order,
-                      const nb::tuple& constants) {
-        ErrorNorm norm;
-        norm.atol = vector_of(atol);
-        norm.one = vector_of(one);
-        norm.rtol = rtol;
-        return initial_step(*system, norm, t, state.data(), rate.data(), magnitude.data(), span,
-                            order,
-                            {nb::cast<double>(constants[0]), nb::cast<double>(constants[1]),
-                             nb::cast<double>(constants[2])});
-    }
-
-    // Evaluates the stage `repeats` times: the cost of one evaluation in the loop.
-    void repeat(double t, const Array& state, long repeats) {
-        std::vector<double> rate(2 * system->nv);
-        const double* x = state.data();
-        nb::gil_scoped_release released;
-        for (long i = 0; i < repeats; ++i) {
-            system->evaluate(t, x, System::ZoneView{});
-            system->rate(rate.data());
-        }
-    }
-
-    // The part of `repeat` that is Pinocchio's: the pass over the tree.
-    void repeat_tree(const Array& state, long repeats) {
-        const double* x = state.data();
-        nb::gil_scoped_release released;
-        for (long i = 0; i < repeats; ++i) system->tree_terms(x);
-    }
-};
-
-struct PyRun {
-    nb::object system;
-    std::unique_ptr<Run> run;
-    System& s;
-
-    PyRun(PySystem& owner, nb::object system_, const nb::dict& d)
-        : system(system_), s(*owner.system) {
-        const Scheme scheme = scheme_of(nb::cast<nb::dict>(d["scheme"]));
-        const auto constants = nb::cast<nb::dict>(d["constants"]);
-        const ControlConstants control_constants = control_constants_of(constants);
-        Pieces pieces{vector_of(d["ends"]), vector_of(d["first"]), vector_of(d["last"]), {}};
-        for (double mark : vector_of(d["given"])) pieces.given.push_back(mark != 0.0);
-        const double t0 = number(d, "t0"), t_end = pieces.ends.back();
-        const double step = number(d, "step"), first_step = number(d, "first_step");
-        std::unique_ptr<Control> control;
-        if (step > 0.0)
-            control = std::make_unique<FixedStep>(t0, t_end, step);
-        else
-            control = std::make_unique<PIControl>(t_end, first_step, scheme.controller_order,
-                                                  control_constants);
-        const auto placement = nb::cast<std::string>(d["placement"]);
-        if (s.constrained() && placement == "automatic") {
-            control = std::make_unique<SingularityPlacement>(std::move(control), scheme, t_end,
-                                                             control_constants,
-                                                             nb::cast<bool>(d["arrivals"]));
-            control = std::make_unique<BranchGuard>(std::move(control), s, control_constants);
-        } else if (s.constrained()) {
-            control = std::make_unique<SlopeOfSigma>(std::move(control), scheme);
-        }
-        Regularisation eps;
-        if (!d["eps"].is_none()) {
-            const auto pair = nb::cast<nb::tuple>(d["eps"]);
-            eps = {nb::cast<double>(pair[0]), nb::cast<double>(pair[1])};
-        }
-        const std::vector<double> state = vector_of(d["state"]);
-        run = std::make_unique<Run>(
-            s, SplitStep(s, scheme, step_constants_of(constants), norm_of(nb::cast<nb::dict>(d["norm"]))),
-            std::move(control), loop_constants_of(constants),
-            memory_of(nb::cast<nb::dict>(d["memory"]), s.nv), state.data(), t0, std::move(pieces),
-            number(d, "max_step"), eps);
-    }
-
-    int advance(long steps, double seconds) {
-        nb::gil_scoped_release released;
-        return static_cast<int>(run->advance(steps, seconds));
-    }
-
-    // One attempt from where the reference stands: (stop, verdict), verdict -1 if none was made.
-    nb::tuple attempt_from(double t, const Array& state, const nb::dict& memory,
-                           const nb::dict& control) {
-        const ControlState c = control_of(control);
-        run->resume(t, state.data(), memory_of(memory, s.nv), c);
-        Verdict verdict = static_cast<Verdict>(-1);
-        const Stop stop = run->attempt(verdict);
-        return nb::make_tuple(static_cast<int>(stop), static_cast<int>(verdict));
-    }
-
-    // Goes on to `end`; `force` (nv,) acts from here, or what acted before.  See Run::go_on.
-    int go_on(double end, double first, double last, nb::handle force, bool anew, double grid,
-              double seconds) {
-        if (!force.is_none()) {
-            const Array array = nb::cast<Array>(force);
-            if (static_cast<int>(array.size()) != s.nv || array.ndim() != 1 ||
-                !finite(array.data(), s.nv))
-                throw nb::value_error("not nv finite forces");
-            if (!s.holds(array.data())) {
-                s.hold(run->t(), array.data(), false);
-                anew = true;
-            }
-        }
-        nb::gil_scoped_release released;
-        return static_cast<int>(run->go_on(end, first, last, anew, grid, seconds));
-    }
-
-    // Everything that the next step depends on.
-    nb::dict snapshot() {
-        nb::dict out;
-        ControlState control;
-        run->control->save(control);
-        out["t"] = run->t();
-        out["state"] = owned(run->state, {run->state.size()});
-        out["memory"] = dict_of(run->memory);
-        out["control"] = dict_of(control);
-        out["seen"] = run->seen();
-        out["near"] = run->near();
-        return out;
-    }
-
-    void restore(const nb::dict& d) {
-        const Array state = nb::cast<Array>(d["state"]);
-        run->resume(number(d, "t"), state.data(), memory_of(nb::cast<nb::dict>(d["memory"]), s.nv),
-                    control_of(nb::cast<nb::dict>(d["control"])));
-        run->adopt(number(d, "seen"), number(d, "near"));
-    }
-
-    // Accepted, rejected and zone steps since the start.
-    nb::tuple totals() {
-        long rejected = run->rejected_before;
-        for (const Attempt& a : run->attempts)
-            rejected += a.verdict == static_cast<int>(Verdict::rejected);
-        return nb::make_tuple(run->steps_before + run->count(), rejected,
-                              run->zones_before + static_cast<long>(run->zones.size()));
-    }
-
-    // The records since the start `state` at `t0`, which are handed over.
-    nb::dict arrays(double t0, const Array& state) {
-        Run& r = *run;
-        const auto count = static_cast<std::size_t>(r.count());
-        const auto n = static_cast<std::size_t>(2 * s.nv), nx = static_cast<std::size_t>(s.nq + s.nv);
-        const auto width = static_cast<std::size_t>(r.step.scheme.stages + 1);
-        nb::dict out;
-        r.times.insert(r.times.begin(), t0);
-        r.states.insert(r.states.begin(), state.data(), state.data() + nx);
-        out["times"] = owned(std::move(r.times), {count + 1});
-        out["states"] = owned(std::move(r.states), {count + 1, nx});
-        out["rates"] = owned(std::move(r.rates), {count, width, n});
-        out["corrections"] = owned(std::move(r.corrections), {count, s.constrained() ? n : 0});
-        out["sigmas"] = owned(std::move(r.sigmas), {count, width});
-        out["ranks"] = owned(std::move(r.ranks), {count});
-        out["error_ratios"] = owned(std::move(r.error_ratios), {count});
-        out["placements"] = owned(std::move(r.placements), {count});
-        out["held"] = owned(std::move(r.held), {count});
-        out["end_rate"] = owned(r.end_rate, {n});
-        const std::size_t breaks = r.breaks.size();
-        out["breaks"] = owned(r.breaks, {breaks});
-        out["break_rates"] = owned(r.break_rates, {breaks, n});
-        nb::dict zones;
-        for (const ZoneRecord& zone : r.zones)
-            zones[nb::int_(zone.step)] = nb::make_tuple(zone.threshold, dict_of(zone.history));
-        out["zones"] = zones;
-        return out;
-    }
-
-    // The step made last, accepted or not, as the reference describes it.
-    nb::dict last() {
-        const StepResult& r = run->step.result;
-        const auto n = static_cast<std::size_t>(2 * s.nv);
-        nb::dict out;
-        out["t"] = r.t;
-        out["h"] = r.h;
-        out["state"] = owned(r.state, {r.state.size()});
-        out["rates"] = owned(r.rates, {r.sigmas.size(), n});
-        out["end_rate"] = owned(r.end_rate, {n});
-        out["correction"] = owned(r.correction, {r.correction.size()});
-        out["error_ratio"] = r.error_ratio;
-        out["sigmas"] = owned(r.sigmas, {r.sigmas.size()});
-        out["rank"] = r.rank;
-        out["magnitude"] = owned(r.magnitude, {n});
-        out["quiet"] = r.quiet;
-        out["gap"] = r.gap;
-        out["held"] = r.held;
-        out["zone_threshold"] = r.in_zone ? nb::cast(r.zone_threshold) : nb::none();
-        // Of an accepted step; that of another one is still the memory's.
-        const bool recorded = !run->zones.empty() && run->zones.back().step == run->count() - 1;
-        out["history"] = !r.in_zone ? nb::none()
-                                    : nb::object(dict_of(recorded ? run->zones.back().history
-                                                                  : run->memory.history));
-        return out;
-    }
-
-    nb::list attempts() {
-        nb::list out;
-        for (const Attempt& a : run->attempts)
-            out.append(nb::make_tuple(a.t, a.h, a.error_ratio, a.verdict));
-        return out;
-    }
-    nb::list suspects() {
-        nb::list out;
-        if (const auto* guard = dynamic_cast<const BranchGuard*>(run->control.get()))
-            for (double t : guard->suspects) out.append(t);
-        return out;
-    }
-};
-
-struct PyDense {
-    nb::object steps;  // kept alive
-    std::unique_ptr<DenseOutput> dense;
-    int nx;
-
-    PyDense(int nq, int nv, const nb::dict& d) : steps(d), nx(nq + nv) {
-        Extension extension;
-        extension.rows = vector_of(d["rows"]);
-        extension.extra_A = vector_of(d["extra_A"]);
-        extension.extra_c = vector_of(d["extra_c"]);
-        extension.degree = whole(d, "degree");
-        extension.n_rates = whole(d, "n_rates");
-        extension.n_extra = static_cast<int>(extension.extra_c.size());
-        HermiteConstants hermite{nb::cast<std::vector<int>>(d["nodes"]), number(d, "spacing"),
-                                 number(d, "close"), vector_of(d["probes"])};
-        StepArrays arrays;
-        const auto pointer = [&](const char* key) { return nb::cast<Array>(d[key]).data(); };
-        arrays.times = pointer("times");
-        arrays.states = pointer("states");
-        arrays.rates = pointer("rates");
-        arrays.corrections = pointer("corrections");
-        arrays.sigmas = pointer("sigmas");
-        arrays.end_rate = pointer("end_rate");
-        arrays.end = number(d, "end");
-        arrays.slack = number(d, "slack");
-        arrays.count = nb::cast<long>(d["count"]);
-        for (double i : vector_of(d["breaks"])) arrays.breaks.push_back(static_cast<long>(i));
-        arrays.break_rates = pointer("break_rates");
-        arrays.width = whole(d, "width");
-        arrays.corrected = nb::cast<bool>(d["corrected"]);
-        arrays.in_zone.assign(arrays.count, 0);
-        for (long step : nb::cast<std::vector<long>>(d["zones"])) arrays.in_zone[step] = 1;
-        dense = std::make_unique<DenseOutput>(nq, nv, std::move(extension), vector_of(d["abscissae"]),
-                                              std::move(hermite), std::move(arrays));
-    }
-
-    nb::object states(PySystem& owner, const Array& t) {
-        const auto k = t.size();
-        std::vector<double> out(k * static_cast<std::size_t>(nx));
-        // With the interpreter's lock held: threads may read one solution, and share its workspace.
-        dense->states(*owner.system, t.data(), static_cast<long>(k), out.data());
-        return owned(std::move(out), {k, static_cast<std::size_t>(nx)});
-    }
-};
-
-}  // namespace
-
-// The collector follows what the objects keep alive: a controller may lead back to a solution.
+// Type slots that show the garbage collector the objects that a T keeps alive: a controller may
+// refer back to a solution.
 template <typename T, nb::object T::*... kept>
 int traverse(PyObject* self, visitproc visit, void* arg) {
     Py_VISIT(Py_TYPE(self));
@@ -601,10 +74,488 @@ PyType_Slot* collected() {
     return slots;
 }
 
+const void* pinocchio_model_in(nb::handle model) {
+    const void* found = model_in(model.ptr());
+    if (!found) throw nb::type_error("not a pinocchio.Model");
+    return found;
+}
+
+// ---- Structs ------------------------------------------------------------------------------------
+
+void bind_structs(nb::module_& m) {
+    bind_struct<Constants>(m, "Constants");
+    bind_struct<ButcherTableau>(m, "ButcherTableau");
+    bind_struct<ErrorNorm>(m, "ErrorNorm");
+    bind_struct<MultiplierHistory>(m, "MultiplierHistory");
+    bind_struct<IntegratorState>(m, "IntegratorState");
+    bind_struct<ControlState>(m, "ControlState");
+    bind_struct<SmoothIntervals>(m, "SmoothIntervals");
+    bind_struct<RunOptions>(m, "RunOptions");
+    bind_struct<RunSnapshot>(m, "RunSnapshot");
+    bind_struct<Curve>(m, "Curve");
+    bind_struct<Anchor>(m, "Anchor");
+    bind_struct<ForceElement>(m, "ForceElement");
+    bind_struct<GroupJoint>(m, "GroupJoint");
+    bind_struct<ClosureRows>(m, "ClosureRows");
+    bind_struct<JointRow>(m, "JointRow");
+    bind_struct<Elimination>(m, "Elimination");
+    bind_struct<DrivenRow>(m, "DrivenRow");
+    bind_struct<SystemData>(m, "SystemData");
+    bind_struct<Extension>(m, "Extension");
+    bind_struct<DenseConstants>(m, "DenseConstants");
+}
+
+// ---- System -------------------------------------------------------------------------------------
+
+struct PySystem {
+    nb::object model, controller;  // kept alive
+    std::unique_ptr<System> system;
+
+    PySystem(nb::object model_, const SystemData& data, nb::object controller_)
+        : model(std::move(model_)), controller(std::move(controller_)) {
+        const void* found = pinocchio_model_in(model);
+        Controller act;
+        if (!controller.is_none())
+            act = [this](double t, const double* q, const double* v, double* tau) {
+                call_controller(t, q, v, tau);
+            };
+        system = std::make_unique<System>(found, data, std::move(act));
+        if (static_cast<int>(data.position_of.size()) != system->nv)
+            throw nb::value_error("SystemData.position_of has not nv numbers");
+    }
+
+    void call_controller(double t, const double* q, const double* v, double* tau) const {
+        nb::gil_scoped_acquire held;
+        const int nq = system->nq, nv = system->nv;
+        const nb::object out = controller(t, owned_array(std::vector<double>(q, q + nq)),
+                                          owned_array(std::vector<double>(v, v + nv)));
+        const Array forces = nb::cast<Array>(out);
+        std::copy_n(vector_of(forces, nv, "the controller's force"), nv, tau);
+    }
+
+    int state_size() const { return system->nq + system->nv; }
+
+    // The terms of one stage, for comparison with the reference.
+    nb::dict terms(double t, const Array& state, double threshold) {
+        System::ZoneView zone;
+        zone.threshold = threshold;
+        system->evaluate(t, vector_of(state, state_size(), "state"), zone);
+        const int nv = system->nv;
+        std::vector<double> rate(2 * nv), correction(2 * nv), multiplier(nv);
+        system->rate(rate.data());
+        system->correction(correction.data());
+        system->multiplier(multiplier.data());
+        nb::dict out;
+        out["rate"] = owned_array(std::move(rate));
+        out["correction"] = owned_array(std::move(correction));
+        out["multiplier"] = owned_array(std::move(multiplier));
+        out["sigma"] = system->sigma();
+        out["rank"] = system->rank();
+        out["constraint_residual"] = system->closure_residual();
+        return out;
+    }
+
+    double first_step(double t, const Array& state, const IntegratorState& memory,
+                      const ErrorNorm& norm, double span, int order, const Constants& constants) {
+        return initial_step(*system, norm, t, vector_of(state, state_size(), "state"),
+                            memory.rate.data(), memory.state_scale.data(), span, order, constants);
+    }
+
+    // Evaluates the stage `repeats` times, to measure one evaluation in the loop.
+    void repeat(double t, const Array& state, long repeats) {
+        std::vector<double> rate(2 * system->nv);
+        const double* x = vector_of(state, state_size(), "state");
+        nb::gil_scoped_release released;
+        for (long i = 0; i < repeats; ++i) {
+            system->evaluate(t, x, System::ZoneView{});
+            system->rate(rate.data());
+        }
+    }
+
+    // The same of its pass over the tree, which is Pinocchio's part.
+    void repeat_tree(const Array& state, long repeats) {
+        const double* x = vector_of(state, state_size(), "state");
+        nb::gil_scoped_release released;
+        for (long i = 0; i < repeats; ++i) system->tree_terms(x);
+    }
+
+    void hold(double t, const Array& force, bool keep) {
+        system->hold(t, vector_of(force, system->nv, "force"), keep);
+    }
+
+    void renew(nb::handle unit, nb::handle gap_scale, nb::handle damping, nb::handle friction) {
+        system->renew(optional_vector(unit), optional_vector(gap_scale), optional_vector(damping),
+                      optional_vector(friction));
+    }
+};
+
+void bind_system(nb::module_& m) {
+    nb::class_<PySystem>(
+        m, "System", nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller>()))
+        .def(nb::init<nb::object, const SystemData&, nb::object>(), nb::arg("model"),
+             nb::arg("data"), nb::arg("controller").none())
+        .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
+        .def("first_step", &PySystem::first_step)
+        .def("repeat", &PySystem::repeat)
+        .def("repeat_tree", &PySystem::repeat_tree)
+        .def("between",
+             [](PySystem& s, double first, double last) { s.system->between(first, last); })
+        .def("hold", &PySystem::hold)
+        .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
+             nb::arg("damping").none(), nb::arg("friction").none())
+        .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
+        .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
+        .def_prop_ro("factorisations",
+                     [](const PySystem& s) { return s.system->factorisations(); });
+}
+
+// ---- Run ----------------------------------------------------------------------------------------
+
+// The records of a run, and the shapes of their arrays.
+struct PyRecords {
+    StepRecords records;
+    std::vector<double> end_rate;
+    std::size_t nx, n, stages, corrected;  // stages: those of a step and its end
+};
+
+struct PyRun {
+    nb::object system;  // kept alive
+    System& s;
+    std::unique_ptr<Run> run;
+    const BranchGuard* guard = nullptr;
+
+    PyRun(nb::object system_, const ButcherTableau& scheme, const Constants& constants,
+          const ErrorNorm& norm, const IntegratorState& memory, const Array& state,
+          const SmoothIntervals& intervals, const RunOptions& options)
+        : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
+        check_size("ErrorNorm.atol", norm.atol.size());
+        check(memory);
+        const double t_end = intervals.ends.back();
+        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm),
+                                    make_control(scheme, constants, options, t_end), memory,
+                                    checked_state(state), intervals, options);
+    }
+
+    std::unique_ptr<Control> make_control(const ButcherTableau& scheme, const Constants& constants,
+                                          const RunOptions& options, double t_end) {
+        std::unique_ptr<Control> control;
+        if (options.step > 0.0)
+            control = std::make_unique<FixedStep>(options.t0, t_end, options.step);
+        else
+            control = std::make_unique<PIControl>(t_end, options.first_step,
+                                                  scheme.controller_order, constants);
+        if (!s.constrained()) return control;
+        if (options.placement != "automatic")
+            return std::make_unique<SlopeOfSigma>(std::move(control), scheme);
+        control = std::make_unique<SingularityPlacement>(std::move(control), scheme, t_end,
+                                                         constants, options.arrivals);
+        auto outer = std::make_unique<BranchGuard>(std::move(control), s, constants);
+        guard = outer.get();
+        return outer;
+    }
+
+    void check_size(const char* field, std::size_t found) const {
+        if (found != static_cast<std::size_t>(2 * s.nv))
+            throw nb::value_error((std::string(field) + " has not 2 nv numbers").c_str());
+    }
+
+    void check(const IntegratorState& memory) const {
+        check_size("IntegratorState.rate", memory.rate.size());
+        if (memory.history && !s.constrained())
+            throw nb::value_error("IntegratorState.history is for mechanisms with closures");
+    }
+
+    std::vector<double> checked_state(const Array& state) const {
+        vector_of(state, s.nq + s.nv, "state");
+        return to_vector(state);
+    }
+
+    int advance(long steps, double seconds) {
+        nb::gil_scoped_release released;
+        return static_cast<int>(run->advance(steps, seconds));
+    }
+
+    // One attempt from another state: (stop, decision), decision -1 if none was made.
+    nb::tuple attempt_from(double t, const Array& state, const IntegratorState& memory,
+                           const ControlState& control) {
+        check(memory);
+        run->resume(t, checked_state(state), memory, control);
+        StepDecision decision = static_cast<StepDecision>(-1);
+        const Stop stop = run->attempt(decision);
+        return nb::make_tuple(static_cast<int>(stop), static_cast<int>(decision));
+    }
+
+    // Goes on to `end`; `force` (nv,) acts from here, or, if None, the force held before.  See
+    // Run::go_on.
+    int go_on(double end, double first, double last, nb::handle force, bool forces_jump,
+              double grid, double seconds) {
+        if (!force.is_none()) {
+            const Array array = nb::cast<Array>(force);
+            if (static_cast<int>(array.size()) != s.nv || array.ndim() != 1 ||
+                !finite(array.data(), s.nv))
+                throw nb::value_error("not nv finite forces");
+            if (!s.holds(array.data())) {
+                s.hold(run->t(), array.data(), false);
+                forces_jump = true;
+            }
+        }
+        nb::gil_scoped_release released;
+        return static_cast<int>(run->go_on(end, first, last, forces_jump, grid, seconds));
+    }
+
+    void restore(const RunSnapshot& snapshot) {
+        check(snapshot.memory);
+        if (snapshot.state.size() != run->state.size())
+            throw nb::value_error("RunSnapshot.state has not nq + nv numbers");
+        run->restore(snapshot);
+    }
+
+    void remember(const IntegratorState& memory) {
+        check(memory);
+        run->memory = memory;
+    }
+
+    // Accepted, rejected and zone steps since the start.
+    nb::tuple totals() const {
+        long rejected = run->rejected_before;
+        for (const Attempt& a : run->attempts) rejected += a.decision == StepDecision::rejected;
+        return nb::make_tuple(run->steps_before + run->records.count(), rejected,
+                              run->zones_before + static_cast<long>(run->records.zones.size()));
+    }
+
+    // The records since the start `state` at `t0`; the run has none any more.
+    PyRecords take_records(double t0, const Array& state) {
+        const std::vector<double> start = checked_state(state);
+        PyRecords out;
+        out.records = std::move(run->records);
+        run->records.clear();
+        out.records.times.insert(out.records.times.begin(), t0);
+        out.records.states.insert(out.records.states.begin(), start.begin(), start.end());
+        out.end_rate = run->end_rate;
+        out.nx = start.size();
+        out.n = 2 * static_cast<std::size_t>(s.nv);
+        out.stages = static_cast<std::size_t>(run->step.scheme.stages()) + 1;
+        out.corrected = s.constrained() ? out.n : 0;
+        return out;
+    }
+
+    // The history of the zone of the step made last; None without one.
+    std::optional<MultiplierHistory> last_history() const {
+        if (!run->step.result.in_zone) return {};
+        // Of an accepted step it is in the records; that of another one is still the memory's.
+        const auto& zones = run->records.zones;
+        const bool recorded = !zones.empty() && zones.back().step == run->records.count() - 1;
+        return recorded ? zones.back().history : run->memory.history;
+    }
+
+    nb::list attempts() const {
+        nb::list out;
+        for (const Attempt& a : run->attempts)
+            out.append(nb::make_tuple(a.t, a.h, a.error_ratio, static_cast<int>(a.decision)));
+        return out;
+    }
+
+    std::vector<double> suspect_times() const {
+        return guard ? guard->suspect_times : std::vector<double>{};
+    }
+};
+
+void bind_run(nb::module_& m) {
+    nb::class_<StepResult>(m, "StepResult")
+        .def_ro("t", &StepResult::t)
+        .def_ro("h", &StepResult::h)
+        .def_ro("error_ratio", &StepResult::error_ratio)
+        .def_ro("residual", &StepResult::residual)
+        .def_ro("rank", &StepResult::rank)
+        .def_ro("quiet", &StepResult::quiet)
+        .def_ro("held", &StepResult::held)
+        .def_ro("in_zone", &StepResult::in_zone)
+        .def_ro("zone_threshold", &StepResult::zone_threshold)
+        .def_prop_ro("state", [](const StepResult& r) { return owned_array(r.state); })
+        .def_prop_ro("rates", [](const StepResult& r) {
+            return owned_array(r.rates, {r.sigmas.size(), r.end_rate.size()});
+        })
+        .def_prop_ro("end_rate", [](const StepResult& r) { return owned_array(r.end_rate); })
+        .def_prop_ro("correction", [](const StepResult& r) { return owned_array(r.correction); })
+        .def_prop_ro("state_scale", [](const StepResult& r) { return owned_array(r.state_scale); })
+        .def_prop_ro("sigmas", [](const StepResult& r) { return owned_array(r.sigmas); });
+
+    nb::class_<ZoneRecord>(m, "ZoneRecord")
+        .def_ro("step", &ZoneRecord::step)
+        .def_ro("threshold", &ZoneRecord::threshold)
+        .def_ro("history", &ZoneRecord::history);
+
+    // Arrays of (steps + 1), (steps,) or (breaks,) rows.
+    nb::class_<PyRecords> records(m, "StepRecords");
+    const auto array = [&records](const char* name, std::vector<double> StepRecords::*values,
+                                  auto columns) {
+        records.def_prop_ro(name, [values, columns](nb::handle self) {
+            const PyRecords& r = *nb::inst_ptr<PyRecords>(self);
+            return columns(r, r.records.*values, self);
+        });
+    };
+    const auto flat = [](const PyRecords&, const std::vector<double>& values, nb::handle self) {
+        return view(values, {values.size()}, self);
+    };
+    // Of `size` columns each, also without rows.
+    const auto matrix = [](auto size, bool start) {
+        return [size, start](const PyRecords& r, const std::vector<double>& values,
+                             nb::handle self) {
+            return view(values, {r.records.ranks.size() + start, r.*size}, self);
+        };
+    };
+    array("times", &StepRecords::times, flat);
+    array("states", &StepRecords::states, matrix(&PyRecords::nx, true));
+    array("rates", &StepRecords::rates,
+          [](const PyRecords& r, const std::vector<double>& values, nb::handle self) {
+              return view(values, {r.records.ranks.size(), r.stages, r.n}, self);
+          });
+    array("corrections", &StepRecords::corrections, matrix(&PyRecords::corrected, false));
+    array("sigmas", &StepRecords::sigmas, matrix(&PyRecords::stages, false));
+    array("ranks", &StepRecords::ranks, flat);
+    array("error_ratios", &StepRecords::error_ratios, flat);
+    array("placements", &StepRecords::placements, flat);
+    array("held", &StepRecords::held, flat);
+    array("breaks", &StepRecords::breaks, flat);
+    array("break_rates", &StepRecords::break_rates,
+          [](const PyRecords& r, const std::vector<double>& values, nb::handle self) {
+              return view(values, {r.records.breaks.size(), r.n}, self);
+          });
+    records.def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
+        .def_prop_ro("zones", [](const PyRecords& r) { return r.records.zones; });
+
+    nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
+        .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&,
+                      const IntegratorState&, const Array&, const SmoothIntervals&,
+                      const RunOptions&>(),
+             nb::arg("system"), nb::arg("scheme"), nb::arg("constants"), nb::arg("norm"),
+             nb::arg("memory"), nb::arg("state"), nb::arg("intervals"), nb::arg("options"))
+        .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
+        .def("attempt_from", &PyRun::attempt_from)
+        .def("go_on", &PyRun::go_on, nb::arg("end"), nb::arg("first"), nb::arg("last"),
+             nb::arg("force").none(), nb::arg("forces_jump"), nb::arg("grid"), nb::arg("seconds"))
+        .def("enter", [](PyRun& r) { return r.run->enter(); })
+        .def("snapshot", [](const PyRun& r) { return r.run->snapshot(); })
+        .def("restore", &PyRun::restore)
+        .def("memory", [](const PyRun& r) { return r.run->memory; })
+        .def("remember", &PyRun::remember)
+        .def("last", [](PyRun& r) -> StepResult& { return r.run->step.result; },
+             nb::rv_policy::reference_internal)
+        .def("last_history", &PyRun::last_history)
+        .def("attempts", &PyRun::attempts)
+        .def("suspect_times", &PyRun::suspect_times)
+        .def("totals", &PyRun::totals)
+        .def("take_records", &PyRun::take_records)
+        .def("time_before", [](const PyRun& r, long steps) {
+            return r.run->records.times[r.run->records.count() - steps];
+        })
+        .def_prop_ro("t", [](const PyRun& r) { return r.run->t(); })
+        .def_prop_ro("h", [](const PyRun& r) { return r.run->last_h(); })
+        .def_prop_ro("state", [](const PyRun& r) { return owned_array(r.run->state); })
+        .def_prop_ro("count", [](const PyRun& r) { return r.run->records.count(); })
+        .def_prop_ro("at_breakpoint", [](const PyRun& r) { return r.run->at_breakpoint(); })
+        .def_prop_ro("interval", [](const PyRun& r) { return r.run->interval(); })
+        .def_prop_ro("evaluation_failed", [](const PyRun& r) { return r.run->evaluation_failed; })
+        .def_prop_ro("placed", [](const PyRun& r) { return r.run->control->placed; })
+        .def_prop_ro("replaced", [](const PyRun& r) { return r.run->control->replaced; });
+}
+
+// ---- Dense output -------------------------------------------------------------------------------
+
+#define SRM_PY_STEPS(field)                                                           \
+    field(Array, times)             /* (k + 1,) */                                    \
+    field(Array, states)            /* (k + 1, nx) */                                 \
+    field(Array, rates)             /* (k, rates per step, n) */                      \
+    field(Array, corrections)       /* (k, n), or (k, 0) without closures */          \
+    field(Array, sigmas)            /* (k, stages + 1) */                             \
+    field(Array, end_rate)          /* (n,) */                                        \
+    field(Array, break_rates)       /* (breaks, n) */                                 \
+    field(std::vector<long>, breaks)                                                  \
+    field(std::vector<long>, zones) /* numbers of the steps with a zone */            \
+    field(double, end)              /* of the run (s) */
+
+// The accepted steps of a run, in NumPy arrays that are not copied.
+struct PySteps {
+    SRM_FIELDS(SRM_PY_STEPS)
+
+    StepArrays arrays(int nq, int nv, std::size_t abscissae) const {
+        const std::size_t k = rates.shape(0), n = 2 * static_cast<std::size_t>(nv);
+        const bool corrected = corrections.ndim() == 2 && corrections.shape(1) > 0;
+        expect("times", times, {k + 1});
+        expect("states", states, {k + 1, static_cast<std::size_t>(nq + nv)});
+        expect("rates", rates, {k, rates.ndim() == 3 ? rates.shape(1) : 0, n});
+        expect("corrections", corrections, {k, corrected ? n : 0});
+        expect("sigmas", sigmas, {k, abscissae});
+        expect("end_rate", end_rate, {n});
+        expect("break_rates", break_rates, {breaks.size(), n});
+        StepArrays out;
+        out.count = static_cast<long>(k);
+        out.end = end;
+        out.width = static_cast<int>(rates.shape(1));
+        out.corrected = corrected;
+        out.times = times.data();
+        out.states = states.data();
+        out.rates = rates.data();
+        out.corrections = corrections.data();
+        out.sigmas = sigmas.data();
+        out.end_rate = end_rate.data();
+        out.breaks = breaks;
+        out.break_rates = break_rates.data();
+        out.in_zone.assign(k, 0);
+        for (long step : zones) {
+            if (step < 0 || step >= out.count)
+                throw nb::value_error("StepArrays.zones has a step that is not there");
+            out.in_zone[static_cast<std::size_t>(step)] = 1;
+        }
+        return out;
+    }
+
+    static void expect(const char* field, const Array& array,
+                       std::initializer_list<std::size_t> shape) {
+        bool same = array.ndim() == shape.size();
+        for (std::size_t i = 0; same && i < shape.size(); ++i)
+            same = array.shape(i) == shape.begin()[i];
+        const std::string place = std::string("StepArrays.") + field;
+        if (!same) throw nb::value_error((place + " has another shape").c_str());
+    }
+};
+
+struct PyDense {
+    PySteps steps;  // kept alive
+    DenseOutput dense;
+    std::size_t nx;
+
+    PyDense(int nq, int nv, const std::vector<double>& abscissae, const Extension& extension,
+            const DenseConstants& constants, const PySteps& steps_)
+        : steps(steps_),
+          dense(nq, nv, extension, abscissae, constants, steps.arrays(nq, nv, abscissae.size())),
+          nx(static_cast<std::size_t>(nq + nv)) {}
+
+    nb::object states(PySystem& owner, const Array& t) {
+        const std::size_t k = t.size();
+        std::vector<double> out(k * nx);
+        // With the interpreter's lock held: threads may read one solution, and share its workspace.
+        dense.states(*owner.system, t.data(), static_cast<long>(k), out.data());
+        return owned_array(std::move(out), {k, nx});
+    }
+};
+
+void bind_dense_output(nb::module_& m) {
+    bind_struct<PySteps>(m, "StepArrays");
+    nb::class_<PyDense>(m, "DenseOutput")
+        .def(nb::init<int, int, const std::vector<double>&, const Extension&,
+                      const DenseConstants&, const PySteps&>(),
+             nb::arg("nq"), nb::arg("nv"), nb::arg("abscissae"), nb::arg("extension"),
+             nb::arg("constants"), nb::arg("steps"))
+        .def("states", &PyDense::states);
+}
+
+}  // namespace
+
 NB_MODULE(_core, m) {
     // Results that live until the interpreter ends are no leak.
     nb::set_leak_warnings(false);
-    m.doc() = "Compiled twin of the default paths of srm_mbs; see srm_mbs.integration.kernel.backend.";
+    m.doc() = "Compiled kernel of srm_mbs; srm_mbs.integration.kernel is its interface.";
     nb::register_exception_translator([](const std::exception_ptr& p, void*) {
         try {
             std::rethrow_exception(p);
@@ -612,69 +563,11 @@ NB_MODULE(_core, m) {
             PyErr_SetString(PyExc_ArithmeticError, "the stage cannot be evaluated");
         }
     });
-    m.def("lean_data", [](nb::object model) {
-        const void* found = model_in(model.ptr());
-        if (!found) throw nb::type_error("not a pinocchio.Model");
-        return nb::steal(lean_data(found));
-    });
+    m.def("lean_data",
+          [](nb::object model) { return nb::steal(lean_data(pinocchio_model_in(model))); });
+    bind_structs(m);
     bind_algebra(m);
-    nb::class_<PySystem>(
-        m, "System", nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller>()))
-        .def(nb::init<nb::object, const nb::dict&, nb::object>(), nb::arg("model"),
-             nb::arg("data"), nb::arg("controller").none())
-        .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
-        .def("repeat", &PySystem::repeat)
-        .def("repeat_tree", &PySystem::repeat_tree)
-        .def("between", [](PySystem& s, double first, double last) { s.system->between(first, last); })
-        .def("hold", [](PySystem& s, double t, const Array& force, bool keep) {
-            if (static_cast<int>(force.size()) != s.system->nv) throw nb::value_error("not (nv,)");
-            s.system->hold(t, force.data(), keep);
-        })
-        .def("renew", [](PySystem& s, nb::handle unit, nb::handle gap_scale, nb::handle damping,
-                         nb::handle friction) {
-            s.system->renew(vector_of(unit), vector_of(gap_scale), vector_of(damping),
-                            vector_of(friction));
-        }, nb::arg("unit"), nb::arg("gap_scale"), nb::arg("damping").none(),
-           nb::arg("friction").none())
-        .def("first_step", &PySystem::first_step)
-        .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
-        .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
-        .def_prop_ro("factorisations", [](const PySystem& s) { return s.system->factorisations(); });
-    nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
-        .def("__init__",
-             [](PyRun* self, nb::object system, const nb::dict& d) {
-                 new (self) PyRun(nb::cast<PySystem&>(system), system, d);
-             })
-        .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
-        .def("attempt_from", &PyRun::attempt_from)
-        .def("arrays", &PyRun::arrays)
-        .def("last", &PyRun::last)
-        .def("attempts", &PyRun::attempts)
-        .def("suspects", &PyRun::suspects)
-        .def("go_on", &PyRun::go_on, nb::arg("end"), nb::arg("first"), nb::arg("last"),
-             nb::arg("force").none(), nb::arg("anew"), nb::arg("grid"), nb::arg("seconds"))
-        .def("snapshot", &PyRun::snapshot)
-        .def("restore", &PyRun::restore)
-        .def("totals", &PyRun::totals)
-        .def("enter", [](PyRun& r) { return r.run->enter(); })
-        .def("remember", [](PyRun& r, const nb::dict& memory) {
-            r.run->memory = memory_of(memory, r.s.nv);
-        })
-        .def_prop_ro("at_breakpoint", [](PyRun& r) { return r.run->at_breakpoint(); })
-        .def_prop_ro("piece", [](PyRun& r) { return r.run->piece(); })
-        .def("memory", [](PyRun& r) { return dict_of(r.run->memory); })
-        .def_prop_ro("t", [](PyRun& r) { return r.run->t(); })
-        .def_prop_ro("h", [](PyRun& r) { return r.run->last_h(); })
-        .def_prop_ro("count", [](PyRun& r) { return r.run->count(); })
-        .def("time_before", [](PyRun& r, long steps) { return r.run->times[r.run->count() - steps]; })
-        .def_prop_ro("trouble", [](PyRun& r) { return r.run->trouble; })
-        .def_prop_ro("placed", [](PyRun& r) { return r.run->control->placed; })
-        .def_prop_ro("replaced", [](PyRun& r) { return r.run->control->replaced; })
-        .def_prop_ro("state", [](PyRun& r) {
-            return owned(r.run->state, {r.run->state.size()});
-        });
-    nb::class_<PyDense>(
-        m, "DenseOutput", nb::type_slots(collected<PyDense, &PyDense::steps>()))
-        .def(nb::init<int, int, const nb::dict&>())
-        .def("states", &PyDense::states);
+    bind_system(m);
+    bind_run(m);
+    bind_dense_output(m);
 }

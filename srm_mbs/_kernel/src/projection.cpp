@@ -36,7 +36,7 @@ void Projection::factor(const double* M, const double* f, const double* bias, do
     if (!(sigma >= 0.0)) throw EvaluationError{Failure::closures};
     rank = structural_rank;
     while (rank > 0 && !(pivots_[rank - 1] >= floor)) --rank;
-    weak = rank < structural_rank;
+    rank_deficient = rank < structural_rank;
     held = false;
     normal(gamma_.data(), white_multiplier.data());
 }
@@ -75,11 +75,11 @@ void Projection::hold(const double* normals, int count) {
         ++held_count_;
     }
     held = true;
-    double* gap = work_.data();
-    for (int i = 0; i < nv; ++i) gap[i] = white_force[i] - white_multiplier[i];
+    double* difference = work_.data();
+    for (int i = 0; i < nv; ++i) difference[i] = white_force[i] - white_multiplier[i];
     for (int k = 0; k < held_count_; ++k) {
         const double* h = &held_[static_cast<std::size_t>(k) * nv];
-        add(dot(h, gap, nv), h, white_multiplier.data(), nv);
+        add(dot(h, difference, nv), h, white_multiplier.data(), nv);
     }
 }
 

@@ -1,10 +1,10 @@
-// Twin of srm_mbs/dynamics/constraints/projection.py: E, P, rank and sigma from one pivoted factorisation.
+// E, P, rank and sigma from one pivoted factorisation: dynamics/constraints/projection.py.
 //
 //     M = L L^T,  W = L^{-1} G^T,  W Pi = Q R,
 //     E g = L^{-T} Q R^{-T} Pi^T g,   P v = L^{-T} Q Q^T L^T v,   yhat = E gamma.
 //
-// "White" vectors are L^T v.  Two factors L of the same M differ by an orthogonal matrix: norms,
-// pivots and sigma of W are the same for all, white vectors are not.
+// White vectors are L^T v.  Two factors L of the same M differ by an orthogonal matrix: norms,
+// pivots and sigma of W are the same for both, white vectors are not.
 #pragma once
 
 #include <cstddef>
@@ -18,22 +18,23 @@ class Projection {
 public:
     virtual ~Projection() = default;
 
-    // Column `row` of G^T (nv,), of which the entries of the row's support are to be written
-    // before factor(), which overwrites them.
+    // Column `row` of G^T (nv,), cleared.  The caller writes the entries of the row's support
+    // before it calls factor(), which overwrites them.
     virtual double* column(int row) = 0;
-    // The same column once it is filled.
+    // The same column after it was written.
     virtual double* filled(int row) = 0;
 
     // Factorises the upper triangle of M (nv, nv) and G, and solves for the multiplier with the
     // forces f (nv,) and bias (rows,).  threshold < 0: none.
     void factor(const double* M, const double* f, const double* bias, double threshold);
 
-    // Keeps the motion tangential to the last normals (nv, count) in place of the dropped rows.
+    // Keeps the motion tangential to the normals (count, nv), the weakest last, in place of the
+    // rows that are not in use.
     void hold(const double* normals, int count);
 
-    // white = Q R^-T Pi^T g, for g (rows,) in their own order.
+    // white = Q R^-T Pi^T g, for g (rows,) in the order of G.
     virtual void normal(const double* g, double* white) const = 0;
-    // white = Q Q^T L^T w, held normals included.
+    // white = Q Q^T L^T w, and the part along held normals.
     void white_project(const double* w, double* white) const;
     // g = Pi R^-1 Q^T x, the transpose of normal(): zero in the rows that are not in use.
     virtual void multiplier(const double* white, double* g) const = 0;
@@ -42,22 +43,23 @@ public:
     // x = L^T x and x = L^-T x, in place.
     virtual void whiten_velocity(double* x) const = 0;
     virtual void unwhiten(double* x) const = 0;
-    // M-orthonormal normals L^-T Q (nv, rank), that of the smallest pivot last.
+    // M-orthonormal normals L^-T Q (rank, nv), that of the smallest pivot last.
     virtual void normals(double* out) const = 0;
-    // Orthonormal white vectors (nv, nv - rank) that the rows in use do not see.
+    // Orthonormal white vectors (nv - rank, nv), orthogonal to the rows in use.
     virtual void complement(double* out) const = 0;
     // |R_kk| (structural rank,) in the order of the pivots, and the squares of W's columns (rows,).
     const std::vector<double>& pivots() const { return pivots_; }
     const std::vector<double>& row_squares() const { return row_squares_; }
     virtual bool sparse() const = 0;
-    // Numbers that Q and R hold: what a factorisation and a product with them cost grows with it.
+    // Numbers that Q and R hold, a measure of the cost of a factorisation and of products with
+    // them.
     virtual std::size_t entries() const = 0;
 
     int nv, rows, structural_rank;
     double sigma_ref;
     double sigma = 0.0;
     int rank = 0;
-    bool weak = false;
+    bool rank_deficient = false;
     bool held = false;
     long factorisations = 0;
     std::vector<double> white_force, white_multiplier;
@@ -65,8 +67,8 @@ public:
 protected:
     Projection(int nv, int rows, int structural_rank, double sigma_ref);
 
-    // white_force, gamma_, row_squares_ and |R_kk| (pivots_) down to the structural rank; those
-    // below `floor` are the last ones.
+    // Computes white_force, gamma_, row_squares_ and |R_kk| (pivots_) down to the structural rank;
+    // pivots below `floor` are the last ones.
     virtual void factorise(const double* M, const double* f, const double* bias,
                            double floor) = 0;
     virtual double smallest_pivot() const { return pivots_[structural_rank - 1]; }
@@ -84,9 +86,9 @@ private:
 // LAPACK's xGEQP3 recomputes a column norm once its square has lost this much: sqrt(2^-53).
 constexpr double norm_lost = 1.0536712127723509e-8;
 
-// What is known of W before any number is.
+// The sparsity of W.
 struct Pattern {
-    std::vector<int> parents;                 // (nv,), the next coordinate to the root, or -1
+    std::vector<int> parents;                 // (nv,), next coordinate towards the root, or -1
     std::vector<std::vector<int>> supports;   // of the rows of G, ascending
     // The rows of G along the graph of the loops; empty: the largest is the next pivot.
     std::vector<int> order;

@@ -1,10 +1,12 @@
-// Twin of srm_mbs/integration/driver.py: propose a step, make it, judge it, record it; in chunks.
+// The driver: propose a step, make it, decide on it, record it; in chunks.  See driver.py.
 #pragma once
 
 #include <memory>
+#include <string>
 #include <vector>
 
 #include "control.hpp"
+#include "struct_fields.hpp"
 
 namespace srm {
 
@@ -13,107 +15,142 @@ enum class Stop {
     finished = 1,
     too_short = 2,   // the step is below round-off
     standstill = 3,  // the last steps covered almost nothing
-    closures = 4,    // the step made last opens the loops
+    closures = 4,    // the step made last leaves the closures open
     evaluation = 5,  // a fixed step could not be evaluated
-    breakpoint = 6,  // the next piece begins, and Python has to look at it first
-    arrival = 7,     // the end lies beside a singular configuration: Python prepares for it
+    breakpoint = 6,  // the next interval begins, and Python has to look at it first
+    arrival = 7,     // the end lies next to a singular configuration: Python prepares for it
 };
 
-// The constants of srm_mbs/integration/driver.py.
-struct LoopConstants {
-    double smallest_step, standstill, large_correction, open, lost;
-    int watched_steps;
-    double look, closer, allowed;  // breakpoints.py
+#define SRM_SMOOTH_INTERVALS(field)                                                           \
+    field(std::vector<double>, ends)                                                          \
+    /* Times within which the system is evaluated in each. */                                 \
+    field(std::vector<double>, first)                                                         \
+    field(std::vector<double>, last)                                                          \
+    field(std::vector<int>, given) /* (n - 1,), whether Python enters the interval after each */
+
+// The intervals of a run between breakpoints: breakpoints.py.
+struct SmoothIntervals {
+    SRM_FIELDS(SRM_SMOOTH_INTERVALS)
+
+    void check() const;
 };
 
-// The pieces of a run between breakpoints; see srm_mbs/integration/breakpoints.py.
-struct Pieces {
-    std::vector<double> ends, first, last;  // (n,)
-    std::vector<char> given;                // (n - 1,)
+#define SRM_RUN_OPTIONS(field)                                                         \
+    field(double, t0)                                                                  \
+    field(double, step)            /* fixed step (s); 0: step-size control */          \
+    field(double, first_step)                                                          \
+    field(double, max_step)                                                            \
+    field(std::string, placement)  /* "automatic" or "off" */                          \
+    field(bool, arrivals)          /* stop before an end next to a singular configuration */ \
+    /* Regularisation eps = eps_factor h^eps_power; eps_factor 0: eps -> 0. */         \
+    field(double, eps_factor)                                                          \
+    field(double, eps_power)
+
+struct RunOptions {
+    SRM_FIELDS(SRM_RUN_OPTIONS)
 };
 
 struct Attempt {
     double t, h, error_ratio;
-    int verdict;
-};
-
-// eps = factor h^power; factor 0: eps -> 0.
-struct Regularisation {
-    double factor = 0.0, power = 0.0;
+    StepDecision decision;
 };
 
 // A zone that a step used, for its dense output.
 struct ZoneRecord {
     long step;
     double threshold;
-    History history;
+    MultiplierHistory history;
+};
+
+// The accepted steps, one after the other.
+struct StepRecords {
+    std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios;
+    std::vector<double> placements;  // 0: none, 1: placed, 2: redone
+    std::vector<double> held;        // 1: a stage kept the normals of the last node
+    std::vector<double> breaks;      // numbers of the steps before breakpoints
+    std::vector<double> break_rates; // (breaks, n), tangent rates there
+    std::vector<ZoneRecord> zones;
+
+    long count() const { return static_cast<long>(times.size()); }
+    void append(const StepResult& result, double t_new, int placement);
+    void clear();
+};
+
+#define SRM_RUN_SNAPSHOT(field)                                                    \
+    field(double, t)                                                               \
+    field(std::vector<double>, state)                                              \
+    field(IntegratorState, memory)                                                 \
+    field(ControlState, control)                                                   \
+    /* Thresholds that change over a run: see Run. */                              \
+    field(double, open_residual)                                                   \
+    field(double, search_below)
+
+// Everything that the next step depends on.
+struct RunSnapshot {
+    SRM_FIELDS(SRM_RUN_SNAPSHOT)
 };
 
 class Run {
 public:
-    Run(System& system, SplitStep step, std::unique_ptr<Control> control, LoopConstants constants,
-        Memory memory, const double* state, double t0, Pieces pieces, double max_step, Regularisation eps);
+    Run(System& system, SplitStep step, std::unique_ptr<Control> control, IntegratorState memory,
+        std::vector<double> state, SmoothIntervals intervals, const RunOptions& options);
 
     // Makes up to `steps` accepted steps, or as many as take `seconds`.
     Stop advance(long steps, double seconds);
 
-    // Goes on from elsewhere, as the reference stands there; what is recorded stays.
-    void resume(double t, const double* state, const Memory& memory, const ControlState& control);
-    // Proposes, makes and judges one step; `verdict` is only set if there was one.
-    Stop attempt(Verdict& verdict);
-    // Goes on to the next piece; whether its first stage is accurate as it was evaluated: a
-    // singular configuration may be so near that it is not.
+    // Goes on from another state; the records stay.
+    void resume(double t, const std::vector<double>& state, IntegratorState memory,
+                const ControlState& control);
+    RunSnapshot snapshot() const;
+    void restore(const RunSnapshot& snapshot);
+    // Proposes, makes and decides on one step; `decision` is only set if there was one.
+    Stop attempt(StepDecision& decision);
+    // Goes on to the next interval; whether its first stage is accurate as it was evaluated.  Next
+    // to a singular configuration it may not be.
     bool enter();
     // Goes on to `end` as a run of its own, evaluated within [first, last]; the records of the
-    // steps before are dropped.  `anew`: forces may have jumped.  With `grid` > 0, fixed steps of
-    // that length are counted from here.
-    Stop go_on(double end, double first, double last, bool anew, double grid, double seconds);
+    // steps before are dropped.  `forces_jump`: forces may have jumped.  With `grid` > 0, fixed
+    // steps of that length are counted from here.
+    Stop go_on(double end, double first, double last, bool forces_jump, double grid,
+               double seconds);
 
     double t() const { return t_; }
     double last_h() const { return h_; }
-    double t_end() const { return pieces_.ends.back(); }
-    // Whether the next piece has still to be entered.
-    bool at_breakpoint() const { return t_ >= pieces_.ends[piece_] && t_ < t_end(); }
-    double seen() const { return seen_; }
-    double near() const { return near_; }
-    // Goes on as another run would that has seen and is looking for this.
-    void adopt(double seen, double near) {
-        seen_ = seen;
-        near_ = near;
-    }
-    long piece() const { return static_cast<long>(piece_); }
-    long count() const { return static_cast<long>(times.size()); }
+    double t_end() const { return intervals_.ends.back(); }
+    // Whether the next interval has still to be entered.
+    bool at_breakpoint() const { return t_ >= intervals_.ends[interval_] && t_ < t_end(); }
+    long interval() const { return static_cast<long>(interval_); }
 
     System& system;
     SplitStep step;
     std::unique_ptr<Control> control;
-    Memory memory;
+    IntegratorState memory;
     std::vector<double> state;
 
-    // Records of the accepted steps, one after the other.
-    std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios,
-        placements, held;
-    std::vector<double> end_rate;
-    std::vector<double> breaks, break_rates;  // numbers of the steps before breakpoints; rates there
-    std::vector<ZoneRecord> zones;
+    StepRecords records;
+    std::vector<double> end_rate;  // (n,), tangent rate at the end of the last step
     std::vector<Attempt> attempts;
     // Of the steps whose records were dropped.
     long steps_before = 0, rejected_before = 0, zones_before = 0;
-    bool trouble = false;  // the last attempt could not be evaluated
+    bool evaluation_failed = false;  // in the last attempt
 
 private:
-    bool opens(const StepResult& result);
-    void record(const StepResult& result, double t_new, int placement);
-    void evaluate_within();
-    void forget();
-    bool renew();
+    bool leaves_closures_open(const StepResult& result);
+    void enter_interval();
+    void drop_records();
+    bool restart_interval();
     double direct_from() const;
 
-    LoopConstants constants_;
-    Regularisation eps_;
-    Pieces pieces_;
-    std::size_t piece_ = 0;
-    double t0_, max_step_, t_, h_ = 0.0, smallest_, seen_, near_;
+    const Constants& constants() const { return step.constants; }
+
+    SmoothIntervals intervals_;
+    std::size_t interval_ = 0;
+    double eps_factor_, eps_power_;
+    double t0_, max_step_, t_, h_ = 0.0, smallest_;
+    // Residual from which a step is looked at whether its correction closes all rows.
+    double open_residual_;
+    // sigma below which the next interval looks for a singular configuration.
+    double search_below_;
     bool redone_ = false;
 };
 

@@ -1,4 +1,4 @@
-// Linear algebra on scattered numbers, and room for more of them.
+// Linear algebra on scattered numbers.
 #pragma once
 
 #include <algorithm>

@@ -11,24 +11,26 @@ namespace srm {
 
 namespace {
 
-// Entries and changes below this part of a column's norm are left out.
+// Entries and changes below this part of a column's norm are dropped.
 constexpr double negligible = 1e-17;
-// Columns whose largest norm is remembered together.
+// Columns of a block, which remembers its largest norm.
 constexpr int block = 32;
-// Columns up to which the working matrix is not packed: their bits fill one word.
+// Number of columns up to which the working matrix is not packed: their bits fill one word.
 constexpr int few = 64;
-// Part of the columns that is still open when it is.
+// The working matrix is packed when this part of its columns is still open.
 constexpr double packing = 0.5;
-// In a packed matrix, reflections of at least so many rows, which fill this part of those from the
-// first to the last, run over all of these: contiguous numbers cost half as much as gathered ones.
+// In a packed matrix, reflections of at least long_reflection rows, which are at least dense_part
+// of the rows from their first to their last, run over all of these: contiguous numbers cost half
+// as much as gathered ones.
 constexpr int long_reflection = 8;
 constexpr double dense_part = 0.5;
 // Part of W's entries up to which the sparse algebra is chosen.  Measured on the bundled mechanisms
-// and random ones of 6 to 96 coordinates: above it both cost about the same, except that the dense
-// one is up to 1.8 times as fast where a long chain makes W full; below it the sparse one wins.
+// and random ones of 6 to 96 coordinates: below it the sparse algebra is faster; above it both cost
+// about the same, or the dense one, where a long chain fills W, is up to 1.8 times as fast.
 constexpr double densest = 0.5;
 
-// The largest of numbers >= -1, by four partial ones.
+// The largest of numbers >= -1; four partial results, so that the compiler may use vector
+// registers.
 inline double greatest(const double* values, int n) {
     double m0 = -1.0, m1 = -1.0, m2 = -1.0, m3 = -1.0;
     int i = 0;
@@ -117,7 +119,7 @@ SparseProjection::SparseProjection(int structural_rank, double sigma_ref, const 
     }
 }
 
-// Row k of L after all its descendants: M = L^T L.
+// M = L^T L: row k of L after those of all its descendants.
 void SparseProjection::cholesky(const double* M) {
     for (int k = 0; k < nv; ++k) {
         const double* column = M + static_cast<std::size_t>(k) * nv;
@@ -155,7 +157,7 @@ void SparseProjection::whiten_velocity(double* x) const {
     }
 }
 
-// W and gamma.
+// Computes W, gamma and the norms of the columns.
 void SparseProjection::whiten_columns(const double* bias) {
     for (int k = nv - 1; k >= 0; --k) {
         const int first = ancestor_start_[k], n = ancestor_start_[k + 1] - first;
@@ -207,7 +209,7 @@ void SparseProjection::start_pivots() {
     reflection_start_[0] = right_start_[0] = steps_ = 0;
 }
 
-// Working rows and columns, all of them open.
+// Opens all working rows and columns.
 void SparseProjection::open_all(int row_count, int column_count) {
     row_count_ = row_count;
     column_count_ = column_count;
@@ -218,8 +220,8 @@ void SparseProjection::open_all(int row_count, int column_count) {
     std::fill(stale_.begin(), stale_.end(), 1);
 }
 
-// Leaves closed rows and columns out of the working matrix, and entries that have become negligible:
-// the open ones, far apart by now, are next to each other again, and so are their bits.
+// Removes closed rows and columns, and entries that have become negligible, from the working
+// matrix, so that the open ones and their bits are contiguous.
 void SparseProjection::pack(int open_columns) {
     int row_count = 0;
     for (int i = 0; i < row_count_; ++i) {
@@ -243,7 +245,8 @@ void SparseProjection::pack(int open_columns) {
         for (int w = rows_of_.first[j]; w <= rows_of_.last[j]; ++w) {
             const Word kept = open ? own[w] & open_rows_[w] : 0;
             each_bit(own[w] & ~kept, w << 6, [&](int i) { from[i] = 0.0; });
-            // Numbers only move down, in ascending order: what is written has been read.
+            // Numbers move towards the front, in ascending order: each place is read before it is
+            // written.
             each_bit(kept, w << 6, [&](int i) {
                 const double value = from[i];
                 from[i] = 0.0;
@@ -273,8 +276,8 @@ void SparseProjection::pack(int open_columns) {
     open_all(row_count, to);
 }
 
-// Moves the column of the largest norm, the first by position among equals, to position k; its
-// place in the working matrix.
+// Moves the column of the largest norm, the first by position among equals, to position k.  Returns
+// its place in the working matrix.
 int SparseProjection::next_pivot(int k) {
     const int blocks = (column_count_ + block - 1) / block;
     double largest = -1.0;
@@ -294,7 +297,8 @@ int SparseProjection::next_pivot(int k) {
         if (best < 0) {
             const int first = b * block, end = std::min(column_count_, first + block);
             for (int j = first; j < end; ++j)
-                if (squares_[j] == largest && (best < 0 || position_[j] < position_[best])) best = j;
+                if (squares_[j] == largest && (best < 0 || position_[j] < position_[best]))
+                    best = j;
         }
         if (pivot < 0 || position_[best] < position_[pivot]) pivot = best;
     }
@@ -303,7 +307,7 @@ int SparseProjection::next_pivot(int k) {
     position_[other] = place;
     order_[k] = column_at_[pivot];
     position_[pivot] = k;
-    // Equal norms are told apart by positions.
+    // Positions decide between equal norms.
     best_[other / block] = -1;
     stale_[pivot / block] = 1;
     squares_[pivot] = -1.0;
@@ -311,7 +315,8 @@ int SparseProjection::next_pivot(int k) {
     return pivot;
 }
 
-// Reflection k, which takes what is left of a column to its largest row; false if nothing is left.
+// Makes reflection k, which maps what is left of a column onto the row of its largest entry; false
+// if nothing is left.
 bool SparseProjection::reflection(int k, int column) {
     const double* a = working(column);
     const double least = least_[column];
@@ -359,7 +364,7 @@ bool SparseProjection::reflection(int k, int column) {
     return true;
 }
 
-// Reflects the other columns, and takes the pivot row out of their norms.
+// Applies reflection k to the other columns, and removes the pivot row from their norms.
 void SparseProjection::apply(int k) {
     const int start = reflection_start_[k], n = reflection_start_[k + 1] - start;
     const int* at = at_.data();
@@ -398,7 +403,7 @@ void SparseProjection::apply(int k) {
     } else {
         std::fill_n(along, count, 0.0);
     }
-    // A change by along v is one of length |along| |v|.
+    // A change of along[c] v has the length |along[c]| |v|.
     const double length = tau != 0.0 ? std::sqrt(2.0 / tau) : 0.0;
     double* const right = room(right_, right_start_[k], count);
     int* const right_column = room(right_column_, right_start_[k], count);
@@ -420,7 +425,7 @@ void SparseProjection::apply(int k) {
         if (!(std::abs(value) > least[j])) continue;
         right_column[kept] = column_at_[j];
         right[kept++] = value;
-        // Norms only fall: those of the others in a block stay below its largest.
+        // Norms only decrease: a block is stale only if its largest one has.
         if (squares_[j] == best_square_[j / block]) stale_[j / block] = 1;
         squares_[j] -= value * value;
         if (squares_[j] <= norm_lost * first_squares_[j]) {
@@ -448,7 +453,7 @@ void SparseProjection::pivoted_qr(double) {
     for (int k = 0; k < structural_rank; ++k) {
         if (column_count_ > few && rows - k <= packing * column_count_) pack(rows - k);
         const int column = next_pivot(k);
-        // All columns left are zero: no pivot from here on is used.
+        // All columns left are zero, and so are the pivots.
         if (!reflection(k, column)) break;
         apply(k);
         steps_ = k + 1;
@@ -458,7 +463,7 @@ void SparseProjection::pivoted_qr(double) {
     clear();
 }
 
-// The working columns are zero again, but for the supports that the next evaluation writes.
+// Clears the working columns for the next evaluation.
 void SparseProjection::clear() {
     for (int j = 0; j < column_count_; ++j) {
         double* a = working(j);
@@ -538,8 +543,8 @@ void SparseProjection::remove_normal(double* white) const {
 }
 
 void SparseProjection::normals(double* out) const {
-    // Column k of Q is the product of the first k + 1 reflections with a unit vector: most of them
-    // lie outside the rows that it has come to.
+    // Column k of Q is the product of the first k + 1 reflections with a unit vector.  Most of them
+    // act on rows in which it is still zero.
     for (int k = 0; k < rank; ++k) {
         double* x = out + static_cast<std::size_t>(k) * nv;
         std::fill(x, x + nv, 0.0);

@@ -1,18 +1,18 @@
-// The projection of a mechanism with many loops: only entries that are not zero are touched.
+// The projection of a mechanism with many loops, in sparse arrays.
 //
 // M = L^T L with L lower triangular, eliminated from the leaves (Featherstone, Rigid Body Dynamics
 // Algorithms, 6.5): L has no entries but those of a coordinate and its ancestors.  The pivots of
-// W = L^-T G^T = Q R Pi^T follow the dense rule, but a reflection acts on the rows of its own
-// column alone, keeps its pivot in one of these rows instead of row k, and touches only the
+// W = L^-T G^T = Q R Pi^T follow the rule of the dense algebra.  A reflection acts on the rows of
+// its own column only, keeps its pivot in one of these rows instead of row k, and changes only the
 // columns that share rows with it.
 //
-// Along a chain of loops the entries of Q and R decay geometrically without becoming zero: what
-// falls below `negligible` of a column's norm, a tenth of the rounding error of the dense
-// algebra, is left out.  That bounds the rows of a reflection and the columns that it meets.  What
-// is left when half of the columns are done is packed, so that it lies together.
+// Along a chain of loops the entries of Q and R decay geometrically without becoming zero.  Entries
+// below `negligible` of a column's norm, a tenth of the rounding error of the dense algebra, are
+// dropped: this bounds the rows of a reflection and the columns that it changes.  When half of the
+// columns are done, the others are packed into a contiguous matrix.
 //
-// Equal norms are told apart by position as in the dense algebra, but rounding differs: of two
-// columns whose norms agree to rounding, either may be the pivot.
+// Of equal norms the first by position is the pivot, as in the dense algebra.  Rounding differs: of
+// two columns whose norms agree to rounding, either may be the pivot.
 #pragma once
 
 #include <cstddef>
@@ -26,7 +26,7 @@ namespace srm {
 // Rows of the columns of W: the supports with all ancestors.
 std::vector<std::vector<int>> with_ancestors(const Pattern& pattern);
 
-// Whether the sparse algebra is the faster one.
+// Whether the sparse algebra is faster than the dense one.
 bool sparse_pays(const Pattern& pattern);
 
 class SparseProjection : public Projection {
@@ -49,26 +49,27 @@ public:
     }
 
 protected:
-    // pivots_ and all of Q and R; the columns of W are zero again.
+    // Computes pivots_, Q and R, and clears the columns of W.
     virtual void pivoted_qr(double floor);
-    // Zero, but for the entries of the row's support, before W; then before clearing.
+    // G^T, then W, column by column; between evaluations zero outside the supports of the rows.
     std::vector<double> A_;
     // Rows of W's columns, ascending, with all ancestors.
     std::vector<int> support_start_, support_;
-    // Squares of W's columns, at first and of what is left; below the last, entries are left out.
+    // Squared norms of what is left of W's columns, and of the whole columns; entries below least_
+    // are dropped.
     std::vector<double> squares_, first_squares_, least_;
 
-    // Pivot k: its column of W in order_, its row in pivot_row_, its part of R's row k beside the
-    // diagonal at right_start_[k], and its reflections, those from reflections_[k] on.  Reflection l:
-    // rows and values (1 in the pivot row) at reflection_start_[l].
+    // Pivot k: its column of W in order_[k], its row in pivot_row_[k], row k of R without the
+    // diagonal at right_start_[k], its reflections from reflections_[k] to reflections_[k + 1].
+    // Reflection l: rows and values (1 in the pivot row) at reflection_start_[l].
     int steps_ = 0;
     std::vector<int> order_, pivot_row_, reflections_, reflection_start_, right_start_;
     std::vector<double> tau_, right_diagonal_;
     std::vector<int> reflection_row_, right_column_;
     std::vector<double> reflection_, right_;
 
-    // Working rows and columns: their rows and columns of W, bit sets of the rows of each column and
-    // of the columns of each row, and those that are not done.
+    // Working rows and columns: the rows and columns of W that they are, bit sets of the rows of
+    // each column and of the columns of each row, and the open ones, which are not done.
     std::vector<int> row_at_, column_at_;
     BitSets rows_of_, columns_of_;
     std::vector<Word> open_rows_, open_columns_, changed_;
@@ -95,27 +96,26 @@ private:
     void times_q(double* x) const;
     void times_q_transposed(double* x) const;
 
-    // The tree: ancestors of coordinate k, the nearest first, at ancestor_start_[k]; L_ in the same
-    // places, its diagonal inverted apart.
+    // The tree: ancestors of coordinate k, the nearest first, at ancestor_start_[k]; L_ at the same
+    // places; its diagonal, and the inverse of that.
     std::vector<int> ancestor_start_, ancestors_;
     std::vector<double> L_, diagonal_, inverse_;
-    // Working columns (row_count_, column_count_) in A_, zero outside their rows.  All of W at
-    // first; then pack() keeps those that are open, in their order; place_of_ is the inverse of
-    // column_at_.
+    // The working columns (row_count_, column_count_) are in A_, zero outside their rows: first all
+    // of W, after pack() the open ones in the same order.  place_of_ is the inverse of column_at_.
     int row_count_ = 0, column_count_ = 0;
     std::vector<int> place_of_, new_row_;
     BitSets packed_rows_of_;
     std::vector<Word> met_, own_rows_;
-    // The reflection at hand: its working rows and its pivot's, and its values from the first of
-    // these rows to the last.
+    // The current reflection: its working rows, that of its pivot, and its values in all rows from
+    // the first of these to the last.
     std::vector<int> at_;
     int pivot_ = 0;
     std::vector<double> window_;
     int own_first_ = 0, own_last_ = -1;
     std::vector<int> met_columns_;
 
-    // Pivots: columns by position as in the dense algebra, which swaps them (order_), and positions
-    // of the working columns; blocks of these remember their largest norm.
+    // Positions of the working columns in order_, which swaps columns as the dense algebra does.
+    // Blocks of working columns remember their largest norm; stale ones have to find it again.
     std::vector<int> position_, best_;
     std::vector<char> stale_;
     std::vector<double> best_square_;

@@ -8,6 +8,21 @@
 
 namespace srm {
 
+void ButcherTableau::check() const {
+    const std::size_t s = b.size();
+    expect_size("A", A.size(), s * s);
+    expect_size("c", c.size(), s);
+    if (!error.empty()) expect_size("error", error.size(), s + 1);
+    expect_size("gap_half_widths", gap_half_widths.size(), gap_centres.size());
+}
+
+void ErrorNorm::check() const { expect_size("one", one.size(), atol.size()); }
+
+void IntegratorState::check() const {
+    expect_size("state_scale", state_scale.size(), rate.size());
+    if (history) expect_size("history.values", 2 * history->nv, rate.size());
+}
+
 double ErrorNorm::ratio(const double* error, const double* weights, int n) {
     double sum = 0.0;
     for (int i = 0; i < n; ++i) {
@@ -17,21 +32,23 @@ double ErrorNorm::ratio(const double* error, const double* weights, int n) {
     return std::sqrt(sum / n);
 }
 
+// d0, d1 and d2 are the sizes of the state, of its rate and of the change of that, over the
+// tolerance.
 double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
-                    const double* rate, const double* magnitude, double span, int order,
-                    const FirstStepConstants& constants) {
+                    const double* rate, const double* state_scale, double span, int order,
+                    const Constants& constants) {
     const int n = 2 * system.nv;
     std::vector<double> weights(n), error(n), there(n), probed(n), x(system.nq + system.nv);
     for (int i = 0; i < n; ++i) {
-        weights[i] = norm.weight(i, magnitude[i]);
-        error[i] = std::max(magnitude[i], norm.one[i]);
+        weights[i] = norm.weight(i, state_scale[i]);
+        error[i] = std::max(state_scale[i], norm.one[i]);
     }
     const double d0 = ErrorNorm::ratio(error.data(), weights.data(), n);
-    if (!finite(rate, n) || !(largest(rate, n) < constants.overflow))
+    if (!finite(rate, n) || !(largest(rate, n) < constants.rate_overflow))
         throw EvaluationError{Failure::not_finite};
     const double d1 = ErrorNorm::ratio(rate, weights.data(), n);
-    if (!(d1 > 0.0)) return constants.probe * span;
-    const double h0 = std::min(constants.probe * d0 / d1, span);
+    if (!(d1 > 0.0)) return constants.first_step_probe * span;
+    const double h0 = std::min(constants.first_step_probe * d0 / d1, span);
     for (int i = 0; i < n; ++i) error[i] = h0 * rate[i];
     system.retract(state, error.data(), x.data());
     system.evaluate(t + h0, x.data(), System::ZoneView{});
@@ -39,13 +56,15 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     system.chart_rate(error.data(), there.data(), probed.data());
     for (int i = 0; i < n; ++i) probed[i] -= rate[i];
     const double d2 = ErrorNorm::ratio(probed.data(), weights.data(), n) / h0;
-    const double longest = constants.longest * h0;
+    const double longest = constants.longest_first_step * h0;
     if (!(d2 > 0.0)) return std::min(longest, span);
     const double tau = d1 / d2;
-    return std::min({longest, tau * std::pow(constants.probe / (tau * d1), 1.0 / order), span});
+    const double change = constants.first_step_probe / (tau * d1);
+    return std::min({longest, tau * std::pow(change, 1.0 / order), span});
 }
 
-SplitStep::SplitStep(System& system, Scheme scheme_, StepConstants constants_, ErrorNorm norm_)
+SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& constants_,
+                     ErrorNorm norm_)
     : scheme(std::move(scheme_)),
       norm(std::move(norm_)),
       constants(constants_),
@@ -62,19 +81,19 @@ SplitStep::SplitStep(System& system, Scheme scheme_, StepConstants constants_, E
       uncertainty_(nv_),
       scratch_(n_),
       noise_(n_) {
-    const int s = scheme.stages;
+    const int s = scheme.stages();
     result.state.resize(nx_);
     result.rates.resize((s + 1) * n_);
     result.end_rate.resize(n_);
     result.correction.resize(system.constrained() ? n_ : 0);
-    result.magnitude.resize(n_);
+    result.state_scale.resize(n_);
     result.sigmas.resize(s + 1);
     result.multiplier.resize(nv_);
-    weak_stages_.reserve(s + 1);
+    deficient_stages_.reserve(s + 1);
 }
 
-// Change of h times the tangent rate by the normal `error` (n,) of a stage.
-void SplitStep::turning(const double* error, double sigma, double change, double* out) const {
+// Error of h times the tangent rate at a stage that lies off the closures by `error` (n,).
+void SplitStep::rate_error(const double* error, double sigma, double change, double* out) const {
     const double reach = change / sigma;
     for (int i = 0; i < nv_; ++i) {
         out[i] = 0.0;
@@ -83,97 +102,102 @@ void SplitStep::turning(const double* error, double sigma, double change, double
     }
 }
 
-// What rounding at a stage with `sigma` does to h times the tangent rate.
-void SplitStep::rounding(double sigma, double change, bool projected,
-                         double* out) const {
-    const double part = projected ? constants.rounding / sigma : constants.rounding;
+// The same of a stage that lies off them by rounding.  Projected positions are known to
+// position_rounding / sigma.
+void SplitStep::rounding_error(double sigma, double change, bool projected, double* out) const {
+    const double rounding = constants.position_rounding;
+    const double part = projected ? rounding / sigma : rounding;
     double* error = scratch_.data();
     for (int i = 0; i < nv_; ++i) {
         error[i] = part * norm.one[i];
         error[nv_ + i] = change / (h_ * sigma) * error[i];
     }
-    turning(error, sigma, change, out);
+    rate_error(error, sigma, change, out);
 }
 
 // sigma from which the direct solve errs by less than `allowed` tolerances; at most zone_largest.
-double SplitStep::known_from(const Memory& memory, double sigma_change, double allowed) const {
+double SplitStep::direct_from(const IntegratorState& memory, double sigma_change,
+                              double allowed) const {
     if (norm.negligible == 0.0) return constants.zone_largest;
-    rounding(1.0, sigma_change, false, noise_.data());
+    rounding_error(1.0, sigma_change, false, noise_.data());
     for (int i = nv_; i < n_; ++i)
-        noise_[i] += h_ * constants.rounding * std::abs(memory.rate[i]);
+        noise_[i] += h_ * constants.position_rounding * std::abs(memory.rate[i]);
     return std::min(constants.zone_largest,
                     std::sqrt(ErrorNorm::ratio(noise_.data(), weights_.data(), n_) / allowed));
 }
 
-// How far the multiplier predicted for `end` may be off, over the tolerance.
-double SplitStep::uncertainty(const History& history, double end) {
-    if (history.size < constants.fewest) return 0.0;
+// Error of the multiplier predicted for `end`, over the tolerance; 0 with too few nodes.
+double SplitStep::prediction_error(const MultiplierHistory& history, double end) {
+    if (history.size() < constants.min_history) return 0.0;
     history.uncertainty(end, uncertainty_.data());
     std::fill(noise_.begin(), noise_.begin() + nv_, 0.0);
     for (int i = 0; i < nv_; ++i) noise_[nv_ + i] = h_ * uncertainty_[i];
     return ErrorNorm::ratio(noise_.data(), weights_.data(), n_);
 }
 
-bool SplitStep::lingers(const Memory& memory, double threshold) const {
-    if (memory.history.normal_count == 0) return false;
-    const double speed = system_.size(memory.rate.data());
+// Whether the motion is so slow that it may be held tangential to the last normals: at `threshold`
+// that errs by |a| threshold + v^2.
+bool SplitStep::holding_suffices(const IntegratorState& memory, double threshold) const {
+    if (memory.history->normals.empty()) return false;
+    const double speed = system_.position_norm(memory.rate.data());
     double* error = scratch_.data();
     for (int i = 0; i < nv_; ++i) {
         error[i] = 0.0;
         error[nv_ + i] = h_ * (threshold * std::abs(memory.rate[nv_ + i]) +
                                speed * std::abs(memory.rate[i]));
     }
-    return ErrorNorm::ratio(error, weights_.data(), n_) < constants.held;
+    return ErrorNorm::ratio(error, weights_.data(), n_) < constants.held_tolerance;
 }
 
-void SplitStep::prepare_branch(const Memory& memory, double end, double sigma_change) {
-    // All stages of a step or none: a mixture of both loses the order.
-    const double reach = sigma_change > 0.0 ? constants.near * sigma_change : constants.watched;
+void SplitStep::prepare_branch(const IntegratorState& memory, double end, double sigma_change) {
+    // All stages of a step are projected or none: a mixture of both loses the order.
+    const double reach =
+        sigma_change > 0.0 ? constants.near_steps * sigma_change : constants.monitored_below;
     branch_.near = memory.sigma < reach;
     branch_.projected = false;
-    branch_.excused = 0.0;
-    const History& history = memory.history;
+    branch_.inaccurate_below = 0.0;
+    const MultiplierHistory& history = *memory.history;
     double threshold = constants.zone_largest;
-    bool lingering = false;
-    if (memory.sigma < constants.watched + constants.near * sigma_change) {
-        threshold = known_from(memory, sigma_change, 1.0);
-        lingering = threshold < constants.zone_largest && lingers(memory, threshold);
-        // The zone is as wide as the tolerance asks for; how good its predictions and projections
-        // have to be follows from what can be had.
+    bool holds = false;
+    if (memory.sigma < constants.monitored_below + constants.near_steps * sigma_change) {
+        threshold = direct_from(memory, sigma_change, 1.0);
+        holds = threshold < constants.zone_largest && holding_suffices(memory, threshold);
+        // The tolerance alone sets the width of the zone.  The accuracy that its predictions and
+        // projections need is limited by rounding: the weights grow only after that.
         add_floor(memory, sigma_change);
-        const double uncertain = uncertainty(history, end);
-        if (uncertain > 1.0 && !lingering) {
+        const double error = prediction_error(history, end);
+        if (error > 1.0 && !holds) {
             // A prediction that errs by more than the tolerance is no better than a direct solve
-            // that does.
-            branch_.excused = threshold;
-            threshold = known_from(memory, sigma_change, uncertain);
+            // that errs as much.
+            branch_.inaccurate_below = threshold;
+            threshold = direct_from(memory, sigma_change, error);
         }
     }
     branch_.zone = System::ZoneView{};
     if (!history.begun()) return;
     const double known = end <= history.known_until ? history.known_below : 0.0;
     double limit = threshold;
-    if (history.size < constants.fewest) limit = std::min(limit, constants.hit);
+    if (history.size() < constants.min_history) limit = std::min(limit, constants.direct_hit);
     branch_.zone.threshold = std::max(limit, known);
     branch_.zone.history = &history;
-    branch_.zone.normals = &history.normals;
-    branch_.zone.normal_count = history.normal_count;
-    branch_.zone.predicts = !lingering;
+    branch_.zone.predicts = !holds;
 }
 
-// Evaluates the stage x_ at its projection on its branch; whether x_ was moved.
-bool SplitStep::onto_branch(double t, double c, const Memory& memory, double sigma_change) {
+// Evaluates the stage x_ at its projection on its branch, by Newton steps that are taken as long as
+// they change more than rounding and a negligible part of the tolerance; whether x_ was moved.
+bool SplitStep::project_stage(double t, double c, const IntegratorState& memory,
+                              double sigma_change) {
     bool moved = false;
     const double change = std::max(sigma_change, std::abs(system_.sigma() - memory.sigma) / c);
-    for (int i = 0; i < constants.projections; ++i) {
+    for (int i = 0; i < constants.max_projections; ++i) {
         const double sigma = system_.sigma();
-        if (system_.weak() || !(sigma > 0.0) || !branch_.near) break;
+        if (system_.rank_deficient() || !(sigma > 0.0)) break;
         system_.correction(error_.data());
-        if (system_.size(error_.data()) > constants.ambiguous * sigma) break;
-        turning(error_.data(), sigma, change, noise_.data());
+        if (system_.position_norm(error_.data()) > constants.ambiguous_offset * sigma) break;
+        rate_error(error_.data(), sigma, change, noise_.data());
         const double effect = ErrorNorm::ratio(noise_.data(), weights_.data(), n_);
         if (effect <= norm.negligible) break;
-        rounding(sigma, change, true, noise_.data());
+        rounding_error(sigma, change, true, noise_.data());
         if (effect <= ErrorNorm::ratio(noise_.data(), weights_.data(), n_)) break;
         if (!moved) std::fill(moved_.begin(), moved_.end(), 0.0);
         add(1.0, error_.data(), moved_.data(), n_);
@@ -188,154 +212,175 @@ bool SplitStep::onto_branch(double t, double c, const Memory& memory, double sig
 
 // Adds to the weights the error that rounding leaves in a step of this length that crosses a
 // singular configuration.
-void SplitStep::add_floor(const Memory& memory, double sigma_change) {
-    const double near = std::min(constants.watched, constants.lead * sigma_change);
+void SplitStep::add_floor(const IntegratorState& memory, double sigma_change) {
+    const double near = std::min(constants.monitored_below, constants.lead_steps * sigma_change);
     if (!(memory.sigma < near && norm.negligible > 0.0)) return;
-    rounding(constants.crosses * sigma_change, sigma_change, true, noise_.data());
+    rounding_error(constants.crossing_sigma * sigma_change, sigma_change, true, noise_.data());
     for (int i = 0; i < n_; ++i)
-        weights_[i] += std::min(constants.usual * noise_[i], constants.most_floor * norm.one[i]);
+        weights_[i] += std::min(constants.usual_rounding * noise_[i],
+                                constants.largest_rounding_floor * norm.one[i]);
 }
 
-// Adds to the weights what rounding does to the error estimate.
-void SplitStep::widen(double sigma_change) {
-    // Below the threshold of the zone nothing is solved for directly.
+// Adds to the weights the effect of rounding on the error estimate.
+void SplitStep::add_rounding(double sigma_change) {
+    // Below the threshold of the zone no multiplier is solved for directly.
     const double least = branch_.zone.history ? branch_.zone.threshold : 0.0;
     double lowest = std::numeric_limits<double>::infinity();
-    for (int j = 1; j <= scheme.stages; ++j)
+    for (int j = 1; j <= scheme.stages(); ++j)
         if (result.sigmas[j] >= least) lowest = std::min(lowest, result.sigmas[j]);
-    lowest = std::max(lowest, branch_.excused);
-    if (scheme.error.empty() || !(0.0 < lowest && lowest < constants.near * sigma_change)) return;
-    rounding(lowest, sigma_change, branch_.projected, noise_.data());
-    const double weight = largest(scheme.error.data(), scheme.stages + 1);
+    lowest = std::max(lowest, branch_.inaccurate_below);
+    if (scheme.error.empty() ||
+        !(0.0 < lowest && lowest < constants.near_steps * sigma_change))
+        return;
+    rounding_error(lowest, sigma_change, branch_.projected, noise_.data());
+    const double weight = largest(scheme.error.data(), scheme.stages() + 1);
     add(weight, noise_.data(), weights_.data(), n_);
 }
 
-const StepResult& SplitStep::make(double t, double h, const double* state, const Memory& memory,
-                                  double theta) {
-    const int s = scheme.stages, n = n_;
+const StepResult& SplitStep::make(double t, double h, const double* state,
+                                  const IntegratorState& memory, double theta) {
     StepResult& r = result;
-    const bool constrained = memory.has_history;
+    const bool constrained = memory.history.has_value();
     const double sigma_change = h * memory.sigma_slope;
     h_ = h;
-    bool watched = false;
-    System::ZoneView none;
-    if (constrained && memory.sigma < constants.watched + constants.far * sigma_change) {
-        watched = true;
-        for (int i = 0; i < n; ++i) weights_[i] = norm.weight(i, memory.magnitude[i]);
+    monitored_ = constrained && memory.sigma < constants.monitored_below +
+                                                   constants.far_steps * sigma_change;
+    if (monitored_) {
+        for (int i = 0; i < n_; ++i) weights_[i] = norm.weight(i, memory.state_scale[i]);
         prepare_branch(memory, t + h, sigma_change);
     }
+    evaluate_stages(t, state, memory, sigma_change);
+    system_.state_scale(x_.data(), r.state_scale.data());
+    const double sigma = system_.sigma();
+    finish(theta, constrained);
+    const double change = std::abs(sigma - memory.sigma);
+    r.quiet = !monitored_ && sigma > constants.monitored_below + constants.far_steps * change;
+    r.residual = 0.0;
+    const bool due = memory.steps < constants.residual_interval ||
+                     memory.steps % constants.residual_interval == 0;
+    if (due && constrained && theta == 1.0) r.residual = system_.closure_residual();
+    r.t = t;
+    r.h = h;
+    estimate_error(memory, sigma_change);
+    r.rank = std::min(r.rank, system_.rank());
+    r.in_zone = !deficient_stages_.empty() && monitored_ && branch_.zone.history != nullptr;
+    r.zone_threshold = monitored_ ? branch_.zone.threshold : 0.0;
+    return r;
+}
+
+// The stages and the uncorrected end: states in x_, tangent rates in rate_, chart rates in the
+// result.
+void SplitStep::evaluate_stages(double t, const double* state, const IntegratorState& memory,
+                                double sigma_change) {
+    const int s = scheme.stages(), n = n_;
+    StepResult& r = result;
+    const System::ZoneView none;
     std::copy(memory.rate.begin(), memory.rate.end(), r.rates.begin());
     r.sigmas[0] = memory.sigma;
-    weak_stages_.clear();
+    deficient_stages_.clear();
     r.rank = std::numeric_limits<int>::max();
     r.held = false;
-    bool moved = false;
+    moved_end_ = false;
     for (int j = 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
         std::fill(delta_.begin(), delta_.end(), 0.0);
         for (int k = 0; k < j; ++k)
-            if (a[k] != 0.0) add(h * a[k], &r.rates[k * n], delta_.data(), n);
+            if (a[k] != 0.0) add(h_ * a[k], &r.rates[k * n], delta_.data(), n);
         system_.retract(state, delta_.data(), x_.data());
         const double fraction = end ? 1.0 : scheme.c[j];
-        const double time = t + fraction * h;
-        system_.evaluate(time, x_.data(), watched ? branch_.zone : none);
+        const double time = t + fraction * h_;
+        system_.evaluate(time, x_.data(), monitored_ ? branch_.zone : none);
         r.sigmas[j] = system_.sigma();
-        moved = false;
-        if (watched && branch_.near && fraction > 0.0) {
-            std::copy(delta_.begin(), delta_.end(), rate_.begin());  // the chart is at the stage
-            moved = onto_branch(time, fraction, memory, sigma_change);
+        if (monitored_ && branch_.near && fraction > 0.0) {
+            // The chart of the rates is that of the stage before it is projected.
+            std::copy(delta_.begin(), delta_.end(), rate_.begin());
+            const bool moved = project_stage(time, fraction, memory, sigma_change);
+            if (end) moved_end_ = moved;
             std::copy(rate_.begin(), rate_.end(), delta_.begin());
         }
         system_.rate(rate_.data());
         system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
-        if (system_.weak()) {
+        if (system_.rank_deficient()) {
             r.rank = std::min(r.rank, system_.rank());
-            weak_stages_.push_back(j);
+            deficient_stages_.push_back(j);
             r.held = r.held || system_.held();
         }
     }
-    system_.magnitudes(x_.data(), r.magnitude.data());
-    const double sigma = system_.sigma();
-    const bool weak = system_.weak();
-    r.has_normals = r.has_multiplier = false;
-    r.normal_count = 0;
-    if (constrained) {
-        system_.correction(r.correction.data());
-        for (int i = 0; i < n; ++i) {
-            r.correction[i] *= theta;
-            delta_[i] = -r.correction[i];
-        }
-        system_.retract(x_.data(), delta_.data(), r.state.data());
-        for (int i = 0; i < nv_; ++i) {
-            r.end_rate[i] = rate_[i] - r.correction[nv_ + i];
-            r.end_rate[nv_ + i] = rate_[nv_ + i];
-        }
-        if (!weak && (watched || sigma < constants.watched)) {
-            system_.multiplier(r.multiplier.data());
-            r.has_multiplier = true;
-            if (sigma < constants.watched) {
-                system_.normals(r.normals, r.normal_count);
-                r.has_normals = r.normal_count > 0;
-            }
-        }
-        if (moved) add(1.0, moved_.data(), r.correction.data(), n);
-    } else {
-        std::copy(x_.begin(), x_.end(), r.state.begin());
-        std::copy(rate_.begin(), rate_.end(), r.end_rate.begin());
-    }
-    const double change = std::abs(sigma - memory.sigma);
-    r.quiet = !watched && sigma > constants.watched + constants.far * change;
-    r.gap = 0.0;
-    const bool due = memory.steps < constants.gap_every || memory.steps % constants.gap_every == 0;
-    if (due && constrained && theta == 1.0) r.gap = system_.gap();
-    r.error_ratio = 0.0;
-    if (!scheme.error.empty()) {
-        std::fill(error_.begin(), error_.end(), 0.0);
-        for (int k = 0; k <= s; ++k)
-            if (scheme.error[k] != 0.0)
-                add(scheme.error[k], &r.rates[k * n], error_.data(), n);
-        for (int i = 0; i < n; ++i) {
-            error_[i] = h * std::abs(error_[i]);
-            weights_[i] = norm.weight(i, std::max(memory.magnitude[i], r.magnitude[i]));
-        }
-        if (watched) {
-            if (sigma_change > constants.count_uncertainty_above) {
-                for (int j : weak_stages_) {
-                    if (j >= s) continue;
-                    memory.history.uncertainty(t + scheme.c[j] * h, uncertainty_.data());
-                    for (int i = 0; i < nv_; ++i)
-                        error_[nv_ + i] += h * std::abs(scheme.b[j]) * uncertainty_[i];
-                }
-            }
-            add_floor(memory, sigma_change);
-            widen(sigma_change);
-        }
-        r.error_ratio = ErrorNorm::ratio(error_.data(), weights_.data(), n);
-    }
-    r.t = t;
-    r.h = h;
-    r.rank = std::min(r.rank, system_.rank());
-    r.in_zone = !weak_stages_.empty() && watched && branch_.zone.history != nullptr;
-    r.zone_threshold = watched ? branch_.zone.threshold : 0.0;
-    return r;
 }
 
-void SplitStep::accept(Memory& memory) {
+// The end from the last stage: its correction, and what the history of multipliers takes from it.
+void SplitStep::finish(double theta, bool constrained) {
+    StepResult& r = result;
+    const double sigma = system_.sigma();
+    r.has_multiplier = false;
+    r.normals.clear();
+    if (!constrained) {
+        std::copy(x_.begin(), x_.end(), r.state.begin());
+        std::copy(rate_.begin(), rate_.end(), r.end_rate.begin());
+        return;
+    }
+    const bool rank_deficient = system_.rank_deficient();
+    system_.correction(r.correction.data());
+    for (int i = 0; i < n_; ++i) {
+        r.correction[i] *= theta;
+        delta_[i] = -r.correction[i];
+    }
+    system_.retract(x_.data(), delta_.data(), r.state.data());
+    for (int i = 0; i < nv_; ++i) {
+        r.end_rate[i] = rate_[i] - r.correction[nv_ + i];
+        r.end_rate[nv_ + i] = rate_[nv_ + i];
+    }
+    if (!rank_deficient && (monitored_ || sigma < constants.monitored_below)) {
+        system_.multiplier(r.multiplier.data());
+        r.has_multiplier = true;
+        if (sigma < constants.monitored_below) system_.normals(r.normals);
+    }
+    if (moved_end_) add(1.0, moved_.data(), r.correction.data(), n_);
+}
+
+// The error ratio of the embedded pair.
+void SplitStep::estimate_error(const IntegratorState& memory, double sigma_change) {
+    StepResult& r = result;
+    r.error_ratio = 0.0;
+    if (scheme.error.empty()) return;
+    const int s = scheme.stages(), n = n_;
+    std::fill(error_.begin(), error_.end(), 0.0);
+    for (int k = 0; k <= s; ++k)
+        if (scheme.error[k] != 0.0) add(scheme.error[k], &r.rates[k * n], error_.data(), n);
+    for (int i = 0; i < n; ++i) {
+        error_[i] = h_ * std::abs(error_[i]);
+        weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));
+    }
+    if (monitored_) {
+        // Counted always, the uncertainty of the predicted multiplier would shorten the steps next
+        // to the singular configuration for ever.
+        if (sigma_change > constants.count_uncertainty_above) {
+            for (int j : deficient_stages_) {
+                if (j >= s) continue;
+                memory.history->uncertainty(r.t + scheme.c[j] * h_, uncertainty_.data());
+                for (int i = 0; i < nv_; ++i)
+                    error_[nv_ + i] += h_ * std::abs(scheme.b[j]) * uncertainty_[i];
+            }
+        }
+        add_floor(memory, sigma_change);
+        add_rounding(sigma_change);
+    }
+    r.error_ratio = ErrorNorm::ratio(error_.data(), weights_.data(), n);
+}
+
+void SplitStep::accept(IntegratorState& memory) {
     const StepResult& r = result;
     ++memory.steps;
     memory.rate.swap(result.end_rate);
     result.end_rate = memory.rate;  // equal sizes: copies without allocating
-    memory.sigma = r.sigmas[scheme.stages];
-    std::copy(r.magnitude.begin(), r.magnitude.end(), memory.magnitude.begin());
-    if (!memory.has_history) return;
-    if (r.has_multiplier) {
-        static const std::vector<double> nothing;
-        memory.history.extend(r.t + r.h, r.multiplier.data(), r.has_normals ? r.normals : nothing,
-                              r.has_normals ? r.normal_count : 0);
-    } else if (!r.in_zone && memory.history.begun()) {
-        memory.history.empty();
-    }
+    memory.sigma = r.sigmas[scheme.stages()];
+    std::copy(r.state_scale.begin(), r.state_scale.end(), memory.state_scale.begin());
+    if (!memory.history) return;
+    if (r.has_multiplier)
+        memory.history->extend(r.t + r.h, r.multiplier.data(), r.normals);
+    else if (!r.in_zone && memory.history->begun())
+        memory.history->clear();
 }
 
 }  // namespace srm

@@ -1,101 +1,136 @@
-// Twin of srm_mbs/integration/methods/split_step.py, branch.py and zone.py: one step of the split PSRM.
+// One step of the split PSRM: methods/split_step.py and methods/near_singular.py.
 #pragma once
 
+#include <optional>
 #include <vector>
 
+#include "constants.hpp"
 #include "history.hpp"
+#include "struct_fields.hpp"
 #include "system.hpp"
 
 namespace srm {
 
-struct Scheme {
-    int stages = 0;
-    std::vector<double> A, b, c;  // (s, s) row-major, (s,), (s,)
-    std::vector<double> error;    // (s + 1,), empty without an embedded pair
-    int controller_order = 1;
-    std::vector<double> gap_centres, gap_half_widths;  // the widest first
+#define SRM_BUTCHER_TABLEAU(field)                                                    \
+    field(std::vector<double>, A)               /* (s, s), row by row */              \
+    field(std::vector<double>, b)               /* (s,) */                            \
+    field(std::vector<double>, c)               /* (s,) */                            \
+    field(std::vector<double>, error)           /* (s + 1,); empty: no embedded pair */ \
+    field(int, controller_order)                                                      \
+    /* Intervals between the abscissae, the widest first. */                          \
+    field(std::vector<double>, gap_centres)                                           \
+    field(std::vector<double>, gap_half_widths)
+
+struct ButcherTableau {
+    SRM_FIELDS(SRM_BUTCHER_TABLEAU)
+
+    int stages() const { return static_cast<int>(b.size()); }
+    void check() const;
 };
 
-// The constants of srm_mbs/methods, passed in from Python.
-struct StepConstants {
-    double watched, near, far, ambiguous, held, rounding, usual, crosses, lead, most_floor,
-        zone_largest, count_uncertainty_above, hit;
-    int projections, fewest, gap_every;
-};
+#define SRM_ERROR_NORM(field)                                                     \
+    field(std::vector<double>, atol) /* (n,) */                                   \
+    field(std::vector<double>, one)  /* (n,), a unit of each component */         \
+    field(double, rtol)                                                           \
+    field(double, negligible)        /* part of the tolerance; 0: fixed steps */
 
+// xi = sqrt(mean_i (e_i / (atol_i + rtol |x_i|))^2)
 struct ErrorNorm {
-    std::vector<double> atol, one;  // (n,)
-    double rtol = 0.0, negligible = 0.0;
+    SRM_FIELDS(SRM_ERROR_NORM)
 
-    double weight(int i, double magnitude) const { return atol[i] + rtol * magnitude; }
+    double weight(int i, double state_scale) const { return atol[i] + rtol * state_scale; }
     static double ratio(const double* error, const double* weights, int n);
+    void check() const;
 };
 
-// Twin of srm_mbs/integration/control/step_size.py, initial_step, and its constants.
-struct FirstStepConstants {
-    double overflow, probe, longest;
-};
+// Length (s) of the first step: initial_step in control/step_size.py.
 double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
-                    const double* rate, const double* magnitude, double span, int order,
-                    const FirstStepConstants& constants);
+                    const double* rate, const double* state_scale, double span, int order,
+                    const Constants& constants);
 
-struct Memory {
-    std::vector<double> rate, magnitude;  // (n,)
-    double sigma = 0.0, sigma_slope = 0.0;
-    long steps = 0;
-    bool has_history = false;
-    History history;
+#define SRM_INTEGRATOR_STATE(field)                                                       \
+    field(std::vector<double>, rate)        /* (n,), tangent rate: the next first stage */ \
+    field(std::vector<double>, state_scale) /* (n,), |x| of the error weights */          \
+    field(double, sigma)                                                                  \
+    field(double, sigma_slope)              /* |d sigma / dt| of the last steps (1/s) */  \
+    field(long, steps)                                                                    \
+    field(std::optional<MultiplierHistory>, history) /* none without closures */
+
+// The values that a method carries from one accepted step to the next.
+struct IntegratorState {
+    SRM_FIELDS(SRM_INTEGRATOR_STATE)
+
+    void check() const;
 };
 
 struct StepResult {
     double t = 0.0, h = 0.0;
-    std::vector<double> state, rates, end_rate, correction, magnitude, sigmas, multiplier, normals;
-    int normal_count = 0;
-    double error_ratio = 0.0, gap = 0.0;
-    int rank = 0;
-    bool in_zone = false, has_multiplier = false, has_normals = false, quiet = false, held = false;
+    std::vector<double> state;        // (nx,), at the end, corrected
+    std::vector<double> rates;        // (s + 1, n), chart rates of the stages and the end
+    std::vector<double> end_rate;     // (n,), tangent rate at the corrected end
+    std::vector<double> correction;   // (n,), subtracted from the uncorrected end
+    std::vector<double> state_scale;  // (n,)
+    std::vector<double> sigmas;       // (s + 1,)
+    std::vector<double> multiplier;   // (nv,), at the end
+    std::vector<double> normals;      // (k, nv), at the end; empty: none
+    double error_ratio = 0.0;
+    double residual = 0.0;  // largest of all closure rows before the correction; 0: not evaluated
+    int rank = 0;           // smallest of all stages
+    bool has_multiplier = false;
+    bool in_zone = false;  // a stage was in the zone
+    bool quiet = false;    // the whole step is far from singular configurations
+    bool held = false;     // a stage kept the normals of the last node
     double zone_threshold = 0.0;
 };
 
-// Makes steps; owns everything a step works on, so that none allocates.
+// Makes steps; owns the memory that a step works in, so that none allocates.
 class SplitStep {
 public:
-    SplitStep(System& system, Scheme scheme, StepConstants constants, ErrorNorm norm);
+    SplitStep(System& system, ButcherTableau scheme, const Constants& constants, ErrorNorm norm);
 
-    // One step from `state`; see srm_mbs/integration/methods/base.py.  Throws EvaluationError.
-    const StepResult& make(double t, double h, const double* state, const Memory& memory,
+    // One step from `state`, of whose end correction the fraction theta is applied.  Throws
+    // EvaluationError.
+    const StepResult& make(double t, double h, const double* state, const IntegratorState& memory,
                            double theta);
     // Moves `memory` to the end of the step made last.
-    void accept(Memory& memory);
+    void accept(IntegratorState& memory);
 
     StepResult result;
-    const Scheme scheme;
+    const ButcherTableau scheme;
     const ErrorNorm norm;
-    const StepConstants constants;
+    const Constants constants;
 
 private:
+    // How the stages of the step are evaluated next to a singular configuration.
     struct Branch {
-        bool near = false, projected = false;
-        double excused = 0.0;
+        bool near = false;             // stages are projected onto their branch
+        bool projected = false;        // one of them was moved
+        double inaccurate_below = 0.0; // sigma below which direct solves exceed the tolerance
         System::ZoneView zone;
     };
-    void prepare_branch(const Memory& memory, double end, double sigma_change);
-    bool onto_branch(double t, double c, const Memory& memory, double sigma_change);
-    void turning(const double* error, double sigma, double change, double* out) const;
-    void rounding(double sigma, double change, bool projected, double* out) const;
-    double known_from(const Memory& memory, double sigma_change, double allowed) const;
-    double uncertainty(const History& history, double end);
-    bool lingers(const Memory& memory, double threshold) const;
-    void add_floor(const Memory& memory, double sigma_change);
-    void widen(double sigma_change);
+    void prepare_branch(const IntegratorState& memory, double end, double sigma_change);
+    bool project_stage(double t, double c, const IntegratorState& memory, double sigma_change);
+    void evaluate_stages(double t, const double* state, const IntegratorState& memory,
+                         double sigma_change);
+    void finish(double theta, bool constrained);
+    void estimate_error(const IntegratorState& memory, double sigma_change);
+    void rate_error(const double* error, double sigma, double change, double* out) const;
+    void rounding_error(double sigma, double change, bool projected, double* out) const;
+    double direct_from(const IntegratorState& memory, double sigma_change, double allowed) const;
+    double prediction_error(const MultiplierHistory& history, double end);
+    bool holding_suffices(const IntegratorState& memory, double threshold) const;
+    void add_floor(const IntegratorState& memory, double sigma_change);
+    void add_rounding(double sigma_change);
 
     System& system_;
     const int nv_, n_, nx_;
     double h_ = 0.0;
+    bool monitored_ = false;  // the step starts next to a singular configuration
+    bool moved_end_ = false;  // the end stage was moved by `moved_`
     Branch branch_;
     std::vector<double> x_, delta_, rate_, weights_, error_, moved_, uncertainty_;
     mutable std::vector<double> scratch_, noise_;
-    std::vector<int> weak_stages_;
+    std::vector<int> deficient_stages_;  // stages with fewer rows than the structural rank
 };
 
 }  // namespace srm

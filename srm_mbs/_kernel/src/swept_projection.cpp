@@ -11,10 +11,10 @@ namespace srm {
 
 namespace {
 
-// A norm so little above the floor counts as below it: rounding may move it there.
-constexpr double above = 1.0 + 1e-12;
-// Squares of norms that differ by less are alike: rounding may have made the difference.
-constexpr double alike = 1.0 - 1e-8;
+// Norms below this multiple of the floor count as below it: rounding may move them there.
+constexpr double floor_margin = 1.0 + 1e-12;
+// Squared norms with a ratio above this count as equal: rounding may have made the difference.
+constexpr double equal_squares = 1.0 - 1e-8;
 
 }  // namespace
 
@@ -35,7 +35,7 @@ SweptProjection::SweptProjection(int structural_rank, double sigma_ref, const Pa
     deferred_.reserve(rows);
     window_.reserve(pivot_window_);
     column_at_ = pattern.order;
-    // Rows in the order in which the columns are done with them.
+    // Rows in the order of the last column of each.
     std::vector<int> done(nv, rows);
     for (int j = 0; j < rows; ++j) {
         const int row_of_g = column_at_[j];
@@ -43,11 +43,12 @@ SweptProjection::SweptProjection(int structural_rank, double sigma_ref, const Pa
             done[support_[s]] = j;
     }
     std::iota(row_at_.begin(), row_at_.end(), 0);
-    std::stable_sort(row_at_.begin(), row_at_.end(), [&](int a, int b) { return done[a] < done[b]; });
+    std::stable_sort(row_at_.begin(), row_at_.end(),
+                     [&](int a, int b) { return done[a] < done[b]; });
     for (int i = 0; i < nv; ++i) row_place_[row_at_[i]] = i;
 }
 
-// The columns of W into the working rows.
+// Copies the columns of W into the working rows, and clears them.
 void SweptProjection::take_columns() {
     rows_of_.clear(rows, nv);
     columns_of_.clear(nv, rows);
@@ -75,10 +76,10 @@ void SweptProjection::take_columns() {
     reflections_[0] = reflection_start_[0] = right_start_[0] = steps_ = 0;
 }
 
-// All columns that wait are to come; the largest of their norms.
+// Opens all columns of this sweep; the largest of their norms.
 double SweptProjection::start_sweep() {
     if (steps_ > 0) {
-        // While a column waits, its rows are not kept.
+        // The rows of deferred columns were not updated.
         rows_of_.clear(rows, nv);
         for (const int j : waiting_) left_[j] = 0.0;
         for (std::size_t w = 0; w < open_rows_.size(); ++w)
@@ -100,7 +101,7 @@ double SweptProjection::start_sweep() {
     return std::sqrt(largest);
 }
 
-// Squares of what is left of a column that is to come.
+// Squared norm of what is left of an open column.
 double SweptProjection::remaining(int column) const {
     const Word* const own = rows_of_.words(column);
     double squares = 0.0;
@@ -112,16 +113,16 @@ double SweptProjection::remaining(int column) const {
     return squares;
 }
 
-// The place in the window of its largest column, the first of those that are alike but for rounding.
+// The place in the window of the largest column, the first of those that are equal up to rounding.
 int SweptProjection::take_from_window() {
     double largest = 0.0;
     for (const int j : window_) largest = std::max(largest, left_[j]);
     int place = 0;
-    while (left_[window_[place]] < alike * largest) ++place;
+    while (left_[window_[place]] < equal_squares * largest) ++place;
     return place;
 }
 
-// The open rows of a column and its entries there, which it takes out of them.
+// Moves the entries of a column in its open rows to entries_, and their rows to touched_.
 void SweptProjection::gather(int column) {
     const Word* const own = rows_of_.words(column);
     touched_.clear();
@@ -143,10 +144,10 @@ void SweptProjection::pivoted_qr(double floor) {
     bool forward = true;
     while (steps_ < structural_rank) {
         const double largest = start_sweep();
-        // All columns left are zero: no pivot from here on is used.
+        // All columns left are zero, and so are the pivots.
         if (!(largest > 0.0)) break;
         double least = structural_rank < rows ? pivot_share_ * largest : 0.0;
-        if (largest > floor * above) least = std::max(least, floor);
+        if (largest > floor * floor_margin) least = std::max(least, floor);
         deferred_.clear();
         window_.clear();
         const int count = static_cast<int>(waiting_.size()), before = steps_;
@@ -173,7 +174,7 @@ void SweptProjection::pivoted_qr(double floor) {
                 window_.clear();
             }
         }
-        // What is left is negligible.
+        // All entries left are negligible.
         if (steps_ == before) break;
         if (!forward) std::reverse(deferred_.begin(), deferred_.end());
         std::swap(waiting_, deferred_);
@@ -184,11 +185,11 @@ void SweptProjection::pivoted_qr(double floor) {
     clear_rows();
 }
 
-// Makes `column`, which gather() has found, the next pivot.
+// Makes `column`, whose entries gather() has found, the next pivot.
 void SweptProjection::eliminate(int column, bool forward) {
     const int k = steps_, n = static_cast<int>(touched_.size());
     const Word* const coming = open_columns_.data();
-    // The rows by the last column to come in each, in the direction of the sweep.
+    // Sorts the rows by the last column to come in each, in the direction of the sweep.
     for (int c = 0; c < n; ++c) {
         const int i = touched_[c];
         const double entry = entries_[c];
@@ -196,7 +197,8 @@ void SweptProjection::eliminate(int column, bool forward) {
         int last = -1;
         if (forward) {
             for (int w = columns_of_.last[i]; w >= columns_of_.first[i] && last < 0; --w)
-                if (const Word both = of[w] & coming[w]) last = (w << 6) + 63 - __builtin_clzll(both);
+                if (const Word both = of[w] & coming[w])
+                    last = (w << 6) + 63 - __builtin_clzll(both);
         } else {
             for (int w = columns_of_.first[i]; w <= columns_of_.last[i] && last < 0; ++w)
                 if (const Word both = of[w] & coming[w])
@@ -226,7 +228,7 @@ void SweptProjection::eliminate(int column, bool forward) {
                 if (std::abs(entries_[c]) > std::abs(entries_[top])) top = c;
             exchange(0, top);
         } else {
-            // The rows before these are done, but for the pivot's.
+            // Of the rows before these only that of the pivot is left.
             exchange(first - 1, pivot);
             pivot = first - 1;
         }
@@ -237,7 +239,8 @@ void SweptProjection::eliminate(int column, bool forward) {
     take_right(column, touched_[pivot]);
 }
 
-// Reflects n rows so that v, their entries in the next pivot's column, is left in the first alone.
+// Reflects n rows so that of v, their entries in the column of the next pivot, only the first is
+// not zero.
 void SweptProjection::reflect(const int* at, double* v, int n) {
     double squares = 0.0;
     int from = static_cast<int>(open_columns_.size()), to = -1;
@@ -250,14 +253,14 @@ void SweptProjection::reflect(const int* at, double* v, int n) {
     const double tau = (beta - alpha) / beta, scale = 1.0 / (alpha - beta);
     v[0] = 1.0;
     for (int c = 1; c < n; ++c) v[c] *= scale;
-    // A change by along v is one of length |along| |v|.
+    // A change of along[j] v has the length |along[j]| |v|.
     const double length = std::sqrt(2.0 / tau);
     double* const along = along_.data();
     for (int w = from; w <= to; ++w) {
         Word met = 0;
         for (int c = 0; c < n; ++c) met |= columns_of_.words(at[c])[w];
         if (!met) continue;
-        // From the first of these columns to the last: the others are zero in these rows.
+        // From the first of these columns to the last; those between are zero in these rows.
         const int start = (w << 6) + __builtin_ctzll(met);
         const int count = (w << 6) + 64 - __builtin_clzll(met) - start;
         const double* const least = small_.data() + start;
@@ -297,7 +300,7 @@ void SweptProjection::reflect(const int* at, double* v, int n) {
     v[0] = beta;
 }
 
-// The pivot's row is the next of R, and done.
+// Moves the row of the pivot to R.
 void SweptProjection::take_right(int column, int pivot) {
     const int k = steps_++;
     double* const a = row(pivot);
@@ -326,7 +329,7 @@ void SweptProjection::take_right(int column, int pivot) {
         if (left_[j] <= norm_lost * summed_[j]) left_[j] = summed_[j] = remaining(j);
 }
 
-// The working rows are zero again.
+// Clears the working rows.
 void SweptProjection::clear_rows() {
     for (std::size_t w = 0; w < open_rows_.size(); ++w)
         each_bit(open_rows_[w], static_cast<int>(w) << 6, [&](int i) {

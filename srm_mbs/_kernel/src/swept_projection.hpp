@@ -1,16 +1,17 @@
-// The sparse projection of a mechanism with many loops, its pivots taken along the graph of the loops.
+// The sparse projection of a mechanism with many loops, with pivots along the graph of the loops.
 //
-// Twin of swept_qr in srm_mbs/dynamics/constraints/projection.py.  The largest norm as the next pivot hops about
-// the graph, and what the pivots fill in between spreads.  So the next pivot is the largest in a
-// window that moves along the order of the graph.  Columns below the floor wait for the next sweep,
-// and so do those of less than a share of the largest norm if some depend on others.  That sweep
-// goes back: their entries have spread to the rows behind them, and find these done.
+// See swept_qr in dynamics/constraints/projection.py.  If the next pivot were the largest norm of
+// all, successive pivots would be far apart in the graph, and the columns between them would fill
+// in.  So the next pivot is the largest norm in a window that moves along the order of the graph.
+// Columns below the floor are deferred to the next sweep, and so are columns with less than a share
+// of the largest norm if some rows depend on others.  The next sweep runs back: the entries of
+// deferred columns have spread to rows further along, with which the sweep back is done first.
 //
-// A column is reflected in stages: first over the rows that none of the columns to come shares, last
-// over those that the latest of them shares.  All stages keep their part of the column in the same
-// row, the pivot's.  So what the column leaves in the rows that it has in common with the next one
-// are as few rows as before, and reflections stay as short as these columns, wherever the sweep is.
-// A reflection with all of these rows would leave each of them filled with what its neighbours are.
+// A column is reflected in stages: first over the rows that it shares with none of the columns to
+// come, last over those that it shares with the latest of them.  All stages keep their part of the
+// column in the same row, that of the pivot.  So the column fills no more of the rows that it has
+// in common with the next one than before, and reflections stay as short as the columns.  One
+// reflection over all rows would fill each of them with the columns of all others.
 #pragma once
 
 #include "sparse_projection.hpp"
@@ -42,15 +43,15 @@ private:
     std::size_t pivot_window_;
     // Places of the coordinates among the working rows.
     std::vector<int> row_place_;
-    // Working rows (nv, rows), of working columns, zero where they have none; open_columns_ are those
-    // to come in the sweep.
+    // Working rows (nv, rows) of the working columns, zero outside their rows.  open_columns_ are
+    // those to come in the sweep.
     std::vector<double> values_;
-    // Columns that wait, ascending, and those that will in the next sweep.
+    // Columns of this sweep, ascending; those deferred to the next one; those in the window.
     std::vector<int> waiting_, deferred_, window_;
-    // Of each working column: entries up to here are negligible, squares of what is left, and what
-    // these were when they were last summed up.
+    // Of each working column: size up to which entries are negligible, squared norm of what is
+    // left, and that norm when it was last summed.
     std::vector<double> small_, left_, summed_;
-    // Rows of the column at hand, its entries in them, and the last column to come in each.
+    // Rows of the current column, the last column to come in each, and its entries.
     std::vector<int> touched_, last_;
     std::vector<double> entries_;
     mutable std::vector<int> by_pivot_;

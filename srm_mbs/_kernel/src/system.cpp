@@ -25,7 +25,8 @@ namespace {
 constexpr double overflow = 1e100;
 constexpr double two_pi = 6.283185307179586;
 
-// Where a joint is in the world; its velocity and bias acceleration (with -gravity) in its own axes.
+// The placement of a joint in the world; its velocity and bias acceleration (with -gravity), in its
+// own axes.
 struct Body {
     Body(const pinocchio::Data& data, int joint)
         : rotation(data.oMi[joint].rotation().data()),
@@ -50,6 +51,27 @@ double distance(const double* x, int n) {
 }
 
 }  // namespace
+
+void ClosureRows::check() const {
+    expect_size("directions", directions.size(), directions.size() / 3 * 3);
+    expect_size("distances", distances.size(), distances.size() / 2 * 2);
+    expect_size("alignments", alignments.size(), alignments.size() / 6 * 6);
+    expect_size("signs", signs.size(), columns.size());
+}
+
+void JointRow::check() const {
+    expect_size("in_q", in_q.size(), coefficients.size());
+    expect_size("in_v", in_v.size(), coefficients.size());
+}
+
+void SystemData::check() const {
+    const std::size_t nv = position_of.size();
+    expect_size("unit", unit.size(), nv);
+    if (!damping.empty()) expect_size("damping", damping.size(), nv);
+    if (!friction.empty()) expect_size("friction", friction.size(), nv);
+    expect_size("residual_scale", residual_scale.size(), static_cast<std::size_t>(rows));
+    if (!order.empty()) expect_size("order", order.size(), static_cast<std::size_t>(rows));
+}
 
 System::System(const void* model, SystemData data, Controller controller)
     : data_(std::move(data)),
@@ -85,11 +107,9 @@ Pattern System::pattern() const {
     out.order = data_.order;
     out.pivot_share = data_.pivot_share;
     out.pivot_window = data_.pivot_window;
-    for (const LoopRows& loop : data_.loops)
-        std::fill_n(out.supports.begin() + loop.first_row,
-                    loop.directions.size() / 3 + loop.distances.size() / 2 +
-                        loop.alignments.size() / 6,
-                    loop.columns);
+    for (const ClosureRows& closure : data_.closures)
+        std::fill_n(out.supports.begin() + closure.first_row,
+                    closure.count(), closure.columns);
     for (const JointRow& joints : data_.joint_rows) out.supports[joints.row] = joints.in_v;
     for (const DrivenRow& drive : data_.drives)
         if (drive.in_v >= 0) out.supports[drive.row] = {drive.in_v};
@@ -100,14 +120,15 @@ double System::sigma() const {
     return closed_ ? projection_->sigma : std::numeric_limits<double>::infinity();
 }
 int System::rank() const { return closed_ ? projection_->rank : 0; }
-bool System::weak() const { return closed_ && projection_->weak; }
+bool System::rank_deficient() const { return closed_ && projection_->rank_deficient; }
 bool System::held() const { return closed_ && projection_->held; }
 
 // All rows: g, Gdot v, and G into the columns of the projection.
-void System::update_loops(const double* q, bool with_bias) {
-    for (const LoopRows& loop : data_.loops) {
-        if (!loop.directions.empty() || !loop.distances.empty()) update_positions(loop, with_bias);
-        if (!loop.alignments.empty()) update_alignments(loop, with_bias);
+void System::update_closures(const double* q, bool with_bias) {
+    for (const ClosureRows& closure : data_.closures) {
+        if (!closure.directions.empty() || !closure.distances.empty())
+            update_positions(closure, with_bias);
+        if (!closure.alignments.empty()) update_alignments(closure, with_bias);
     }
     for (const JointRow& joints : data_.joint_rows) {
         double* const out = projection_->column(joints.row);
@@ -129,21 +150,24 @@ void System::update_loops(const double* q, bool with_bias) {
 }
 
 // A row of G = (force, moment) J.
-void System::fill(const LoopRows& loop, int row, const Vec& force, const Vec& moment) {
+void System::fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment) {
     const double* J = work_->data.J.data();
     double* const out = projection_->column(row);
-    for (std::size_t k = 0; k < loop.columns.size(); ++k) {
-        const int j = loop.columns[k];
+    for (std::size_t k = 0; k < closure.columns.size(); ++k) {
+        const int j = closure.columns[k];
         const double* column = J + 6 * j;
-        out[j] = loop.signs[k] * (dot(force, vec(column)) + dot(moment, vec(column + 3)));
+        out[j] = closure.signs[k] * (dot(force, vec(column)) + dot(moment, vec(column + 3)));
     }
 }
 
-// Twin of _LoopRows._positions.
-void System::update_positions(const LoopRows& loop, bool with_bias) {
-    const Body a(work_->data, loop.joint_a), b(work_->data, loop.joint_b);
-    const bool ground = loop.joint_b == 0;
-    const Vec at_a = vec(loop.at_a);
+// Rows along directions and distances of points.
+//
+// x is the point of anchor a in the world, p its offset from the point of anchor b in the axes of
+// b, r and bias the first derivative of p and the second without accelerations of the joints.
+void System::update_positions(const ClosureRows& closure, bool with_bias) {
+    const Body a(work_->data, closure.joint_a), b(work_->data, closure.joint_b);
+    const bool ground = closure.joint_b == 0;
+    const Vec at_a = vec(closure.at_a.data());
     const Vec x = to_world(a.rotation, at_a) + a.origin();
     const Vec at_b = ground ? x : from_world(b.rotation, x - b.origin());
     Vec r{}, bias{};
@@ -153,7 +177,7 @@ void System::update_positions(const LoopRows& loop, bool with_bias) {
         bias = to_world(a.rotation, bias);
         r = to_world(a.rotation, speed);
         if (ground) {
-            bias = bias - b.bias();  // the ground's is -gravity, as in every body's
+            bias = bias - b.bias();  // -gravity, which every body's bias has
         } else {
             const Vec seen = from_world(b.rotation, r);
             const Vec carried = b.velocity() + cross(b.spin(), at_b);
@@ -164,21 +188,21 @@ void System::update_positions(const LoopRows& loop, bool with_bias) {
                    (b.bias() + cross(b.spin_bias(), at_b) + cross(b.spin(), twice));
         }
     }
-    const Vec p = at_b - vec(loop.at_b);
-    int row = loop.first_row;
+    const Vec p = at_b - vec(closure.at_b.data());
+    int row = closure.first_row;
     const auto along = [&](const Vec& d, double g, double rate) {
         const Vec e = ground ? d : to_world(b.rotation, d);
-        fill(loop, row, e, cross(x, e));
+        fill(closure, row, e, cross(x, e));
         g_[row] = g;
         if (with_bias) bias_[row] = rate;
         ++row;
     };
-    for (std::size_t k = 0; k < loop.directions.size(); k += 3) {
-        const Vec d = vec(&loop.directions[k]);
+    for (std::size_t k = 0; k < closure.directions.size(); k += 3) {
+        const Vec d = vec(&closure.directions[k]);
         along(d, dot(d, p), dot(d, bias));
     }
-    for (std::size_t k = 0; k < loop.distances.size(); k += 2) {
-        const double length = loop.distances[k], factor = loop.distances[k + 1];
+    for (std::size_t k = 0; k < closure.distances.size(); k += 2) {
+        const double length = closure.distances[k], factor = closure.distances[k + 1];
         const double apart = std::sqrt(dot(p, p));
         if (apart < data_.coincident * length) throw EvaluationError{Failure::coincident};
         const double by = factor / apart;
@@ -188,9 +212,10 @@ void System::update_positions(const LoopRows& loop, bool with_bias) {
     }
 }
 
-// Twin of _LoopRows._alignments.
-void System::update_alignments(const LoopRows& loop, bool with_bias) {
-    const Body a(work_->data, loop.joint_a), b(work_->data, loop.joint_b);
+// Rows that keep directions u of a and n of b perpendicular: g = n . m, m = u in the axes of b.
+// w and bias are the angular velocity of a against b and its derivative without accelerations.
+void System::update_alignments(const ClosureRows& closure, bool with_bias) {
+    const Body a(work_->data, closure.joint_a), b(work_->data, closure.joint_b);
     const auto seen = [&](const Vec& v) { return from_world(b.rotation, to_world(a.rotation, v)); };
     Vec w{}, bias{};
     if (with_bias) {
@@ -198,11 +223,11 @@ void System::update_alignments(const LoopRows& loop, bool with_bias) {
         w = spin - carried;
         bias = seen(a.spin_bias()) - b.spin_bias() - cross(carried, spin);
     }
-    const std::size_t before = loop.directions.size() / 3 + loop.distances.size() / 2;
-    int row = loop.first_row + static_cast<int>(before);
-    for (std::size_t k = 0; k < loop.alignments.size(); k += 6, ++row) {
-        const Vec m = seen(vec(&loop.alignments[k])), n = vec(&loop.alignments[k + 3]);
-        fill(loop, row, Vec{}, to_world(b.rotation, cross(m, n)));
+    const std::size_t before = closure.directions.size() / 3 + closure.distances.size() / 2;
+    int row = closure.first_row + static_cast<int>(before);
+    for (std::size_t k = 0; k < closure.alignments.size(); k += 6, ++row) {
+        const Vec m = seen(vec(&closure.alignments[k])), n = vec(&closure.alignments[k + 3]);
+        fill(closure, row, Vec{}, to_world(b.rotation, cross(m, n)));
         g_[row] = dot(n, m);
         if (with_bias) bias_[row] = dot(n, cross(bias, m) + cross(w, cross(w, m)));
     }
@@ -217,10 +242,10 @@ void System::hold(double t, const double* force, bool keep) {
     held_.insert(held_.end(), force, force + nv);
 }
 
-void System::renew(std::vector<double> unit, std::vector<double> gap_scale,
+void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
                    std::vector<double> damping, std::vector<double> friction) {
     data_.unit = std::move(unit);
-    data_.gap_scale = std::move(gap_scale);
+    data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
     held_from_.clear();
@@ -240,19 +265,20 @@ const double* System::held_force(double t) const {
     std::size_t k = held_from_.size() - 1;
     if (t < held_from_[k] && k > 0) {
         const auto after = std::upper_bound(held_from_.begin(), held_from_.end(), t);
-        k = after == held_from_.begin() ? 0 : static_cast<std::size_t>(after - held_from_.begin()) - 1;
+        const auto later = static_cast<std::size_t>(after - held_from_.begin());
+        k = later == 0 ? 0 : later - 1;
     }
     return &held_[k * nv];
 }
 
-// The rows of driven joints, and the motion at t taken off all driven rows.
+// Evaluates the rows of driven joints, and subtracts the motion at t from all driven rows.
 void System::update_drives(double t, bool with_bias) {
     const double* q = work_->q.data();
     for (const DrivenRow& drive : data_.drives) {
         const int row = drive.row;
         const bool joint = drive.in_v >= 0;
         if (joint) {
-            const double angle = drive.wound ? std::atan2(q[drive.in_q + 1], q[drive.in_q])
+            const double angle = drive.wraps ? std::atan2(q[drive.in_q + 1], q[drive.in_q])
                                              : q[drive.in_q];
             g_[row] = drive.factor * angle;
             bias_[row] = 0.0;
@@ -263,7 +289,7 @@ void System::update_drives(double t, bool with_bias) {
         g_[row] -= drive.factor * s[0];
         pushed_[row] = drive.factor * s[1];
         if (with_bias) bias_[row] -= drive.factor * s[2];
-        if (drive.wound)  // the turn that is nearest
+        if (drive.wraps)  // the nearest turn
             g_[row] = drive.factor * std::remainder(g_[row] / drive.factor, two_pi);
     }
 }
@@ -310,23 +336,22 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         return;
     }
     pinocchio_model::compute_terms(w);
-    for (int i = 0; i < nv; ++i) f_[i] = -w.data.nle[i] + f_[i];
+    for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
     if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
-    update_loops(state, true);
+    update_closures(state, true);
     update_drives(t, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);
     predicted_ = false;
-    if (!p.weak || zone.history == nullptr) return;
+    if (!p.rank_deficient || zone.history == nullptr) return;
     predicted_ = zone.predicts && zone.history->predict_near(t, prediction_.data());
     if (predicted_) return;
-    if (zone.normals == nullptr || zone.normal_count == 0)
-        throw EvaluationError{Failure::no_branch};
-    p.hold(zone.normals->data(), zone.normal_count);
+    if (zone.history->normals.empty()) throw EvaluationError{Failure::no_branch};
+    p.hold(zone.history->normals.data(), zone.history->normal_count());
 }
 
-// The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred.
+// The part of a multiplier of the rows in use, in white coordinates, plus (1 - P) yhat_pred.
 void System::completed(const double* white, double* out) const {
     std::copy(white, white + nv, out);
     if (!predicted_) return;
@@ -364,22 +389,23 @@ void System::correction(double* out) {
     projection_->normal(g_.data(), out);
     projection_->unwhiten(out);
     projection_->white_project(v_.data(), out + nv);
-    if (!data_.drives.empty()) {  // E (G v - s') is P v - E s'
+    if (!data_.drives.empty()) {  // E (G v - s') = P v - E s'
         projection_->normal(pushed_.data(), white_.data());
         for (int i = 0; i < nv; ++i) out[nv + i] -= white_[i];
     }
     projection_->unwhiten(out + nv);
 }
 
-double System::gap() const {
+double System::closure_residual() const {
     double out = 0.0;
-    for (int i = 0; i < data_.rows; ++i) out = std::max(out, std::abs(g_[i] * data_.gap_scale[i]));
+    for (int i = 0; i < data_.rows; ++i)
+        out = std::max(out, std::abs(g_[i] * data_.residual_scale[i]));
     return out;
 }
 
-void System::normals(std::vector<double>& out, int& count) const {
+void System::normals(std::vector<double>& out) const {
     // With drives the motion has a part along them: it cannot be held tangential.
-    count = data_.drives.empty() ? rank() : 0;
+    const int count = data_.drives.empty() ? rank() : 0;
     out.resize(static_cast<std::size_t>(count) * nv);
     if (count) projection_->normals(out.data());
 }
@@ -428,14 +454,14 @@ void System::difference(const double* start, const double* end, const double* ne
     Eigen::VectorXd step(nv);
     pinocchio::difference(w.model, from, to, step);
     std::copy(step.data(), step.data() + nv, out);
-    // The logarithm loses digits at small angles, the exponential does not.
+    // The logarithm loses digits at small angles, the exponential does not: one Newton step.
     std::vector<double> moved(nq + nv);
     retract(start, out, moved.data());
     from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
     pinocchio::difference(w.model, from, to, step);
     for (int i = 0; i < nv; ++i) out[i] += step[i];
     constexpr double turn = 2.0 * EIGEN_PI;
-    for (int i : data_.turning) out[i] += turn * std::nearbyint((near[i] - out[i]) / turn);
+    for (int i : data_.wrapped_angles) out[i] += turn * std::nearbyint((near[i] - out[i]) / turn);
 }
 
 void System::chart_rate(const double* delta, const double* rate, double* out) const {
@@ -448,13 +474,13 @@ void System::chart_rate(const double* delta, const double* rate, double* out) co
     }
 }
 
-double System::size(const double* positions) const {
+double System::position_norm(const double* positions) const {
     double out = 0.0;
     for (int i = 0; i < nv; ++i) out = std::max(out, std::abs(positions[i]) / data_.unit[i]);
     return out;
 }
 
-void System::magnitudes(const double* state, double* out) const {
+void System::state_scale(const double* state, double* out) const {
     for (int i = 0; i < nv; ++i) {
         const int k = data_.position_of[i];
         out[i] = k < 0 ? data_.unit[i] : std::min(std::abs(state[k]), data_.unit[i]);
@@ -470,14 +496,14 @@ double System::step_limit(const double* state) const {
                        : std::numeric_limits<double>::infinity();
 }
 
-double System::closure_gap(double t, const double* state) {
+double System::closure_residual_at(double t, const double* state) {
     if (!closed_) return 0.0;
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
     pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
-    update_loops(state, false);
+    update_closures(state, false);
     update_drives(t, false);
-    return gap();
+    return closure_residual();
 }
 
 }  // namespace srm

@@ -1,13 +1,14 @@
-// Twin of srm_mbs/dynamics/multibody.py and loops.py: a mechanism as a system.
+// A mechanism as a system: dynamics/multibody.py and dynamics/constraints/rows.py.
 //
 //     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),
 //
-// s the motion of the drives, 0 in the rows of the loops.
+// s the motion of the drives, 0 in the rows of the closures.
 //
-// A state is (q, v), a tangent (dq, dv).  The terms of the stage evaluated last are answered by
-// the system itself, each at its own cost.
+// A state is (q, v), a tangent (dq, dv).  The system answers for the terms of the stage that it
+// evaluated last.
 #pragma once
 
+#include <array>
 #include <functional>
 #include <limits>
 #include <memory>
@@ -19,72 +20,108 @@
 #include "forces.hpp"
 #include "history.hpp"
 #include "projection.hpp"
+#include "struct_fields.hpp"
 #include "vectors.hpp"
 
 namespace srm {
 
+using Point = std::array<double, 3>;
+
+#define SRM_CLOSURE_ROWS(field)                                                              \
+    field(int, joint_a)                                                                      \
+    field(int, joint_b)                                                                      \
+    field(int, first_row)                                                                    \
+    field(Point, at_a)                     /* origin of the anchor, in the axes of joint a */ \
+    field(Point, at_b)                                                                       \
+    /* The rows: k along directions, l distances, m alignments; in the axes of the joints. */ \
+    field(std::vector<double>, directions) /* (k, 3) */                                      \
+    field(std::vector<double>, distances)  /* (l, 2): length, factor of the row */           \
+    field(std::vector<double>, alignments) /* (m, 6): u in a, n in b */                      \
+    field(std::vector<int>, columns)       /* velocity components that move a against b, */  \
+    field(std::vector<double>, signs)      /* +1 where they move a, -1 where b */
+
 // Kept, scaled rows of one closure.
-struct LoopRows {
-    int joint_a, joint_b;
-    double at_a[3], at_b[3];              // the anchors' origins, like all in the axes of the joints
-    std::vector<double> directions;       // (k, 3)
-    std::vector<double> distances;        // (l, 2): length, factor of the row
-    std::vector<double> alignments;       // (l, 6): u in a, n in b
-    std::vector<int> columns;             // velocity components that move a against b
-    std::vector<double> signs;            // +1 where they move a, -1 where b
-    int first_row;
+struct ClosureRows {
+    SRM_FIELDS(SRM_CLOSURE_ROWS)
+
+    std::size_t count() const {
+        return directions.size() / 3 + distances.size() / 2 + alignments.size() / 6;
+    }
+    void check() const;
 };
 
-// A kept, scaled joint row: sum c_i q_i - offset.
+#define SRM_JOINT_ROW(field)                 \
+    field(int, row)                          \
+    field(std::vector<double>, coefficients) \
+    field(std::vector<int>, in_q)            \
+    field(std::vector<int>, in_v)            \
+    field(double, offset)
+
+// A kept, scaled row of joint coordinates: sum c_i q_i - offset.
 struct JointRow {
-    int row;
-    std::vector<double> coefficients;
-    std::vector<int> in_q, in_v;
-    double offset;
+    SRM_FIELDS(SRM_JOINT_ROW)
+
+    void check() const;
 };
 
-// factor times the row other is taken off the row row, in their columns of G.
+#define SRM_ELIMINATION(field) \
+    field(int, row)            \
+    field(int, other)          \
+    field(double, factor)      \
+    field(std::vector<int>, columns)
+
+// The row `row` minus factor times the row `other`, in these columns of G.
 struct Elimination {
-    int row, other;
-    double factor;
-    std::vector<int> columns;
+    SRM_FIELDS(SRM_ELIMINATION)
 };
 
-// A driven row: that of a closure among the loops, or of a joint coordinate.
+#define SRM_DRIVEN_ROW(field)                                     \
+    field(int, row)                                               \
+    field(double, factor) /* the inverse of the row scale */      \
+    field(int, in_q)      /* of a joint coordinate, else -1 */    \
+    field(int, in_v)                                              \
+    field(bool, wraps)    /* a joint that stores (cos, sin) */    \
+    field(Curve, curve)
+
+// A driven row: that of a closure, or of a joint coordinate.
 struct DrivenRow {
-    int row;
-    double factor;              // the inverse of the row scale
-    int in_q = -1, in_v = -1;   // of a joint, else -1
-    bool wound = false;         // a joint that stores (cos, sin)
-    Curve curve;
+    SRM_FIELDS(SRM_DRIVEN_ROW)
 };
 
 // (t, q, v) -> generalised forces (nv,), added to tau.
 using Controller = std::function<void(double, const double*, const double*, double*)>;
 
+#define SRM_SYSTEM_DATA(field)                                                                   \
+    field(std::vector<ClosureRows>, closures)                                                    \
+    field(std::vector<JointRow>, joint_rows)                                                     \
+    field(std::vector<Elimination>, eliminations)                                                \
+    field(std::vector<DrivenRow>, drives)       /* in the order of their rows, the last ones */  \
+    field(int, rows)                                                                             \
+    field(int, structural_rank)                                                                  \
+    field(double, sigma_ref)                                                                     \
+    field(std::string, algebra)                 /* "auto", "dense" or "sparse" */                \
+    field(std::vector<int>, order)              /* of the rows along the graph, or empty */      \
+    field(double, pivot_share)                                                                   \
+    field(int, pivot_window)                                                                     \
+    field(std::vector<double>, residual_scale)  /* (rows,) */                                    \
+    field(std::vector<double>, unit)            /* (nv,) */                                      \
+    field(std::vector<int>, position_of)        /* (nv,), index in q; -1 on groups */            \
+    field(std::vector<double>, damping)         /* (nv,) or empty */                             \
+    field(std::vector<double>, friction)        /* (nv,) or empty */                             \
+    field(double, friction_speed)                                                                \
+    field(std::vector<ForceElement>, forces)                                                     \
+    field(double, coincident)                   /* relative distance of points that count as one */ \
+    field(std::vector<GroupJoint>, groups)                                                       \
+    field(std::vector<double>, series)          /* of dexp^-1 */                                 \
+    field(std::vector<int>, wrapped_angles)     /* velocity indices of (cos, sin) joints */      \
+    field(double, largest_rotation)             /* of a chart (rad) */                           \
+    field(double, farthest_node)                /* rotation (rad) between nodes, at most */      \
+    field(double, rotation_per_step)            /* (rad), at most */
+
 struct SystemData {
-    std::vector<LoopRows> loops;
-    std::vector<JointRow> joint_rows;
-    std::vector<Elimination> eliminations;
-    std::vector<DrivenRow> drives;      // in the order of their rows, which are the last
-    int rows = 0, structural_rank = 0;
-    double sigma_ref = 1.0;
-    std::string algebra = "auto";       // "auto", "dense" or "sparse"
-    std::vector<int> order;             // of the rows along the graph of the loops, or empty
-    double pivot_share = 1.0;
-    int pivot_window = 1;
-    std::vector<double> gap_scale;      // (rows,)
-    std::vector<double> unit;           // (nv,)
-    std::vector<int> position_of;       // (nv,), -1 on groups
-    std::vector<double> damping;        // (nv,) or empty
-    std::vector<double> friction;       // (nv,) or empty
-    double friction_speed = 1.0;
-    std::vector<ForceElement> forces;
-    double coincident = 0.0;
-    std::vector<GroupJoint> groups;
-    std::vector<double> series;         // of dexp^-1
-    std::vector<int> turning;           // velocity indices of (cos, sin) joints
-    double largest_rotation = 0.0, farthest_node = 0.0, rotation_per_step = 0.0;
+    SRM_FIELDS(SRM_SYSTEM_DATA)
+
+    void check() const;
 };
 
 class System {
@@ -92,13 +129,11 @@ public:
     System(const void* model, SystemData data, Controller controller);
     ~System();
 
-    // The zone of a stage; see srm_mbs/dynamics/system.py.  threshold < 0: none.
+    // The zone of a stage: Zone in dynamics/system.py.  threshold < 0: none.
     struct ZoneView {
         double threshold = -1.0;
-        const History* history = nullptr;
-        bool predicts = true;  // false: hold the normals
-        const std::vector<double>* normals = nullptr;
-        int normal_count = 0;
+        const MultiplierHistory* history = nullptr;
+        bool predicts = true;  // false: hold the normals of the last node
     };
 
     void evaluate(double t, const double* state, const ZoneView& zone);
@@ -109,13 +144,13 @@ public:
         first_ = first;
         last_ = last;
     }
-    // From t on a constant force (nv,) acts, beside all others; with `keep` those before stay in
-    // force at earlier times.
+    // From t on a constant force (nv,) acts in addition to all others.  With `keep` the forces held
+    // before still act at earlier times.
     void hold(double t, const double* force, bool keep);
-    // As if it were new, at another start: what depends on that.
-    void renew(std::vector<double> unit, std::vector<double> gap_scale,
+    // Resets the system for a run from another start, on which these values depend.
+    void renew(std::vector<double> unit, std::vector<double> residual_scale,
                std::vector<double> damping, std::vector<double> friction);
-    // Whether `force` (nv,) is what acts now.
+    // Whether `force` (nv,) is the force held last.
     bool holds(const double* force) const;
 
     // Terms of the stage evaluated last.
@@ -123,24 +158,26 @@ public:
     bool sparse() const { return closed_ && projection_->sparse(); }
     double sigma() const;
     int rank() const;
-    bool weak() const;
+    bool rank_deficient() const;
     bool held() const;
     void rate(double* out);              // (2 nv,)
     void multiplier(double* out);        // (nv,)
     void correction(double* out);        // (2 nv,)
-    double gap() const;
-    void normals(std::vector<double>& out, int& count) const;
+    double closure_residual() const;     // the largest, in row units
+    // M-orthonormal normals (k, nv) of the rows in use; empty with drives.
+    void normals(std::vector<double>& out) const;
 
     // The manifold.
     void retract(const double* state, const double* delta, double* out);
-    // Angles that count no turns take the one nearest to the motion near (nv,).
+    // Angles of (cos, sin) joints take the turn nearest to the motion near (nv,).
     void difference(const double* start, const double* end, const double* near, double* out);
     bool reachable(const double* start, const double* end) const;
     void chart_rate(const double* delta, const double* rate, double* out) const;
-    double size(const double* positions) const;  // of dq (nv,), in units
-    void magnitudes(const double* state, double* out) const;
+    double position_norm(const double* positions) const;  // largest of dq (nv,), in units
+    void state_scale(const double* state, double* out) const;
     double step_limit(const double* state) const;
-    double closure_gap(double t, const double* state);
+    // The largest residual of all rows at a state, in row units.
+    double closure_residual_at(double t, const double* state);
 
     int nq, nv;
     long evaluations = 0;
@@ -148,17 +185,17 @@ public:
 
 private:
     Pattern pattern() const;
-    void update_loops(const double* q, bool with_bias);
-    void update_positions(const LoopRows& loop, bool with_bias);
-    void update_alignments(const LoopRows& loop, bool with_bias);
-    void fill(const LoopRows& loop, int row, const Vec& force, const Vec& moment);
+    void update_closures(const double* q, bool with_bias);
+    void update_positions(const ClosureRows& closure, bool with_bias);
+    void update_alignments(const ClosureRows& closure, bool with_bias);
+    void fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment);
     void update_drives(double t, bool with_bias);
     void completed(const double* white, double* out) const;
     const double* held_force(double t) const;
 
     double first_ = -std::numeric_limits<double>::infinity();
     double last_ = std::numeric_limits<double>::infinity();
-    std::vector<double> held_from_, held_;  // times, and forces (k, nv)
+    std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;
     Controller controller_;
     std::unique_ptr<pinocchio_model::Workspace> work_;

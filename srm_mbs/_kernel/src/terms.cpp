@@ -41,8 +41,8 @@ struct IsUsual : boost::static_visitor<bool> {
     }
 };
 
-// CrbaWorldConventionForwardStep and NLEForwardStep.  Flattened: products of six numbers cost less
-// than calls.
+// CrbaWorldConventionForwardStep and NLEForwardStep.  Flattened, because products of six numbers
+// cost less than calls.
 struct Forward : pinocchio::fusion::JointUnaryVisitorBase<Forward> {
     using ArgsType = boost::fusion::vector<const Model&, Data&, const Argument&, const Argument&>;
 

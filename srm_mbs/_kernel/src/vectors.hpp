@@ -1,4 +1,4 @@
-// Twin of srm_mbs/dynamics/constraints/rows.py: products of three numbers, in the order of the reference.
+// Vectors of three numbers.
 #pragma once
 
 namespace srm {
@@ -31,7 +31,7 @@ inline double dot(const Vec& a, const Vec& b) {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-// R a and R^T a, R in columns.
+// R a and R^T a; R column by column.
 inline Vec to_world(const double* R, const Vec& a) {
     return {R[0] * a.x + R[3] * a.y + R[6] * a.z, R[1] * a.x + R[4] * a.y + R[7] * a.z,
             R[2] * a.x + R[5] * a.y + R[8] * a.z};

@@ -8,8 +8,8 @@
 
 namespace pinocchio_model {
 
-// What Pinocchio's library has crba and aba for: with vectors, the compiler would make them anew,
-// for every kind of joint, in ten times the time and memory.
+// The argument type of the crba and aba in Pinocchio's library.  For other vector types the
+// compiler would instantiate them again, for every kind of joint, in ten times the time and memory.
 using Argument = Eigen::Ref<const Eigen::VectorXd>;
 
 struct Workspace {

@@ -10,8 +10,8 @@ import numpy as np
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.integration import dense_output as hermite
-from srm_mbs.integration.dense_output import SLACK, DenseOutput, StepData
+from srm_mbs.integration.dense_output import DenseOutput, StepData
+from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -38,9 +38,9 @@ class CompiledDenseOutput(DenseOutput):
 
     Parameters
     ----------
-    twin
-        That of the run, to be kept; None where any idle one of the mechanism serves
-        (:func:`~srm_mbs.integration.kernel.system.shared`), so that runs at hand hold no workspace.
+    kernel_system
+        The kernel system of the run; None where any idle one of the mechanism serves
+        (:func:`~srm_mbs.integration.kernel.system.shared`), so that results hold no workspace.
     system, scheme, steps
         As for :class:`~srm_mbs.integration.dense_output.DenseOutput`.
     """
@@ -97,38 +97,16 @@ class CompiledDenseOutput(DenseOutput):
     def _lone_zones(self) -> bool:
         """Whether a step with a zone has a breakpoint on both sides: the kernel's extra stages have
         no zone."""
-        pieces = (self._steps.piece(step) for step in self._steps.zones)
+        pieces = (self._steps.smooth_interval(step) for step in self._steps.zones)
         return any(last - first < 2 for first, last in pieces)
 
     def _compile(self) -> Any:
-        steps, extension = self._steps, self._extension
+        system = self._mechanism_system
         return core.DenseOutput(  # type: ignore[union-attr]
-            self._mechanism_system.nq,
-            self._mechanism_system.nv,
-            {
-                "rows": extension.rows,
-                "extra_A": extension.extra_A,
-                "extra_c": extension.extra_c,
-                "degree": len(extension.rows),
-                "n_rates": extension.n_rates,
-                "abscissae": self._abscissae,
-                "nodes": list(hermite.NODES),
-                "spacing": hermite.SPACING,
-                "close": hermite.CLOSE,
-                "probes": hermite.PROBES,
-                "end": steps.end,
-                "slack": SLACK,
-                "count": steps.count,
-                "width": steps.rates.shape[1],
-                "corrected": steps.corrections.shape[1] > 0,
-                "zones": list(steps.zones),
-                "breaks": steps.breaks.astype(float),
-                **{
-                    name: np.ascontiguousarray(getattr(steps, name))
-                    for name in (
-                        "times", "states", "rates", "corrections", "sigmas", "end_rate",
-                        "break_rates",
-                    )
-                },
-            },
-        )  # fmt: skip
+            system.nq,
+            system.nv,
+            self._abscissae,
+            marshalling.extension_struct(self._extension),
+            marshalling.dense_constants(),
+            marshalling.steps_struct(self._steps),
+        )

@@ -1,4 +1,4 @@
-"""From the start of a run on the compiled kernel to its record."""
+"""Drives a run on the compiled kernel from its start to its record."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunRecord, Tick
 from srm_mbs.integration.events import EventWatch
-from srm_mbs.integration.kernel.marshalling import VERDICTS, history_from
+from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
 from srm_mbs.integration.kernel.run import (
     ARRIVAL,
     BREAKPOINT,
@@ -39,9 +39,12 @@ class CompiledRecord(RunRecord):
     Attributes
     ----------
     run
-        What holds its steps.
+        Holds the steps.
     suspects
-        Times (s) of steps that were kept although the velocity turned.
+        Ends (s) of steps that were accepted although they may have changed the branch.
+    placed, replaced
+        Numbers of steps that were placed around a singular configuration, and of attempts that
+        were repeated for it.
     """
 
     run: Any = None
@@ -53,13 +56,7 @@ class CompiledRecord(RunRecord):
         """The accepted steps as arrays."""
         if self.run is None:
             return super().data(scheme, tangent_size)
-        arrays = self.run.arrays(self.t0, self.x0)
-        zones = {
-            step: (threshold, history_from(history))
-            for step, (threshold, history) in arrays.pop("zones").items()
-        }
-        breaks = arrays.pop("breaks").astype(int)
-        return StepData(breaks=breaks, zones=zones, stop=self.stop, **arrays)
+        return steps_from(self.run.take_records(self.t0, self.x0), self.stop)
 
 
 def integrate(
@@ -75,12 +72,12 @@ def integrate(
     Parameters
     ----------
     system
-        The mechanism that ``run`` is of.
+        The mechanism of ``run``.
     tick, events
-        With events the kernel returns after every step; with a tick after as many as its
-        ``stride`` says, one if it has none.
+        With events the kernel returns after every step; with a tick after ``tick.stride`` steps,
+        or one.
     passing
-        What happens at breakpoints, if there are any.
+        Handles breakpoints, if there are any.
     """
     state = run.start
     record = CompiledRecord(run.t0, state)
@@ -121,16 +118,17 @@ def integrate(
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
         record.mark_aborted(run.t, error)
     record.attempts = [
-        driver.Attempt(t, h, ratio, VERDICTS[verdict]) for t, h, ratio, verdict in run.attempts()
+        driver.Attempt(t, h, ratio, DECISIONS[decision]) for t, h, ratio, decision in run.attempts()
     ]
-    record.suspects, record.placed, record.replaced = run.suspects(), run.placed, run.replaced
+    record.suspects = run.suspect_times()
+    record.placed, record.replaced = run.placed, run.replaced
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
 
 
 def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> RunFailure:
-    """Why the kernel stopped, as the reference says it, which repeats the attempt that failed."""
+    """The reason why the kernel stopped, from the reference, which repeats the failed attempt."""
     attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
     if reason == STANDSTILL:
         return driver.standstill(run.t - run.time_before(driver.WATCHED_STEPS))
@@ -139,9 +137,10 @@ def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun
         return failure or RunFailure.of(StopReason.ERROR_ESTIMATE)
     if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
         return RunFailure.of(StopReason.ROUND_OFF)
-    if run.trouble:
+    if run.evaluation_failed:
         failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
-        # The last one first; at the edge of what can be evaluated rounding decides.
+        # Where a step can just be evaluated, rounding decides: the reference may not fail at the
+        # last one.
         for h in reversed(failed):
             try:
                 run.method.step(system, run.t, h, run.state, run.memory(), run.norm)

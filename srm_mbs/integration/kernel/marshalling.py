@@ -1,6 +1,9 @@
-"""What is handed to the compiled kernel and back: numbers of the algorithm, what a run remembers.
+"""Structs of the compiled kernel, made from objects of the reference and turned back into them.
 
-Matrices of the reference have their vectors in columns, those of the kernel in rows.
+The kernel binds its C++ structs as immutable classes.  Their constructors take every field by
+keyword: a missing or an unknown field is a TypeError, an array of another size a ValueError that
+names the field.  Matrices of the reference have their vectors in columns, those of the kernel in
+rows.
 """
 
 from __future__ import annotations
@@ -10,128 +13,354 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.integration import breakpoints, driver, singular_endpoints
+from srm_mbs._kernel import core
+from srm_mbs._typing import FloatArray
+from srm_mbs.integration import breakpoints, dense_output, driver, singular_endpoints
+from srm_mbs.integration.breakpoints import SmoothIntervals
 from srm_mbs.integration.control import branch_guard, placement, step_size
 from srm_mbs.integration.control.step_size import StepDecision
+from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.methods import near_singular, split_step
-from srm_mbs.integration.methods.base import IntegratorState
-from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
+from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+from srm_mbs.integration.methods.thesis.regularisation import Regularisation
 
-VERDICTS = (StepDecision.ACCEPTED, StepDecision.REJECTED, StepDecision.REPLACED)
-"""What the kernel numbers from 0: ``StepDecision`` in control.hpp."""
-CONSTANTS = {
-    "watched": near_singular.WATCHED,
-    "near": near_singular.NEAR,
-    "far": near_singular.FAR,
-    "ambiguous": near_singular.AMBIGUOUS,
-    "held": near_singular.HELD,
-    "rounding": near_singular.ROUNDING,
-    "usual": near_singular.USUAL,
-    "crosses": near_singular.CROSSES,
-    "lead": near_singular.LEAD,
-    "most_floor": near_singular.MOST_FLOOR,
-    "zone_largest": near_singular.ZONE_LARGEST,
-    "count_uncertainty_above": near_singular.COUNT_UNCERTAINTY_ABOVE,
-    "hit": near_singular.HIT,
-    "projections": near_singular.PROJECTIONS,
-    "fewest": near_singular.FEWEST,
-    "gap_every": split_step.RESIDUAL_EVERY,
-    "safety": step_size.SAFETY,
-    "min_factor": step_size.MIN_FACTOR,
-    "max_factor": step_size.MAX_FACTOR,
-    "proportional": step_size.PROPORTIONAL_EXPONENT,
-    "integral": step_size.INTEGRAL_EXPONENT,
-    "xi_old_floor": step_size.MIN_OLD_ERROR_RATIO,
-    "xi_floor": step_size.MIN_ERROR_RATIO,
-    "failed_evaluation": step_size.UNEVALUATED_ERROR_RATIO,
-    "sigma_change": placement.SIGMA_CHANGE,
-    "too_close": placement.TOO_CLOSE,
-    "clearance": placement.CLEARANCE,
-    "ahead": placement.PREDICTION_STEPS,
-    "max_redone": placement.MAX_REDONE,
-    "beside": placement.SINGULAR_END_SIGMA,
-    "arrival_change": placement.ARRIVAL_SIGMA_CHANGE,
-    "turned": branch_guard.VELOCITY_JUMP,
-    "guard_max_redone": branch_guard.MAX_REDONE,
-    "smallest_step": driver.SMALLEST_STEP,
-    "standstill": driver.STANDSTILL,
-    "large_correction": driver.LARGE_CORRECTION,
-    "open": driver.RESIDUAL_EXAMINED,
-    "lost": driver.LARGEST_RESIDUAL,
-    "watched_steps": driver.WATCHED_STEPS,
-    "look": singular_endpoints.NEAR_SINGULAR_SIGMA,
-    "closer": breakpoints.CLOSER,
-    "allowed": breakpoints.ALLOWED,
-}
-"""Every number of the algorithm, from the module of the reference that has it."""
+# Tests without the compiled kernel import this module, too.
+_core: Any = core
+
+DECISIONS = (StepDecision.ACCEPTED, StepDecision.REJECTED, StepDecision.REPLACED)
+"""The decisions that the kernel numbers from 0: ``StepDecision`` in control.hpp."""
+_GROUPS = ("so3", "se3", "se2")
+"""The groups that the kernel numbers from 0: ``Group`` in charts.hpp."""
 
 
-FIRST_STEP = (step_size.RATE_OVERFLOW, step_size.PROBE_LENGTH, step_size.LONGEST_FIRST)
-"""Those of the first step."""
-
-
-@lru_cache(maxsize=64)
-def scheme_data(scheme: ButcherTableau) -> dict[str, Any]:
-    """``scheme`` as the kernel reads it."""
-    gaps = np.array(scheme.gaps)
-    return {
-        "A": scheme.A,
-        "b": scheme.b,
-        "c": scheme.c,
-        "error": scheme.error,
-        "controller_order": scheme.controller_order or 1,
-        "gap_centres": gaps[:, 0].copy(),
-        "gap_half_widths": gaps[:, 1].copy(),
-    }
-
-
-def history_data(history: MultiplierHistory | None) -> dict[str, Any] | None:
-    """``history`` as the kernel reads it; None is none."""
-    if history is None:
-        return None
-    normals = history.normals
-    return {
-        "times": np.ascontiguousarray(history.times),
-        "values": np.ascontiguousarray(history.values),
-        "known_until": history.known_until,
-        "known_below": history.known_below,
-        "normals": None if normals is None else np.ascontiguousarray(normals.T),
-    }
-
-
-def history_from(data: dict[str, Any]) -> MultiplierHistory:
-    """What the kernel gave back, as a history."""
-    normals = data["normals"]
-    return MultiplierHistory(
-        data["times"],
-        data["values"],
-        data["known_until"],
-        data["known_below"],
-        None if normals is None else normals.T,
+def constants() -> Any:
+    """``Constants`` of constants.hpp, each from the module of the reference that has it."""
+    return _core.Constants(
+        # Branch stages and zone.
+        monitored_below=near_singular.WATCHED_SIGMA,
+        near_steps=near_singular.NEAR_STEPS,
+        far_steps=near_singular.FAR_STEPS,
+        ambiguous_offset=near_singular.AMBIGUOUS_DISTANCE,
+        held_tolerance=near_singular.HELD_ERROR,
+        position_rounding=near_singular.POSITION_ROUNDING,
+        usual_rounding=near_singular.USUAL_ROUNDING,
+        crossing_sigma=near_singular.CROSSING_SIGMA,
+        lead_steps=near_singular.FLOOR_STEPS,
+        largest_rounding_floor=near_singular.LARGEST_FLOOR,
+        zone_largest=near_singular.LARGEST_ZONE_SIGMA,
+        count_uncertainty_above=near_singular.UNCERTAINTY_SIGMA_CHANGE,
+        direct_hit=near_singular.DIRECT_HIT_SIGMA,
+        max_projections=near_singular.MAX_PROJECTIONS,
+        min_history=near_singular.MIN_PREDICTION_NODES,
+        residual_interval=split_step.RESIDUAL_EVERY,
+        # Step-size control.
+        safety=step_size.SAFETY,
+        min_factor=step_size.MIN_FACTOR,
+        max_factor=step_size.MAX_FACTOR,
+        proportional=step_size.PROPORTIONAL_EXPONENT,
+        integral=step_size.INTEGRAL_EXPONENT,
+        previous_error_floor=step_size.MIN_OLD_ERROR_RATIO,
+        error_floor=step_size.MIN_ERROR_RATIO,
+        failed_evaluation=step_size.UNEVALUATED_ERROR_RATIO,
+        rate_overflow=step_size.RATE_OVERFLOW,
+        first_step_probe=step_size.PROBE_LENGTH,
+        longest_first_step=step_size.LONGEST_FIRST,
+        # Placement.
+        max_sigma_change=placement.SIGMA_CHANGE,
+        too_close=placement.TOO_CLOSE,
+        clearance=placement.CLEARANCE,
+        zero_horizon=placement.PREDICTION_STEPS,
+        max_placements=placement.MAX_REDONE,
+        singular_end=placement.SINGULAR_END_SIGMA,
+        arrival_sigma_change=placement.ARRIVAL_SIGMA_CHANGE,
+        # Branch guard.
+        branch_change=branch_guard.VELOCITY_JUMP,
+        max_guard_retries=branch_guard.MAX_REDONE,
+        # Driver and breakpoints.
+        smallest_step=driver.SMALLEST_STEP,
+        standstill=driver.STANDSTILL,
+        standstill_steps=driver.WATCHED_STEPS,
+        large_correction=driver.LARGE_CORRECTION,
+        open_residual=driver.RESIDUAL_EXAMINED,
+        lost_residual=driver.LARGEST_RESIDUAL,
+        search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
+        search_factor=breakpoints.REPEATED_SEARCH_SIGMA,
+        rounding_share=breakpoints.FIRST_STAGE_ERROR,
     )
 
 
-def memory_data(memory: IntegratorState) -> dict[str, Any]:
-    """``memory`` as the kernel reads it."""
-    return {
-        "rate": np.ascontiguousarray(memory.rate),
-        "magnitude": np.ascontiguousarray(memory.state_scale),
-        "sigma": memory.sigma,
-        "sigma_slope": memory.sigma_slope,
-        "steps": memory.steps,
-        "history": history_data(memory.history),
-    }
+CONSTANTS: Any = None if core is None else constants()
+"""Those of every run; a field that :func:`constants` lacks is an error on import."""
 
 
-def memory_from(data: dict[str, Any]) -> IntegratorState:
-    """What the kernel gave back, as a memory."""
-    history = data["history"]
+@lru_cache(maxsize=64)
+def tableau_struct(scheme: ButcherTableau) -> Any:
+    """``ButcherTableau`` of step.hpp."""
+    gaps = np.array(scheme.gaps)
+    return _core.ButcherTableau(
+        A=scheme.A,
+        b=scheme.b,
+        c=scheme.c,
+        error=_NO_NUMBERS if scheme.error is None else scheme.error,
+        controller_order=scheme.controller_order or 1,
+        gap_centres=gaps[:, 0],
+        gap_half_widths=gaps[:, 1],
+    )
+
+
+def norm_struct(norm: ErrorNorm) -> Any:
+    """``ErrorNorm`` of step.hpp."""
+    return _core.ErrorNorm(atol=norm.atol, one=norm.one, rtol=norm.rtol, negligible=norm.negligible)
+
+
+def history_struct(history: MultiplierHistory) -> Any:
+    """``MultiplierHistory`` of history.hpp."""
+    normals = history.normals
+    return _core.MultiplierHistory(
+        nv=history.values.shape[1],
+        times=history.times,
+        values=history.values,
+        known_until=history.known_until,
+        known_below=history.known_below,
+        normals=_NO_NUMBERS if normals is None else np.ascontiguousarray(normals.T),
+    )
+
+
+def history_from(struct: Any) -> MultiplierHistory:
+    """The history of multipliers in a ``MultiplierHistory`` of the kernel."""
+    nv: int = struct.nv
+    normals: FloatArray = struct.normals.reshape(-1, nv)
+    return MultiplierHistory(
+        struct.times,
+        struct.values.reshape(-1, nv),
+        struct.known_until,
+        struct.known_below,
+        normals.T if len(normals) else None,
+    )
+
+
+def state_struct(memory: IntegratorState) -> Any:
+    """``IntegratorState`` of step.hpp."""
+    history = memory.history
+    return _core.IntegratorState(
+        rate=memory.rate,
+        state_scale=memory.state_scale,
+        sigma=memory.sigma,
+        sigma_slope=memory.sigma_slope,
+        steps=memory.steps,
+        history=None if history is None else history_struct(history),
+    )
+
+
+def state_from(struct: Any) -> IntegratorState:
+    """The integrator's state in an ``IntegratorState`` of the kernel."""
+    history = struct.history
     return IntegratorState(
-        data["rate"],
-        data["sigma"],
-        data["magnitude"],
+        struct.rate,
+        struct.sigma,
+        struct.state_scale,
         None if history is None else history_from(history),
-        data["sigma_slope"],
-        data["steps"],
+        struct.sigma_slope,
+        struct.steps,
+    )
+
+
+def control_struct(
+    *,
+    h: float = 0.0,
+    xi_old: float = 1.0,
+    just_rejected: bool = False,
+    index: int = 1,
+    slope: float = 0.0,
+    zero: float = np.nan,
+    redo: float = 0.0,
+    redone: int = 0,
+    arrival: int = 0,
+    limit: float = np.inf,
+    tries: int = 0,
+) -> Any:
+    """``ControlState`` of control.hpp; by default that of a control before its first step."""
+    return _core.ControlState(
+        h=h,
+        xi_old=xi_old,
+        just_rejected=just_rejected,
+        index=index,
+        slope=slope,
+        zero=zero,
+        redo=redo,
+        redone=redone,
+        arrival=arrival,
+        limit=limit,
+        tries=tries,
+    )
+
+
+def intervals_struct(pieces: SmoothIntervals) -> Any:
+    """``SmoothIntervals`` of run.hpp."""
+    return _core.SmoothIntervals(
+        ends=pieces.ends, first=pieces.first, last=pieces.last, given=pieces.given.tolist()
+    )
+
+
+def options_struct(
+    *,
+    t0: float,
+    step: float | None,
+    first_step: float,
+    max_step: float,
+    placed: str,
+    arrivals: bool,
+    eps: Regularisation | None,
+) -> Any:
+    """``RunOptions`` of run.hpp."""
+    return _core.RunOptions(
+        t0=t0,
+        step=0.0 if step is None else step,
+        first_step=first_step,
+        max_step=max_step,
+        placement=placed,
+        arrivals=arrivals,
+        eps_factor=0.0 if eps is None else eps.factor,
+        eps_power=0.0 if eps is None else eps.power,
+    )
+
+
+def extension_struct(extension: DenseExtension) -> Any:
+    """``Extension`` of dense.hpp."""
+    return _core.Extension(
+        n_rates=extension.n_rates,
+        rows=extension.rows,
+        extra_A=extension.extra_A,
+        extra_c=extension.extra_c,
+    )
+
+
+def dense_constants() -> Any:
+    """``DenseConstants`` of dense.hpp."""
+    return _core.DenseConstants(
+        nodes=list(dense_output.HERMITE_NODES),
+        spacing=dense_output.NODE_SPACING,
+        close=dense_output.CLOSE_SIGMA,
+        probes=dense_output.COMPARED_AT,
+        slack=dense_output.TIME_TOLERANCE,
+    )
+
+
+def steps_struct(steps: StepData) -> Any:
+    """``StepArrays`` of module.cpp, which refers to the arrays of ``steps``."""
+    n = len(steps.end_rate)
+    return _core.StepArrays(
+        times=steps.times,
+        states=steps.states,
+        rates=steps.rates,
+        corrections=steps.corrections,
+        sigmas=steps.sigmas,
+        end_rate=steps.end_rate,
+        break_rates=steps.break_rates.reshape(len(steps.breaks), n),
+        breaks=steps.breaks.tolist(),
+        zones=list(steps.zones),
+        end=steps.end,
+    )
+
+
+def steps_from(records: Any, stop: float | None) -> StepData:
+    """The accepted steps in ``StepRecords`` of the kernel; its arrays are not copied."""
+    return StepData(
+        times=records.times,
+        states=records.states,
+        rates=records.rates,
+        corrections=records.corrections,
+        sigmas=records.sigmas,
+        ranks=records.ranks,
+        error_ratios=records.error_ratios,
+        placements=records.placements,
+        held=records.held,
+        end_rate=records.end_rate,
+        zones={zone.step: (zone.threshold, history_from(zone.history)) for zone in records.zones},
+        stop=stop,
+        breaks=records.breaks.astype(int),
+        break_rates=records.break_rates,
+    )
+
+
+_NO_NUMBERS = np.zeros(0)
+
+
+def system_struct(constants: dict[str, Any]) -> Any:
+    """``SystemData`` of system.hpp.
+
+    Parameters
+    ----------
+    constants
+        From :meth:`~srm_mbs.dynamics.multibody.Mechanics.constants`.
+    """
+    data = dict(constants)
+    damping, friction = data.pop("damping"), data.pop("friction")
+    return _core.SystemData(
+        closures=[_closure_rows(**rows) for rows in data.pop("loops")],
+        joint_rows=[_core.JointRow(**row) for row in data.pop("joint_rows")],
+        eliminations=[_elimination(*row) for row in data.pop("eliminations")],
+        drives=[_driven_row(**row) for row in data.pop("drives")],
+        forces=[_force(**force) for force in data.pop("forces")],
+        groups=[_group_joint(*joint) for joint in data.pop("groups")],
+        residual_scale=data.pop("gap_scale"),
+        wrapped_angles=data.pop("turning"),
+        damping=_NO_NUMBERS if damping is None else damping,
+        friction=_NO_NUMBERS if friction is None else friction,
+        **data,
+    )
+
+
+def _closure_rows(support: FloatArray, **rows: Any) -> Any:
+    columns = np.flatnonzero(support)
+    return _core.ClosureRows(columns=columns.tolist(), signs=support[columns].astype(float), **rows)
+
+
+def _elimination(row: int, other: int, factor: float, columns: list[int]) -> Any:
+    return _core.Elimination(row=row, other=other, factor=factor, columns=columns)
+
+
+def _driven_row(curve: dict[str, Any], wound: bool, **row: Any) -> Any:
+    return _core.DrivenRow(curve=_core.Curve(**curve), wraps=bool(wound), **row)
+
+
+def _group_joint(group: str, start: int, size: int, position: int) -> Any:
+    return _core.GroupJoint(group=_GROUPS.index(group), start=start, size=size, position=position)
+
+
+_NO_ANCHOR = (0, np.zeros(12))
+
+
+def _force(
+    kind: int,
+    a: tuple[int, FloatArray] = _NO_ANCHOR,
+    b: tuple[int, FloatArray] = _NO_ANCHOR,
+    support: FloatArray = _NO_NUMBERS,
+    stiffness: float = 0.0,
+    damping: float = 0.0,
+    rest: float = 0.0,
+    in_q: int = 0,
+    in_v: int = 0,
+    turns: bool = False,
+    numbers: FloatArray = _NO_NUMBERS,
+    curves: tuple[dict[str, Any], ...] = (),
+) -> Any:
+    """``ForceElement`` of forces.hpp; the fields that its kind has not are zero or empty."""
+    columns = np.flatnonzero(support)
+    return _core.ForceElement(
+        kind=kind,
+        a=_core.Anchor(joint=a[0], placement=a[1]),
+        b=_core.Anchor(joint=b[0], placement=b[1]),
+        columns=columns.tolist(),
+        signs=support[columns].astype(float),
+        stiffness=stiffness,
+        damping=damping,
+        rest=rest,
+        in_q=in_q,
+        in_v=in_v,
+        in_link_axes=turns,
+        numbers=numbers,
+        curves=[_core.Curve(**curve) for curve in curves],
     )

@@ -5,27 +5,19 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
-
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration import driver, singular_endpoints
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals
 from srm_mbs.integration.control.step_size import StepDecision
-from srm_mbs.integration.kernel.marshalling import (
-    CONSTANTS,
-    VERDICTS,
-    history_from,
-    memory_data,
-    memory_from,
-    scheme_data,
-)
+from srm_mbs.integration.kernel import marshalling
+from srm_mbs.integration.kernel.marshalling import CONSTANTS, DECISIONS
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.psrm import PSRM
 
 CHUNK = 0.1
-"""Seconds after which the kernel returns, so that Ctrl-C is heard."""
+"""Time (s) after which the kernel returns, so that Ctrl-C interrupts a run."""
 (
     CHUNK_FULL,
     FINISHED,
@@ -36,7 +28,7 @@ CHUNK = 0.1
     BREAKPOINT,
     ARRIVAL,
 ) = range(8)
-"""Why the kernel returned: ``Stop`` in run.hpp."""
+"""Reasons for which the kernel returns: ``Stop`` in run.hpp."""
 
 
 class CompiledRun:
@@ -44,20 +36,20 @@ class CompiledRun:
 
     Parameters
     ----------
-    twin
+    kernel_system
         From :func:`~srm_mbs.integration.kernel.system.make_kernel_system`.
     method, norm, memory, state
         As for :func:`~srm_mbs.integration.driver.integrate`.
     pieces
-        Of the run; its end is that of the last one.
+        The smooth intervals of the run, which ends with the last one.
     t0
-        Its start (s).
+        Start of the run (s).
     step, first_step, max_step
         Fixed step or None, first and longest step of step-size control (s).
     placed
         ``"automatic"`` or ``"off"``.
     arrivals
-        Whether it returns before an end beside a singular configuration.
+        Whether the kernel returns before an end next to a singular configuration.
     """
 
     def __init__(
@@ -79,118 +71,126 @@ class CompiledRun:
         self.kernel_system, self.method, self.norm = kernel_system, method, norm
         self.start, self.t0, self.t_end = state.copy(), t0, float(pieces.ends[-1])
         self.adaptive = step is None
-        eps = method.regularisation
+        options = marshalling.options_struct(
+            t0=t0,
+            step=step,
+            first_step=first_step,
+            max_step=max_step,
+            placed=placed,
+            arrivals=arrivals,
+            eps=method.regularisation,
+        )
         self._run = core.Run(  # type: ignore[union-attr]
             kernel_system,
-            {
-                "scheme": scheme_data(method.scheme),
-                "constants": CONSTANTS,
-                "norm": {
-                    "atol": np.ascontiguousarray(norm.atol),
-                    "one": np.ascontiguousarray(norm.one),
-                    "rtol": norm.rtol,
-                    "negligible": norm.negligible,
-                },
-                "memory": memory_data(memory),
-                "eps": None if eps is None else (eps.factor, eps.power),
-                "state": np.ascontiguousarray(state),
-                "t0": t0,
-                "ends": pieces.ends,
-                "first": pieces.first,
-                "last": pieces.last,
-                "given": pieces.given.astype(float),
-                "step": 0.0 if step is None else step,
-                "first_step": first_step,
-                "max_step": max_step,
-                "placement": placed,
-                "arrivals": arrivals,
-            },
+            marshalling.tableau_struct(method.scheme),
+            CONSTANTS,
+            marshalling.norm_struct(norm),
+            marshalling.state_struct(memory),
+            state,
+            marshalling.intervals_struct(pieces),
+            options,
         )
 
     def advance(self, steps: int = 0) -> int:
-        """Make ``steps`` steps (0: as many as fit in CHUNK); why it returned (CHUNK_FULL, ...)."""
+        """Make ``steps`` steps, or with 0 those of CHUNK seconds; the reason of the return
+        (CHUNK_FULL, ...)."""
         return int(self._run.advance(steps, CHUNK))
 
     def attempt_from(
-        self, t: float, state: FloatArray, memory: IntegratorState, control: dict[str, Any]
+        self, t: float, state: FloatArray, memory: IntegratorState, control: Any
     ) -> tuple[int, StepDecision | None]:
-        """One attempt from where the reference stands, for comparison with it.
+        """One attempt from a state of the reference, for comparison with it.
 
         Parameters
         ----------
         t, state, memory
             Before the attempt.
         control
-            What step-size control remembers; the keys are those of ``ControlState`` in control.hpp.
+            State of the step-size control, from
+            :func:`~srm_mbs.integration.kernel.marshalling.control_struct`.
 
         Returns
         -------
-        Why it returned (CHUNK_FULL, ...), and the verdict; None if no step was made.
+        The reason of the return (CHUNK_FULL, ...), and the decision; None if no step was made.
         """
-        stop, verdict = self._run.attempt_from(t, state, memory_data(memory), control)
-        return stop, None if verdict < 0 else VERDICTS[verdict]
+        known = marshalling.state_struct(memory)
+        stop, decision = self._run.attempt_from(t, state, known, control)
+        return stop, None if decision < 0 else DECISIONS[decision]
 
     def last(self) -> StepResult:
         """The step made last."""
-        data = dict(self._run.last())
-        threshold, history = data.pop("zone_threshold"), data.pop("history")
-        data["state_scale"] = data.pop("magnitude")
-        data["constraint_residual"] = data.pop("gap")
-        known = None if history is None else history_from(history)
-        near = None if known is None else Zone(threshold, known.predict_near, known.normals)
-        return StepResult(zone=near, history=known, multiplier=None, **data)
+        r = self._run.last()
+        history, zone = None, None
+        if r.in_zone:
+            history = marshalling.history_from(self._run.last_history())
+            zone = Zone(r.zone_threshold, history.predict_near, history.normals)
+        return StepResult(
+            t=r.t,
+            h=r.h,
+            state=r.state,
+            rates=r.rates,
+            end_rate=r.end_rate,
+            correction=r.correction,
+            error_ratio=r.error_ratio,
+            sigmas=r.sigmas,
+            rank=r.rank,
+            zone=zone,
+            history=history,
+            multiplier=None,
+            state_scale=r.state_scale,
+            quiet=r.quiet,
+            constraint_residual=r.residual,
+            held=r.held,
+        )
 
     def memory(self) -> IntegratorState:
-        """What it carries to the next step."""
-        return memory_from(self._run.memory())
+        """The state of the integrator before the next step."""
+        return marshalling.state_from(self._run.memory())
 
     def pass_breakpoint(self, passing: BreakpointHandler) -> None:
-        """Go on behind a breakpoint at which the kernel stopped.
+        """Enter the interval after a breakpoint at which the kernel returned.
 
         Raises
         ------
         ControllerError
             If the sampled controller fails.
         EvaluationError
-            If the first stage cannot be evaluated, or the motion on is not determined.
+            If the first stage cannot be evaluated, or the motion after it is not determined.
         """
         t, state = self._run.t, self._run.state
         before = self.memory()
-        known = False
+        accurate = False
         if self._run.at_breakpoint:
-            passing.enter(self._run.piece + 1, t, state)
-            with suppress(ArithmeticError):  # the reference says why
-                known = self._run.enter()
+            passing.enter(self._run.interval + 1, t, state)
+            with suppress(ArithmeticError):  # the reference raises the error that says why
+                accurate = self._run.enter()
         else:
-            passing.enter(self._run.piece, t, state)
-        if not known:
+            passing.enter(self._run.interval, t, state)
+        if not accurate:
             self.remember(passing.resolved(t, state, before))
 
     def arrive(self, passing: BreakpointHandler) -> None:
-        """Prepare for the end beside a singular configuration before which the kernel stopped."""
+        """Prepare for the end next to a singular configuration before which the kernel returned."""
         run = self._run
-        self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.piece))
+        self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.interval))
 
     def remember(self, memory: IntegratorState) -> None:
-        """Carry ``memory`` to the next step."""
-        self._run.remember(memory_data(memory))
+        """Start the next step from ``memory``."""
+        self._run.remember(marshalling.state_struct(memory))
 
     def begin(
         self, t: float, state: FloatArray, memory: IntegratorState, first_step: float
     ) -> None:
-        """Start again, from ``state`` at ``t`` (s); what was counted stays."""
-        fresh = {"h": first_step, "xi_old": 1.0, "just_rejected": False, "index": 1, "slope": 0.0,
-                 "zero": np.nan, "redo": 0.0, "redone": 0, "limit": np.inf, "tries": 0,
-                 "arrival": 0}  # fmt: skip
+        """Start again, from ``state`` at ``t`` (s); the counts of steps and evaluations stay."""
         self._run.restore(
-            {
-                "t": t,
-                "state": np.ascontiguousarray(state),
-                "memory": memory_data(memory),
-                "control": fresh,
-                "seen": driver.RESIDUAL_EXAMINED,
-                "near": singular_endpoints.NEAR_SINGULAR_SIGMA,
-            }
+            core.RunSnapshot(  # type: ignore[union-attr]
+                t=t,
+                state=state,
+                memory=marshalling.state_struct(memory),
+                control=marshalling.control_struct(h=first_step),
+                open_residual=driver.RESIDUAL_EXAMINED,
+                search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
+            )
         )
 
     def __getattr__(self, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""A mechanism in the compiled kernel, and the reference with the kernel's regular stages."""
+"""Mechanisms in the compiled kernel, their pool, and the reference with the kernel's stages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.control.step_size import initial_step
-from srm_mbs.integration.kernel.marshalling import FIRST_STEP
+from srm_mbs.integration.kernel.marshalling import (
+    CONSTANTS,
+    norm_struct,
+    state_struct,
+    system_struct,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.model.mechanism import MechanismData, per_model
 
@@ -23,12 +28,12 @@ LARGEST_KEPT = 64
 
 
 def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
-    """The kernel's twin of ``system``, with a workspace of its own."""
+    """The mechanism of ``system`` in the kernel, with a workspace of its own."""
     held = system.held
-    calls = system.calls_forces or (system.controlled and held is None)
-    controller = system.called_force if calls else None
-    assembled = system.model, system.constants(), controller
-    kernel_system = core.System(*assembled)  # type: ignore[union-attr]
+    calls = system.has_user_forces or (system.controlled and held is None)
+    controller = system.callback_force if calls else None
+    data = system_struct(system.constants())
+    kernel_system = core.System(system.model, data, controller)  # type: ignore[union-attr]
     if held is not None:
         for t, force in zip(held.times, held.values):
             kernel_system.hold(t, force, True)
@@ -36,12 +41,12 @@ def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
 
 
 def shared(system: ClosedSystem | OpenSystem) -> bool:
-    """Whether a twin of ``system`` serves every run of its mechanism: no function of the user and
-    no motion from one start is in it, and it is small enough to be kept."""
+    """Whether a kernel system of ``system`` serves every run of its mechanism: it holds no function
+    of the user and no motion from one start, and is small enough to be kept."""
     return (
         system.nv <= LARGEST_KEPT
         and system.held is None
-        and not (system.controlled or system.calls_forces or system.mechanism.drives)
+        and not (system.controlled or system.has_user_forces or system.mechanism.drives)
     )
 
 
@@ -73,7 +78,7 @@ def _idle_or_new(system: ClosedSystem | OpenSystem) -> Any:
     return make_kernel_system(system)
 
 
-class _TwinTerms:
+class _KernelTerms:
     """Terms of a regular stage, evaluated by the kernel."""
 
     rank_deficient = False
@@ -96,8 +101,8 @@ class Evaluator:
 
     Parameters
     ----------
-    system, twin
-        The mechanism, and what :func:`make_kernel_system` made of it.
+    system, kernel_system
+        The mechanism, and its kernel system from :func:`make_kernel_system`.
     """
 
     def __init__(self, system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
@@ -108,7 +113,7 @@ class Evaluator:
         return getattr(self._system, name)
 
     def between(self, first: float, last: float) -> None:
-        """Times of both within [``first``, ``last``] (s); see :mod:`..stepping.breakpoints`."""
+        """Evaluate both at times within [``first``, ``last``] (s) only: between breakpoints."""
         self._system.between(first, last)
         self._kernel_system.between(first, last)
 
@@ -124,17 +129,16 @@ class Evaluator:
         """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
         try:
             return self._kernel_system.first_step(  # type: ignore[no-any-return]
-                t, state, memory.rate, memory.state_scale, norm.atol, norm.one, norm.rtol, span,
-                order, FIRST_STEP,
-            )  # fmt: skip
-        except ArithmeticError:  # the reference says why
+                t, state, state_struct(memory), norm_struct(norm), span, order, CONSTANTS
+            )
+        except ArithmeticError:  # the reference raises the error that says why
             return initial_step(self, state, memory, norm, span, order, t)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""
         if zone is None:
             try:
-                return _TwinTerms(self._kernel_system.terms(t, state))
+                return _KernelTerms(self._kernel_system.terms(t, state))
             except ArithmeticError:
-                pass  # the reference says why
+                pass  # the reference raises the error that says why
         return self._system.evaluate(t, state, zone)

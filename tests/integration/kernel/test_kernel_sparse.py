@@ -15,6 +15,7 @@ from srm_mbs.dynamics.constraints.row_algebra import GRAPH_ORDER_ABOVE
 from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.kernel.system import make_kernel_system
 from tests.integration.kernel.test_kernel import agree
 from tests.support import reduced
@@ -70,7 +71,9 @@ def twins(mechanism: srm.Mechanism) -> tuple[ClosedSystem, Any, Any]:
     """The reference, and the kernel with the dense and with the sparse algebra."""
     system = ClosedSystem(mechanism)
     dense, sparse = (
-        kernel.core.System(system.model, system.constants() | {"algebra": choice}, None)
+        kernel.core.System(
+            system.model, system_struct(system.constants() | {"algebra": choice}), None
+        )
         for choice in ("dense", "sparse")
     )
     assert sparse.sparse
@@ -276,7 +279,7 @@ def test_it_is_chosen_for_chains_of_loops_and_not_for_single_loops() -> None:
     system = ClosedSystem(srm.load("four_bar"))
     unknown = system.constants() | {"algebra": "banded"}
     with pytest.raises(ValueError, match="auto, dense or sparse"):
-        kernel.core.System(system.model, unknown, None)
+        kernel.core.System(system.model, system_struct(unknown), None)
 
 
 @pytest.mark.usefixtures("forced")
@@ -296,7 +299,9 @@ def test_twenty_loops_pass_their_singularity_of_nullity_twenty() -> None:
 def test_sigma_falls_with_the_distance_to_the_singularity_of_a_long_chain(n: int) -> None:
     """Which columns are pivots first changes on the way there; sigma must not jump with them."""
     sparse = kernel.core.System(
-        (mechanism := srm.n_four_bar(n)).model, ClosedSystem(mechanism).constants(), None
+        (mechanism := srm.n_four_bar(n)).model,
+        system_struct(ClosedSystem(mechanism).constants()),
+        None,
     )
     angles = np.logspace(-0.5, -6.0, 60)
     slopes = [sparse.terms(0.0, flat(mechanism, angle))["sigma"] / angle for angle in angles]

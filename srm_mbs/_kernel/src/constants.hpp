@@ -1,0 +1,66 @@
+// Thresholds and gains of the integration, in one struct that Python fills (marshalling.py): each
+// has its source, and its reasons, in the module of the reference that is named here.
+#pragma once
+
+#include "struct_fields.hpp"
+
+namespace srm {
+
+#define SRM_CONSTANTS(field)                                                                       \
+    /* Branch stages and zone: methods/near_singular.py. */                                        \
+    field(double, monitored_below)         /* sigma below which steps look for singularities */    \
+    field(double, near_steps)              /* distance (steps) from which stages are projected */  \
+    field(double, far_steps)               /* distance (steps) beyond which nothing is prepared */ \
+    field(double, ambiguous_offset)        /* largest distance from the branch, over sigma */      \
+    field(double, held_tolerance)          /* part of the tolerance that held normals may cost */  \
+    field(double, position_rounding)       /* rounding of positions, at most (units) */            \
+    field(double, usual_rounding)          /* what it usually is, over position_rounding */        \
+    field(double, crossing_sigma)          /* sigma at the ends of a crossing step / its change */ \
+    field(double, lead_steps)              /* distance (steps) from which steps stay long */       \
+    field(double, largest_rounding_floor)  /* relative error of rounding that is accepted */       \
+    field(double, zone_largest)            /* largest threshold of the zone (sigma) */             \
+    field(double, count_uncertainty_above) /* change of sigma per step; see step_error */          \
+    field(double, direct_hit)              /* sigma below which any prediction is better */        \
+    field(int, max_projections)            /* Newton steps onto the branch, per stage */           \
+    field(int, min_history)                /* nodes from which the prediction is better */         \
+    /* Evaluation of all closure rows: methods/split_step.py. */                                   \
+    field(int, residual_interval)          /* accepted steps between two of them */                \
+    /* Step-size control: control/step_size.py. */                                                 \
+    field(double, safety)                                                                          \
+    field(double, min_factor)                                                                      \
+    field(double, max_factor)                                                                      \
+    field(double, proportional)            /* exponent of the last error ratio */                  \
+    field(double, integral)                /* exponent of the error ratio */                       \
+    field(double, previous_error_floor)                                                            \
+    field(double, error_floor)                                                                     \
+    field(double, failed_evaluation)       /* error ratio of a step that could not be evaluated */ \
+    field(double, rate_overflow)           /* rates from which products may overflow */            \
+    field(double, first_step_probe)        /* relative change that the first step may make */      \
+    field(double, longest_first_step)      /* over the probing step */                             \
+    /* Placement: control/placement.py. */                                                         \
+    field(double, max_sigma_change)        /* per step */                                          \
+    field(double, too_close)               /* sigma of a stage, over slope times step */           \
+    field(double, clearance)               /* from abscissae, over half the widest gap */          \
+    field(double, zero_horizon)            /* steps within which zeros of sigma are predicted */   \
+    field(int, max_placements)             /* tries per step */                                    \
+    field(double, singular_end)            /* sigma below which an end counts as singular */       \
+    field(double, arrival_sigma_change)    /* distance from which such an end is prepared for */   \
+    /* Branch guard: control/branch_guard.py. */                                                   \
+    field(double, branch_change)           /* relative change of velocity that is suspect */       \
+    field(int, max_guard_retries)          /* tries per step */                                    \
+    /* Driver: driver.py, singular_endpoints.py, breakpoints.py. */                                \
+    field(double, smallest_step)           /* over the length of the run */                        \
+    field(double, standstill)              /* progress in standstill_steps / length of run */ \
+    field(int, standstill_steps)                                                                   \
+    field(double, large_correction)        /* units */                                             \
+    field(double, open_residual)           /* of rows, before the correction */                    \
+    field(double, lost_residual)           /* of rows, after the correction */                     \
+    field(double, search_below)            /* sigma below which singularities are searched for */  \
+    field(double, search_factor)           /* fall of sigma from one search to the next */         \
+    field(double, rounding_share)          /* of the tolerance, in the first stage of a piece */
+
+struct Constants {
+    SRM_FIELDS(SRM_CONSTANTS)
+};
+
+}  // namespace srm

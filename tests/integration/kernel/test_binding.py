@@ -1,0 +1,132 @@
+"""Structs of the kernel: made by keyword, complete and of the right sizes, or not at all."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.integration.kernel import backend, marshalling
+from srm_mbs.integration.methods.base import IntegratorState
+from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+from tests.support.bundled import load
+
+pytestmark = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
+core: Any = backend.core
+
+
+def fields(struct: Any) -> dict[str, Any]:
+    """Names and values of a struct."""
+    names = [name for name in dir(type(struct)) if not name.startswith("_")]
+    return {name: getattr(struct, name) for name in names}
+
+
+def test_every_constant_has_to_be_given() -> None:
+    given = fields(marshalling.CONSTANTS)
+    assert len(given) > 40
+    assert fields(core.Constants(**given)) == given
+    for name in given:
+        with pytest.raises(TypeError, match=f"Constants.{name} is not given"):
+            core.Constants(**{key: value for key, value in given.items() if key != name})
+
+
+def test_an_unknown_field_is_refused() -> None:
+    with pytest.raises(TypeError, match="Constants has no field tolerance"):
+        core.Constants(**fields(marshalling.CONSTANTS), tolerance=1.0)
+
+
+def test_a_missing_constant_is_an_error_when_the_bridge_is_imported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Kernel:
+        @staticmethod
+        def Constants(**given: Any) -> Any:  # noqa: N802 - the name of the struct
+            del given["safety"]
+            return core.Constants(**given)
+
+    monkeypatch.setattr(marshalling, "_core", Kernel)
+    with pytest.raises(TypeError, match=r"Constants\.safety is not given"):
+        marshalling.constants()
+
+
+def test_structs_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        marshalling.CONSTANTS.safety = 1.0
+
+
+def test_values_of_another_type_are_refused() -> None:
+    given = fields(marshalling.CONSTANTS)
+    for name, value in (("safety", "much"), ("max_projections", 2.5), ("safety", None)):
+        with pytest.raises(ValueError, match=f"Constants.{name} has another type or size"):
+            core.Constants(**given | {name: value})
+
+
+def test_arrays_of_another_size_are_refused() -> None:
+    given = fields(marshalling.tableau_struct(srm.PSRM().scheme))
+    for name in ("A", "c", "error", "gap_half_widths"):
+        with pytest.raises(ValueError, match=rf"ButcherTableau\.{name} has \d+ numbers instead"):
+            core.ButcherTableau(**given | {name: given[name][1:]})
+    system = ClosedSystem(load("four_bar"))
+    given = fields(marshalling.system_struct(system.constants()))
+    for name in ("unit", "residual_scale"):
+        with pytest.raises(ValueError, match=rf"SystemData\.{name} has \d+ numbers instead"):
+            core.SystemData(**given | {name: given[name][1:]})
+    with pytest.raises(ValueError, match=re.escape("Anchor.placement has another type or size")):
+        core.Anchor(joint=1, placement=np.zeros(11))
+
+
+def test_a_state_of_another_size_is_refused() -> None:
+    system = ClosedSystem(load("four_bar"))
+    kernel_system = core.System(system.model, marshalling.system_struct(system.constants()), None)
+    for state in (np.zeros(5), np.zeros(7), np.zeros((2, 3))):
+        with pytest.raises(ValueError, match=r"state has not the shape \(6,\)"):
+            kernel_system.terms(0.0, state)
+
+
+def test_steps_of_another_shape_are_refused() -> None:
+    solution = srm.simulate(load("four_bar"), 1.0, backend="kernel")
+    steps, extension = solution.steps, solution.scheme.dense
+    given = fields(marshalling.steps_struct(steps))
+    abscissae = np.append(solution.scheme.c, 1.0)
+    for name in ("states", "rates", "sigmas", "corrections", "end_rate"):
+        array = getattr(steps, name)
+        wrong = core.StepArrays(**given | {name: np.ascontiguousarray(array[..., 1:])})
+        with pytest.raises(ValueError, match=f"StepArrays.{name} has another shape"):
+            core.DenseOutput(
+                3,
+                3,
+                abscissae,
+                marshalling.extension_struct(extension),
+                marshalling.dense_constants(),
+                wrong,
+            )
+
+
+@pytest.mark.parametrize("normals", [None, np.arange(6.0).reshape(3, 2)])
+def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) -> None:
+    values = np.arange(12.0).reshape(4, 3)
+    history = MultiplierHistory(np.arange(4.0), values, 2.5, 1e-3, normals)
+    given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7)
+    found = marshalling.state_from(marshalling.state_struct(given))
+    assert found.history is not None
+    for name in ("times", "values", "normals"):
+        np.testing.assert_array_equal(getattr(found.history, name), getattr(history, name))
+    assert (found.history.known_until, found.history.known_below) == (2.5, 1e-3)
+    assert (found.sigma, found.sigma_slope, found.steps) == (0.5, 0.25, 7)
+    np.testing.assert_array_equal(found.rate, given.rate)
+
+
+def test_a_run_is_restored_from_its_snapshot() -> None:
+    """The next steps after a snapshot are those of a run that goes on, bit by bit."""
+    mechanism = load("slider_crank_whirl")
+    runs = [srm.Simulator(mechanism, backend="kernel") for _ in range(2)]
+    for run in runs:
+        run.step(0.3)
+    again = runs[0].clone()
+    for run in (*runs, again):
+        run.step(0.4)
+    np.testing.assert_array_equal(again.q, runs[1].q)

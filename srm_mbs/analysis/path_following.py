@@ -21,6 +21,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import position_of
+from srm_mbs.model.numbers import finite_array
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = logging.getLogger(__name__)
@@ -96,17 +97,14 @@ def _dragged(mechanism: Mechanism, values: Mapping[str, Any]) -> FloatArray:
     columns = []
     for name, given in values.items():
         joint = mechanism.joint(name)
-        try:
-            array = np.atleast_1d(np.asarray(given, dtype=float))
-        except (TypeError, ValueError):
-            array = np.full(1, np.nan)
-        if joint.nv != 1 or array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+        array = finite_array(given)
+        if joint.nv != 1 or array is None or array.ndim > 1 or not array.size:
             raise InputError(
                 f"joint {name!r} cannot be dragged along {given!r}",
                 element="values",
                 remedy="Give finite numbers (rad, m) for a joint of one degree of freedom",
             )
-        columns.append(array)
+        columns.append(np.atleast_1d(array))
     if not columns or len({len(column) for column in columns}) > 1:
         raise InputError(
             f"the joints have {[len(column) for column in columns]} values",

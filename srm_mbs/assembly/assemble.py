@@ -30,6 +30,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
+from srm_mbs.model.numbers import finite_array
 
 LARGEST_CONTRADICTION = 1e-9
 """Largest difference (rad, m) between a held position and the initial value of a drive."""
@@ -124,11 +125,8 @@ def _positions(
 
 
 def _vector(values: Any, size: int, what: str) -> FloatArray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (size,) or not np.isfinite(array).all():
+    array = finite_array(values, (size,))
+    if array is None:
         raise InputError(
             f"{what} must be {size} finite numbers",
             element=what,

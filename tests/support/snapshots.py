@@ -17,9 +17,7 @@ import srm_mbs as srm
 
 MESSAGES = Path(__file__).parents[1] / "data" / "messages"
 UPDATE = "SRM_MBS_UPDATE_SNAPSHOTS"
-FOREIGN = re.compile(
-    r"((?:is not valid (?:TOML|YAML)|is not a file name): )(.*?)(?=: '|\. [A-Z])"
-)
+FOREIGN = re.compile(r"((?:is not valid (?:TOML|YAML)|is not a file name): )(.*?)(?=: '|\. [A-Z])")
 """Words of Python and its parsers, which change with their versions; the line is kept."""
 LINE = re.compile(r"line [0-9]+")
 LONGEST = 400

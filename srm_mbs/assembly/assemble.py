@@ -32,6 +32,8 @@ from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
 from srm_mbs.model.numbers import finite_array
 
+log = logging.getLogger(__name__)
+
 LARGEST_CONTRADICTION = 1e-9
 """Largest difference (rad, m) between a held position and the initial value of a drive."""
 
@@ -72,9 +74,6 @@ def with_absolute_drives(
     if len(loops) == len(mechanism.loops):
         return held, mechanism
     return held, replace(mechanism, loops=tuple(loops), drives=())
-
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,12 @@ from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.mechanism import MechanismData, per_start
 from srm_mbs.model.validation import check_inertia
 
+log = logging.getLogger(__name__)
+
 OPEN_SAMPLES = 24
+"""Random open configurations from which rows are scaled."""
 WALK_AMPLITUDE = 0.5
+"""Largest step of the walk, in units."""
 ROUNDING_ROW = 1e-12
 """Rows of one kind whose rms stays below this part of their uncancelled terms are rounding."""
 NULL = 1e-7
@@ -45,6 +49,20 @@ CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
 CLOSURE_ROUNDING = 1e-14
 """Closure error, in row units, at which Newton's iteration ends."""
+RESTARTS = 10
+WALK_STEPS = 12
+"""Walks from the start, and steps of each."""
+STRUCTURAL_PIVOT = 1e-6
+"""A pivot (of scaled rows) above this counts as independent."""
+ZERO_ROW = 1e-9
+"""A scaled row that stays below this in every closed sample is zero."""
+SMALL_REFERENCE_PIVOT = 0.1
+"""A last structural pivot with a median below this is close to zero everywhere: rows are
+eliminated and scaled anew."""
+BALANCING_SAMPLES = 12
+"""Closed configurations in which rows are measured against each other."""
+RANK_GAP = 1e3
+"""Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
 
 class ManifoldSampler:
@@ -295,23 +313,6 @@ class ManifoldSampler:
                 if closed is not None:
                     q = closed
                     yield q
-
-
-log = logging.getLogger(__name__)
-
-RESTARTS = 10
-WALK_STEPS = 12
-STRUCTURAL_PIVOT = 1e-6
-"""A pivot (of scaled rows) above this counts as independent."""
-ZERO_ROW = 1e-9
-"""A scaled row that stays below this in every closed sample is zero."""
-SMALL_REFERENCE_PIVOT = 0.1
-"""A last structural pivot with a median below this is close to zero everywhere: rows are
-eliminated and scaled anew."""
-BALANCING_SAMPLES = 12
-"""Closed configurations in which rows are measured against each other."""
-RANK_GAP = 1e3
-"""Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
 
 @dataclass(frozen=True, eq=False)

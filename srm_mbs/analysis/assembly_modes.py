@@ -18,12 +18,11 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.assemble import Assembly, assemble
-from srm_mbs.assembly.diagnosis import free_coordinates
-from srm_mbs.assembly.position import ClosureProblem, close_from, onto_singular_point
+from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.model.coordinates import coordinate_names, set_position
+from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
 
 log = logging.getLogger(__name__)
 
@@ -91,8 +90,8 @@ def _starts(
 def _apart(problem: ClosureProblem, a: FloatArray, b: FloatArray) -> float:
     """Largest difference of two configurations in units, hinges modulo whole turns."""
     away = problem.difference(a, b)
-    hinges = problem.hinges
-    away[hinges] = (away[hinges] + np.pi) % (2.0 * np.pi) - np.pi
+    periodic = problem.periodic
+    away[periodic] = (away[periodic] + np.pi) % (2.0 * np.pi) - np.pi
     return float(np.abs(away).max(initial=0.0))
 
 
@@ -160,7 +159,7 @@ def assembly_modes(
     modes: list[FloatArray] = []
     counts: list[int] = []
     for guess in _starts(problem, start, free, int(starts), int(seed)):
-        closed = close_from(problem, guess, free, SEARCH_STEPS)
+        closed = close_positions(problem, guess, free, SEARCH_STEPS)
         if not problem.closed(closed):
             continue
         closed = onto_singular_point(problem, closed, free)

@@ -20,7 +20,6 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.assemble import assemble
-from srm_mbs.assembly.diagnosis import free_coordinates
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import (
     ChartPoint,
@@ -38,7 +37,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     smallest_singular_value,
 )
 from srm_mbs.errors import AnalysisError, InputError
-from srm_mbs.model.coordinates import joint_coordinates
+from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
 
 log = logging.getLogger(__name__)
 

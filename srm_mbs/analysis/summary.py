@@ -14,7 +14,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import joint_turns, row_angles, turning_coordinates
+from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
@@ -130,7 +130,7 @@ def _angular(mechanism: Mechanism, name: str) -> list[bool]:
     """Which degrees of freedom of the joint ``name`` are angles."""
     joint = mechanism.joint(name)
     own = slice(joint.idx_v, joint.idx_v + joint.nv)
-    angular: list[bool] = turning_coordinates(mechanism.model)[own].tolist()
+    angular: list[bool] = angle_coordinates(mechanism.model)[own].tolist()
     return angular
 
 
@@ -153,7 +153,7 @@ def _joint_type(joint: Any) -> str:
 
 
 def _unit(mechanism: Mechanism, name: str) -> str:
-    return "rad" if joint_turns(mechanism.model, name) else "m"
+    return "rad" if is_angle(mechanism.model, name) else "m"
 
 
 def body_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:

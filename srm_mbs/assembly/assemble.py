@@ -16,20 +16,20 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.assembly.diagnosis import cannot_close, free_coordinates, limits_in_the_way
+from srm_mbs.assembly.diagnosis import cannot_close, limits_in_the_way
 from srm_mbs.assembly.position import (
     ClosureProblem,
+    assemble_positions,
+    assemble_within_limits,
     beyond_limits,
-    close_loops,
-    close_within_limits,
 )
-from srm_mbs.assembly.velocity import consistent_rates
+from srm_mbs.assembly.velocity import assemble_velocity
 from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
-from srm_mbs.model.coordinates import set_position, set_rate
+from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
 
 CONTRADICTS = 1e-9
 """Difference (rad, m) between a held position and where a drive begins."""
@@ -112,12 +112,12 @@ def _positions(
     limits: bool,
 ) -> FloatArray:
     free = free_coordinates(mechanism, held)
-    q = close_loops(problem, start, free)
+    q = assemble_positions(problem, start, free)
     if not problem.closed(q):
         raise cannot_close(mechanism, problem, start, held, q)
     if not limits or not beyond_limits(mechanism, q):
         return q
-    within = close_within_limits(problem, start, free)
+    within = assemble_within_limits(problem, start, free)
     if within is None:
         raise limits_in_the_way(mechanism, problem, held, q)
     return within
@@ -248,7 +248,7 @@ def assemble(
         joint = mechanism.joint(name)
         own = slice(joint.idx_q, joint.idx_q + joint.nq)
         closed[own] = start[own]
-    consistent = consistent_rates(mechanism, problem, closed, rates, held_rates)
+    consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates)
     drives = DriveRows(mechanism, problem, closed)
     free = null_basis(np.concatenate([problem.normalised(closed), drives.rows]), SINGULAR)
     residuals, rate_residuals = mechanism.with_state(closed, consistent).initial_errors

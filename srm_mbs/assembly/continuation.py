@@ -13,12 +13,14 @@ closures lose rank, branches cross; the tangent leads across.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.position import CLOSED, RANK, ClosureProblem, onto_singular_point
+from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.singularities.local_analysis import (
     analyse_singular,
     nearest_singular,
@@ -83,6 +85,10 @@ class _Point:
     s: float
 
 
+_Moved = tuple[_Point, FloatArray]
+"""A point, and its motion (n,) from where Newton's iteration began."""
+
+
 class _Follower:
     """One segment of the path, between two knots."""
 
@@ -123,24 +129,23 @@ class _Follower:
         """Newton's iteration from ``guess`` in the plane normal to ``across``: the point and how
         far it is from the guess, or None."""
         problem = self.problem
-        q, h, s = guess.q, guess.h, guess.s
-        moved, best, error = np.zeros(len(across)), None, np.inf
-        for _ in range(ITERATIONS):
-            g, G = problem.closure(q)
-            miss = h - (self.values + self.slope * (s - self.base))
-            size = max(np.abs(g).max(), np.abs(miss).max(initial=0.0))
-            if not size < error:
-                break
-            best, error = (_Point(q, h, s), float(np.linalg.norm(moved))), size
-            if size == 0.0:
-                break
-            system = np.vstack([self.rows(G), across])
-            right = np.concatenate([g, miss, [across @ moved]])
-            step = np.linalg.lstsq(system, right, rcond=RANK)[0]
-            moved = moved - step
-            q = problem.move(q, -step[:-1])
-            h, s = h - step[self.columns], s - step[-1]
-        return best if error <= CLOSED else None
+
+        def linearise(at: _Moved) -> tuple[float, Callable[[], _Moved]]:
+            point, moved = at
+            g, G = problem.closure(point.q)
+            miss = point.h - (self.values + self.slope * (point.s - self.base))
+
+            def next_point() -> _Moved:
+                system = np.vstack([self.rows(G), across])
+                right = np.concatenate([g, miss, [across @ moved]])
+                step = np.linalg.lstsq(system, right, rcond=RANK)[0]
+                q = problem.move(point.q, -step[:-1])
+                return _Point(q, point.h - step[self.columns], point.s - step[-1]), moved - step
+
+            return max(np.abs(g).max(), np.abs(miss).max(initial=0.0)), next_point
+
+        (best, moved), error = newton((guess, np.zeros(len(across))), linearise, ITERATIONS)
+        return (best, float(np.linalg.norm(moved))) if error <= CLOSED else None
 
     def advance(self, length: float, end: float) -> tuple[_Point, float] | None:
         """A step of ``length`` along the tangent, or less to s = end; its point and correction."""

@@ -6,19 +6,14 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.continuation import CLOSE, drag
-from srm_mbs.assembly.position import ClosureProblem, beyond_limits, close_loops
+from srm_mbs.assembly.position import ClosureProblem, assemble_positions, beyond_limits
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, smallest_singular_value
 from srm_mbs.errors import AssemblyError
-from srm_mbs.model.coordinates import joint_coordinates, position_of
-
-
-def free_coordinates(mechanism: Mechanism, held: Iterable[str]) -> IndexArray:
-    """Velocity indices of the joints that are not held."""
-    return np.setdiff1d(np.arange(mechanism.model.nv), joint_coordinates(mechanism, set(held)))
+from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
 
 
 def quoted(names: Iterable[str]) -> str:
@@ -26,9 +21,9 @@ def quoted(names: Iterable[str]) -> str:
     return ", ".join(repr(name) for name in names)
 
 
-def _described(gaps: Mapping[str, tuple[float | None, float | None]]) -> str:
+def _described(loop_residuals: Mapping[str, tuple[float | None, float | None]]) -> str:
     parts = []
-    for name, (gap, angle) in gaps.items():
+    for name, (gap, angle) in loop_residuals.items():
         values = [] if gap is None else [f"{gap:.3g} m"]
         values += [] if angle is None else [f"{angle:.3g} rad"]
         parts.append(f"{name}: {', '.join(values)}")
@@ -46,22 +41,22 @@ def cannot_close(
 
     ``q`` (nq,) is the closest configuration that was found.
     """
-    gaps = problem.gaps(q)
-    remaining = f"remaining gaps: {_described(gaps)}"
+    loop_residuals = problem.loop_residuals(q)
+    remaining = f"remaining gaps: {_described(loop_residuals)}"
     closings = {}
     for name in held:
         others = tuple(other for other in held if other != name)
-        closed = close_loops(problem, start, free_coordinates(mechanism, others))
+        closed = assemble_positions(problem, start, free_coordinates(mechanism, others))
         if problem.closed(closed):
             closings[name] = closed
     guilty = tuple(closings)
     if not guilty and len(held) > 1:
-        everything_free = close_loops(problem, start, free_coordinates(mechanism, ()))
+        everything_free = assemble_positions(problem, start, free_coordinates(mechanism, ()))
         guilty = held if problem.closed(everything_free) else ()
     if not guilty:
         return AssemblyError(
             f"the loops cannot be closed from this guess; {remaining}",
-            residuals=gaps,
+            residuals=loop_residuals,
             q=q,
             element="initial.guess",
             remedy="Check the anchors and link lengths, or give a guess closer to a closed "
@@ -80,7 +75,7 @@ def cannot_close(
         remedy += f"; nearest values that close, one at a time: {values}"
     return AssemblyError(
         f"the loops cannot close with the held values of {quoted(held)}; {remaining}",
-        residuals=gaps,
+        residuals=loop_residuals,
         q=q,
         held=guilty,
         nearest=nearest,
@@ -126,7 +121,7 @@ def limits_in_the_way(
     parts = [f"{name} at {at:.6g}, limit {limit:.6g}" for name, (at, limit) in beyond.items()]
     return AssemblyError(
         f"the loops close, but not within the limits of {quoted(beyond)}: {'; '.join(parts)}",
-        residuals=problem.gaps(q),
+        residuals=problem.loop_residuals(q),
         q=q,
         held=tuple(name for name in held if name in beyond),
         limits=tuple(beyond),

@@ -10,6 +10,7 @@ Position limits of joints: which are left, and closing within them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -19,9 +20,10 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
-from srm_mbs.dynamics.scaling import coordinate_units, counted_turns, row_angles
+from srm_mbs.dynamics.scaling import coordinate_units, periodic_coordinates, row_angles
 from srm_mbs.dynamics.singularities.local_analysis import refine_singular_point
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import OPEN_LIMIT, LimitSpring
@@ -38,6 +40,7 @@ FAR = 0.5
 for."""
 OTHER_STARTS = 8
 SEARCH_STEPS = 200
+POLISHING_EVALUATIONS = 61
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts when the guess itself leads nowhere."""
 
@@ -51,8 +54,8 @@ def _plain(loop: LoopClosure) -> IndexArray:
 
 
 @per_model
-def _counted_turns(mechanism: MechanismData) -> BoolArray:
-    return counted_turns(mechanism.model)
+def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
+    return periodic_coordinates(mechanism.model)
 
 
 class ClosureProblem(ClosureGeometry):
@@ -88,7 +91,7 @@ class ClosureProblem(ClosureGeometry):
                 parts += [-pin.skew(m) @ turn for m in loop.rows.matched @ R.T]
         return np.concatenate(parts)
 
-    def gaps(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
+    def loop_residuals(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
         """Gap (m) and misalignment (rad) of each loop at q; None where a type has none."""
         g = self.closure(q)[0] * self.row_unit
         angles = row_angles(self.mechanism)
@@ -120,11 +123,11 @@ class ClosureProblem(ClosureGeometry):
         return float(np.linalg.norm(self.difference(self.start, q)))
 
     @cached_property
-    def _hinges(self) -> tuple[IndexArray, IndexArray]:
+    def _periodic(self) -> tuple[IndexArray, IndexArray]:
         """Indices into q and into v of the angles of which whole turns do not matter: those of
         coupled joints do."""
         coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
-        turning = _counted_turns(self.mechanism)
+        turning = _periodic_coordinates(self.mechanism)
         in_q: list[int] = []
         in_v: list[int] = []
         for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
@@ -135,14 +138,14 @@ class ClosureProblem(ClosureGeometry):
         return np.array(in_q, dtype=int), np.array(in_v, dtype=int)
 
     @property
-    def hinges(self) -> IndexArray:
+    def periodic(self) -> IndexArray:
         """Velocity indices of the angles of which whole turns do not matter: hinges and universal
         joints."""
-        return self._hinges[1]
+        return self._periodic[1]
 
-    def unwound(self, q: FloatArray) -> FloatArray:
+    def unwrapped(self, q: FloatArray) -> FloatArray:
         """q without full turns of its hinges away from the start, except of coupled ones."""
-        own = self._hinges[0]
+        own = self._periodic[0]
         turns = np.round((q[own] - self.start[own]) / (2.0 * np.pi))
         q = q.copy()
         q[own] -= 2.0 * np.pi * turns
@@ -208,20 +211,17 @@ def _search(
 
 
 def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
-    """Gauss-Newton on the closure rows until they stop improving."""
-    g, G = problem.closure(q)
-    best, error = q, float(np.abs(g).max())
-    for _ in range(60):
-        if error == 0.0:
-            break
-        step = min_norm_solution(G[:, free], g, RANK)
-        q = problem.move(q, -step, free)
+    """Newton's iteration on the closure rows, by shortest steps of the ``free`` coordinates."""
+
+    def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray]]:
         g, G = problem.closure(q)
-        new_error = float(np.abs(g).max())
-        if not new_error < error:
-            break
-        best, error = q, new_error
-    return best
+
+        def step() -> FloatArray:
+            return problem.move(q, -min_norm_solution(G[:, free], g, RANK), free)
+
+        return float(np.abs(g).max()), step
+
+    return newton(q, linearise, POLISHING_EVALUATIONS)[0]
 
 
 def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
@@ -236,7 +236,7 @@ def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray
     return q if found is None else found
 
 
-def close_from(
+def close_positions(
     problem: ClosureProblem,
     q: FloatArray,
     free: IndexArray,
@@ -248,15 +248,15 @@ def close_from(
     ``bounds`` are the least and largest motions of these, in units.
     """
     if np.linalg.norm(problem.mismatch(q)) <= CLOSED:
-        return problem.unwound(_polish(problem, q, free))
+        return problem.unwrapped(_polish(problem, q, free))
     for near in (True, False):  # far away where loops close nowhere near, were it by rounding only
         found = _polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
         if problem.closed(found):
             break
-    return problem.unwound(found)
+    return problem.unwrapped(found)
 
 
-def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) -> FloatArray:
+def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexArray) -> FloatArray:
     """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
     if not len(free):
         return start
@@ -265,7 +265,7 @@ def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) ->
     best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
     for size in (0.0, *PERTURBATIONS):
         spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
-        q = close_from(problem, problem.move(start, spread, free), free)
+        q = close_positions(problem, problem.move(start, spread, free), free)
         if problem.closed(q):
             break
         gap = float(np.linalg.norm(problem.mismatch(q)))
@@ -280,7 +280,7 @@ def close_loops(problem: ClosureProblem, start: FloatArray, free: IndexArray) ->
         others = [-0.5 * away, -away]
         others += list(rng.uniform(-far, far, (OTHER_STARTS, len(free))))
         for other in others:
-            candidate = close_from(problem, problem.move(start, other, free), free)
+            candidate = close_positions(problem, problem.move(start, other, free), free)
             if problem.distance(candidate) < problem.distance(q) and problem.closed(candidate):
                 q = candidate
     return onto_singular_point(problem, q, free)
@@ -324,7 +324,7 @@ def beyond_limits(mechanism: MechanismData, q: FloatArray) -> dict[str, tuple[fl
     return out
 
 
-def close_within_limits(
+def assemble_within_limits(
     problem: ClosureProblem, start: FloatArray, free: IndexArray
 ) -> FloatArray | None:
     """The closed configuration nearest to ``start`` that was found within all limits, or None."""
@@ -344,7 +344,7 @@ def close_within_limits(
             if j in free:
                 q[i] = np.clip(q[i], least + inside, largest - inside)
             low[j], high[j] = (least - q[i]) / problem.unit[j], (largest - q[i]) / problem.unit[j]
-        closed = close_from(problem, q, free, bounds=(low[free], high[free]))
+        closed = close_positions(problem, q, free, bounds=(low[free], high[free]))
         # Angles count as they are: a turn more may be within the limits.
         if problem.closed(closed) and not beyond_limits(mechanism, closed):
             found.append(closed)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.assembly.diagnosis import free_coordinates, quoted
+from srm_mbs.assembly.diagnosis import quoted
 from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import (
@@ -30,6 +30,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
 )
 from srm_mbs.errors import AssemblyError
+from srm_mbs.model.coordinates import free_coordinates
 
 RATE_TOLERANCE = 1e-12
 ROUNDING, LOOSEST = 1e-14, 1e-8
@@ -43,7 +44,7 @@ CURVATURE = 1e-7
 """Largest u^T (Gdot v) of consistent rates, over the square of the rates."""
 
 
-def consistent_rates(
+def assemble_velocity(
     mechanism: Mechanism,
     problem: ClosureProblem,
     q: FloatArray,
@@ -136,7 +137,7 @@ def consistent_rates(
         )
     raise AssemblyError(
         what,
-        residuals=problem.gaps(q),
+        residuals=problem.loop_residuals(q),
         q=q,
         held=tuple(guilty),
         element="initial.v",

@@ -410,14 +410,12 @@ class ForceKinematics:
         return sum(element.energy(data, q) for element in self._elements)
 
     @property
-    def calls(self) -> bool:
+    def has_user_forces(self) -> bool:
         """Whether there are functions of the user among the elements."""
         return any(isinstance(element, _UserForceEvaluator) for element in self._elements)
 
-    def evaluate_controller(
-        self, data: pin.Data, q: FloatArray, v: FloatArray, t: float
-    ) -> FloatArray:
-        """tau (nv,) of those functions alone; ``data`` is a workspace."""
+    def user_forces(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """tau (nv,) of the functions of the user alone; ``data`` is a workspace."""
         pin.forwardKinematics(self._model, data, q, v)
         pin.computeJointJacobians(self._model, data, q)
         tau = np.zeros(self._nv)

@@ -172,7 +172,7 @@ def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
 
 
 @per_model
-def _wound_angles(mechanism: MechanismData) -> IndexArray:
+def _angle_pairs(mechanism: MechanismData) -> IndexArray:
     """Velocity indices of the joints whose angle is (cos, sin)."""
     joints = list(mechanism.model.joints)[1:]
     return np.array([j.idx_v for j in joints if (j.nq, j.nv) == (2, 1)], dtype=int)
@@ -207,8 +207,8 @@ class Manifold:
         return tuple(joint for joint in self._groups if joint.group == "se2")
 
     @cached_property
-    def _turning(self) -> IndexArray:
-        return _wound_angles(self.mechanism)
+    def _wrapped_angles(self) -> IndexArray:
+        return _angle_pairs(self.mechanism)
 
     def chart_constants(self) -> dict[str, Any]:
         """What the compiled kernel needs to know of the manifold, independent of the start."""
@@ -216,7 +216,7 @@ class Manifold:
             "position_of": [int(i) for i in self._position_of],
             "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
             "series": np.array(SERIES),
-            "turning": [int(i) for i in self._turning],
+            "turning": [int(i) for i in self._wrapped_angles],
             "largest_rotation": LARGEST_ROTATION,
             "farthest_node": FARTHEST_NODE,
             "rotation_per_step": ROTATION_PER_STEP,
@@ -260,7 +260,7 @@ class Manifold:
         moved = self.retract(start, delta)
         delta[: self.nv] += pin.difference(self.model, moved[:nq], end[:nq])
         if near is not None:
-            turning = self._turning
+            turning = self._wrapped_angles
             turns = np.round((near[turning] - delta[turning]) / (2.0 * np.pi))
             delta[turning] += 2.0 * np.pi * turns
         return delta

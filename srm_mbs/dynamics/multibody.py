@@ -97,7 +97,7 @@ class ClosedTerms:
     ) -> None:
         self._p = projection
         self._loops = loops
-        self._pushed = loops.pushed if isinstance(loops, DrivenKinematics) else None
+        self._target_rate = loops.target_rate if isinstance(loops, DrivenKinematics) else None
         self._residual_scale = residual_scale
         self.v = np.zeros(0)
         self.predicted: FloatArray | None = None
@@ -121,7 +121,7 @@ class ClosedTerms:
         return self._p.held is not None
 
     def normals(self) -> FloatArray:
-        if self._pushed is not None:
+        if self._target_rate is not None:
             return np.zeros((self.v.size, 0))
         return self._p.normals()
 
@@ -150,7 +150,9 @@ class ClosedTerms:
         """L^T (P w - s E s'): with w = v and s = 1 that of the rates that violate G v = s'."""
         p = self._p
         white = p.white_project(w)
-        return white if self._pushed is None else white - s * p.normal(self._pushed[p.order])
+        return (
+            white if self._target_rate is None else white - s * p.normal(self._target_rate[p.order])
+        )
 
     def constraint_residual(self) -> float:
         residuals = self._loops.g * self._residual_scale
@@ -214,16 +216,16 @@ class Mechanics(Manifold):
         return self._controller is not None
 
     @property
-    def calls_forces(self) -> bool:
+    def has_user_forces(self) -> bool:
         """Whether force elements are functions of the user."""
-        return self._forces is not None and self._forces.calls
+        return self._forces is not None and self._forces.has_user_forces
 
-    def called_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+    def callback_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) of the Python functions that act: the controller, unless its
         output is held, and those among the force elements."""
         tau = np.zeros(self.nv) if self.held is not None else self.controlled_force(t, q, v)
-        if self._forces is not None and self._forces.calls:
-            tau = tau + self._forces.evaluate_controller(self.data, q, v, t)
+        if self._forces is not None and self._forces.has_user_forces:
+            tau = tau + self._forces.user_forces(self.data, q, v, t)
         return tau
 
     @property
@@ -440,7 +442,7 @@ class ClosedSystem(Mechanics):
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
         own = super().constants()
-        return own if self._driven is None else own | {"drives": self._driven.moving()}
+        return own if self._driven is None else own | {"drives": self._driven.drive_constants()}
 
     def constants_of_start(self) -> dict[str, Any]:
         """As for open mechanisms, and the scales of the closures."""
@@ -540,7 +542,10 @@ class ClosedSystem(Mechanics):
         pin.crba(self.model, self.data, q, _WORLD)
         self._update(t, q, with_bias=False)
         rates = self.loops.G @ v
-        return self.loops.g.copy(), rates if self._driven is None else rates - self._driven.pushed
+        return (
+            self.loops.g.copy(),
+            rates if self._driven is None else rates - self._driven.target_rate,
+        )
 
 
 def make_system(

@@ -60,28 +60,28 @@ def row_angles(mechanism: MechanismData) -> BoolArray:
         lengths, alignments, _ = loop.rows.blocks
         out += [False] * lengths.stop + [True] * (alignments.stop - alignments.start)
         for row in loop.rows.joint_rows:
-            out.append(joint_turns(model, row.joints[0]))
+            out.append(is_angle(model, row.joints[0]))
     return np.array(out, dtype=bool)
 
 
-def joint_turns(model: pin.Model, name: str) -> bool:
+def is_angle(model: pin.Model, name: str) -> bool:
     """Whether the coordinate of a joint with one degree of freedom is an angle."""
-    return bool(turning_coordinates(model)[model.joints[model.getJointId(name)].idx_v])
+    return bool(angle_coordinates(model)[model.joints[model.getJointId(name)].idx_v])
 
 
-def turning_coordinates(model: pin.Model) -> BoolArray:
+def angle_coordinates(model: pin.Model) -> BoolArray:
     """Which velocity components (nv,) are in rad/s; the others are in m/s."""
     data = workspace(model)
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    return _turning(data)
+    return _angle_components(data)
 
 
-def counted_turns(model: pin.Model) -> BoolArray:
+def periodic_coordinates(model: pin.Model) -> BoolArray:
     """Which velocity components (nv,) belong to angles that count turns in q, while a whole turn
     leads back to the same place: those of hinges and universal joints, not those of screws."""
     out: BoolArray = np.zeros(model.nv, dtype=bool)
     joints = [(i, joint) for i, joint in enumerate(model.joints) if i and joint.nq == joint.nv]
-    turning = turning_coordinates(model)
+    turning = angle_coordinates(model)
     data = workspace(model)
     start = pin.neutral(model)
     pin.forwardKinematics(model, data, start)
@@ -99,7 +99,7 @@ def counted_turns(model: pin.Model) -> BoolArray:
 def constraint_angles(mechanism: MechanismData) -> BoolArray:
     """Which rows (rows,) are in rad, those of the drives after those of the loops."""
     driven = [
-        drive.joint is not None and joint_turns(mechanism.model, drive.joint)
+        drive.joint is not None and is_angle(mechanism.model, drive.joint)
         for drive in in_order_of_rows(mechanism.drives)
     ]
     return np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
@@ -111,7 +111,7 @@ def row_dimensions(mechanism: MechanismData) -> tuple[str, ...]:
     return tuple(unit for unit, own in (("m", ~angles), ("rad", angles)) if own.any())
 
 
-def _turning(data: pin.Data) -> BoolArray:
+def _angle_components(data: pin.Data) -> BoolArray:
     """Which velocity components (nv,) turn something, by the Jacobian in ``data``."""
     out: BoolArray = np.abs(world_jacobian(data)[3:]).max(axis=0) > 1e-9
     return out
@@ -164,7 +164,7 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     known_to = ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
     length = diagonal if diagonal > known_to else 1.0
-    coordinate = np.where(_turning(data), 1.0, length)
+    coordinate = np.where(_angle_components(data), 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
     if rate == 0.0:
         rates = np.abs(v) / coordinate

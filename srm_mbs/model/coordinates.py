@@ -112,6 +112,11 @@ def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexAr
     return np.array(indices, dtype=int)
 
 
+def free_coordinates(mechanism: MechanismData, held: Iterable[str]) -> IndexArray:
+    """Velocity indices of the joints that are not held."""
+    return np.setdiff1d(np.arange(mechanism.model.nv), joint_coordinates(mechanism, set(held)))
+
+
 def position_of(mechanism: MechanismData, q: FloatArray, name: str) -> float:
     """Position (rad or m) of the one-degree joint ``name`` in q (nq,)."""
     joint = mechanism.joint(name)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import joint_turns, row_dimensions
+from srm_mbs.dynamics.scaling import is_angle, row_dimensions
 from srm_mbs.simulation.result import SimulationResult
 
 log = logging.getLogger(__name__)
@@ -85,7 +85,7 @@ def _columns(solution: SimulationResult) -> dict[str, FloatArray]:
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         if joint.nv == 1:
-            unit = "rad" if joint_turns(mechanism.model, name) else "m"
+            unit = "rad" if is_angle(mechanism.model, name) else "m"
             positions[f"{name} ({unit})"], rates[f"{name} rate ({unit}/s)"] = solution.joint(name)
             continue
         numbered = [f"q{i}" for i in range(joint.nq)], [f"v{i}" for i in range(joint.nv)]

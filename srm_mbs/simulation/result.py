@@ -356,7 +356,7 @@ class SimulationResult(RunOutcome):
         return energy_balance(self, self._system)
 
     def _need_controller(self, what: str) -> None:
-        acting = self._system.controlled or self._system.calls_forces
+        acting = self._system.controlled or self._system.has_user_forces
         if self.settings.controlled and not acting:
             raise InputError(
                 f"the {what} of a loaded run with a controller cannot be computed: "

@@ -568,7 +568,9 @@ def assemble_result(
         placed = sum(wrapper.placed for wrapper in wrappers)
         replaced = sum(wrapper.replaced for wrapper in wrappers)
         suspects = suspected(wrappers)
-    controlled = options.controller is not None or system.calls_forces
+    # Counted before anything below reads the dense output, which evaluates stages.
+    stats = statistics(system, record, data, placed, replaced)
+    controlled = options.controller is not None or system.has_user_forces
     by = "kernel" if problem.on_kernel else "python"
     return result_type(
         mechanism,
@@ -585,7 +587,7 @@ def assemble_result(
         + method_messages(options.method, record.steps, problem.norm)
         + _limits_left(mechanism, dense)
         + _driven_too_far(mechanism, record),
-        stats=statistics(system, record, data, placed, replaced),
+        stats=stats,
         settings=settings(options, problem.norm, controlled, by),
     )
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 import srm_mbs as srm
-from srm_mbs.dynamics.scaling import counted_turns
+from srm_mbs.dynamics.scaling import periodic_coordinates
 from tests.support.mechanisms import along_x, rod
 
 Z = pin.JointModelRZ
@@ -220,4 +220,4 @@ def test_a_screw_counts_turns_that_do_not_lead_back_and_a_hinge_turns_that_do() 
         "ball": pin.JointModelSpherical(),
     }.items():
         parent = model.addJoint(parent, joint, pin.SE3.Identity(), name)
-    np.testing.assert_array_equal(counted_turns(model), [1, 0, 0, 1, 1, 0, 0, 0, 0])
+    np.testing.assert_array_equal(periodic_coordinates(model), [1, 0, 0, 1, 1, 0, 0, 0, 0])

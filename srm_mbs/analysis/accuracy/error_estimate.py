@@ -19,7 +19,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import turning_coordinates
+from srm_mbs.dynamics.scaling import angle_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.simulation.options import positive, tightest_rtol
@@ -150,7 +150,7 @@ def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -
 
 def _parts(mechanism: Mechanism) -> Iterator[tuple[str, str, IndexArray]]:
     """(joint, unit, velocity indices): the lengths and the angles of each joint."""
-    turns = turning_coordinates(mechanism.model)
+    turns = angle_coordinates(mechanism.model)
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         own = np.arange(joint.idx_v, joint.idx_v + joint.nv)

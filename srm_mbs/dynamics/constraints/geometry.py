@@ -277,7 +277,7 @@ class DrivenGeometry(ClosureGeometry):
         """(g - s) over row units (rows,), and [G, -s'] over row units times units (rows, n)."""
         pin.crba(self.model, self.data, place[:-1], pin.Convention.WORLD)
         self._update(place, with_bias=False)
-        jacobian = np.column_stack([self._rows.G, -self._rows.pushed])
+        jacobian = np.column_stack([self._rows.G, -self._rows.target_rate])
         return self._rows.g / self.row_unit, jacobian / self.row_unit[:, None] * self.unit
 
     def bias(self, place: FloatArray, u: FloatArray) -> FloatArray:

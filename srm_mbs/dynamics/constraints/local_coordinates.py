@@ -21,6 +21,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, THIRD_ORDER
 
 CLOSED = 1e-12
@@ -125,21 +126,19 @@ class TangentChart:
     def point(self, z: FloatArray) -> ChartPoint | None:
         """The closed configuration with these coordinates (k,); None if none was found."""
         geometry = self.geometry
-        u = self.basis @ z
-        best, error = None, np.inf
-        for _ in range(ITERATIONS):
-            q = geometry.move(self.q, u)
-            g, G = geometry.closure(q)
-            size = float(np.abs(g).max(initial=0.0))
-            if not size < error:
-                break
-            best, error = ChartPoint(self, q, u), size
-            if size == 0.0:
-                break
-            D = self.derivative(u)
-            moves = G @ self.complement if D is None else G @ D @ self.complement
-            u = u - self.complement @ np.linalg.lstsq(moves, g, rcond=CUT)[0]
-        return best if error <= CLOSED else None
+
+        def linearise(u: FloatArray) -> tuple[float, Callable[[], FloatArray]]:
+            g, G = geometry.closure(geometry.move(self.q, u))
+
+            def step() -> FloatArray:
+                D = self.derivative(u)
+                moves = G @ self.complement if D is None else G @ D @ self.complement
+                return u - self.complement @ np.linalg.lstsq(moves, g, rcond=CUT)[0]
+
+            return float(np.abs(g).max(initial=0.0)), step
+
+        u, error = newton(self.basis @ z, linearise, ITERATIONS)
+        return ChartPoint(self, geometry.move(self.q, u), u) if error <= CLOSED else None
 
 
 def differences(function: Callable[[FloatArray], FloatArray], steps: FloatArray) -> FloatArray:

@@ -68,7 +68,7 @@ class DrivenKinematics:
         )
         start = len(self._inner.g)
         m = start + len(self._joints)
-        self.g, self.bias, self.pushed = np.zeros(m), np.zeros(m), np.zeros(m)
+        self.g, self.bias, self.target_rate = np.zeros(m), np.zeros(m), np.zeros(m)
         self.G = np.zeros((m, model.nv))
         self._closed = slice(0, start)
         self._coordinates: list[tuple[int, int, bool, float]] = []
@@ -77,7 +77,7 @@ class DrivenKinematics:
             self.G[row, joint.idx_v] = 1.0 / size
             self._coordinates.append((row, joint.idx_q, joint.nq == 2, 1.0 / size))
         first = m - len(ordered)
-        self._moving = [
+        self._driven_rows = [
             (
                 first + k,
                 1.0 / float(scale[total - len(ordered) + k]),
@@ -100,12 +100,12 @@ class DrivenKinematics:
         """What the compiled kernel needs of the closures, those of driven points included."""
         return self._inner.constants()
 
-    def moving(self) -> list[dict[str, Any]]:
+    def drive_constants(self) -> list[dict[str, Any]]:
         """What it needs of each drive."""
         joints = {row: (k, wound) for row, k, wound, _ in self._coordinates}
         in_v = {c[0]: k for c, k in zip(self._coordinates, self._in_v)}
         drives = []
-        for row, factor, curve in self._moving:
+        for row, factor, curve in self._driven_rows:
             in_q, wound = joints.get(row, (-1, False))
             drives.append(
                 {"row": row, "factor": factor, "in_q": in_q, "in_v": in_v.get(row, -1)}
@@ -129,10 +129,10 @@ class DrivenKinematics:
 
     def move_to(self, t: float) -> None:
         """Take the motion of the drives at t (s) off the rows of :meth:`update`."""
-        for row, factor, curve in self._moving:
+        for row, factor, curve in self._driven_rows:
             s, rate, bend = curve(t)
             self.g[row] -= factor * s
-            self.pushed[row] = factor * rate
+            self.target_rate[row] = factor * rate
             self.bias[row] -= factor * bend
         for row, _, wound, factor in self._coordinates:
             if wound:  # the turn that is nearest
@@ -161,5 +161,5 @@ def constraint_errors(
         rows.update(data, q[i], with_bias=False)
         rows.move_to(t[i])
         g[i] = rows.g
-        c[i] = rows.G @ v[i] - rows.pushed
+        c[i] = rows.G @ v[i] - rows.target_rate
     return g, c

@@ -12,7 +12,7 @@ Source: docs/notation.md, "Load-time analysis".
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from scipy.linalg import lapack
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, cholesky, unwhiten, whiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
@@ -44,6 +45,8 @@ DEPENDENT = 1e-6
 """The same, below which it follows from them."""
 CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
+CLOSURE_ROUNDING = 1e-14
+"""Closure error, in row units, at which Newton's iteration ends."""
 
 
 class ManifoldSampler:
@@ -115,20 +118,23 @@ class ManifoldSampler:
         if not self.closed:
             return q, 0.0
         unit, own = self.units.coordinate, slice(self.closed)
-        for iteration in range(iterations + 1):
+
+        def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray | None]]:
             self._evaluate(q)
             g = self._rows.g[own] / self.row_unit
-            error = float(np.abs(g).max())
-            if error < 1e-14 or iteration == iterations:
-                break
-            by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
-            try:
-                longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
-                self._plain.factor(None, by_unit, CLOSING_RANK * longest)
-            except EvaluationError:
-                break
-            q = pin.integrate(self.model, q, -self._plain.solve(g) * unit)
-        return q, error
+
+            def step() -> FloatArray | None:
+                by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
+                try:
+                    longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
+                    self._plain.factor(None, by_unit, CLOSING_RANK * longest)
+                except EvaluationError:
+                    return None
+                return pin.integrate(self.model, q, -self._plain.solve(g) * unit)  # type: ignore[no-any-return]
+
+            return float(np.abs(g).max()), step
+
+        return newton(q, linearise, iterations + 1, tolerance=CLOSURE_ROUNDING, monotone=False)
 
     def set_scale(self, mechanism: MechanismData, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""

@@ -24,7 +24,7 @@ from srm_mbs.integration.methods import near_singular, split_step
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
-from srm_mbs.integration.methods.regularisation import Regularisation
+from srm_mbs.integration.methods.thesis.regularisation import Regularisation
 
 # Tests without the compiled kernel import this module, too.
 _core: Any = core

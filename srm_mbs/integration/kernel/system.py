@@ -30,8 +30,8 @@ LARGEST_KEPT = 64
 def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
     """The mechanism of ``system`` in the kernel, with a workspace of its own."""
     held = system.held
-    calls = system.calls_forces or (system.controlled and held is None)
-    controller = system.called_force if calls else None
+    calls = system.has_user_forces or (system.controlled and held is None)
+    controller = system.callback_force if calls else None
     data = system_struct(system.constants())
     kernel_system = core.System(system.model, data, controller)  # type: ignore[union-attr]
     if held is not None:
@@ -46,7 +46,7 @@ def shared(system: ClosedSystem | OpenSystem) -> bool:
     return (
         system.nv <= LARGEST_KEPT
         and system.held is None
-        and not (system.controlled or system.calls_forces or system.mechanism.drives)
+        and not (system.controlled or system.has_user_forces or system.mechanism.drives)
     )
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import coordinate_units, joint_turns
+from srm_mbs.dynamics.scaling import coordinate_units, is_angle
 from srm_mbs.errors import InputError
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
@@ -140,7 +140,7 @@ def components(run: SimulationResult, joint: str) -> Iterator[Component]:
 
     kind = data.shortname().removeprefix("JointModel")
     if data.nv == 1:
-        turns = joint_turns(mechanism.model, joint)
+        turns = is_angle(mechanism.model, joint)
         yield component("", slice(0, 1), run.joint(joint)[0][:, None], ("",), turns)
     elif kind == "FreeFlyer":
         yield component("position", slice(0, 3), q[:, :3], XYZ, turns=False)

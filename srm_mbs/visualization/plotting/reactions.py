@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srm_mbs.dynamics.scaling import joint_turns
+from srm_mbs.dynamics.scaling import is_angle
 from srm_mbs.errors import ControllerError, EvaluationError, InputError
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
@@ -148,7 +148,7 @@ def _by_loop(
         lines = {}
         for name in coupled:
             first = found[name].rows.joint_rows[0].joints[0]
-            if joint_turns(run.mechanism.model, first) == turning:
+            if is_angle(run.mechanism.model, first) == turning:
                 own = found[name].rows.joint_rows[0].coefficients[0]
                 values = -own * run.reaction_multipliers[name][:, 0]
                 lines[f"{name}, on {first}"] = values
@@ -174,7 +174,7 @@ def _by_row(
         loop = found[name]
         panels = []
         _, alignments, joints = loop.rows.blocks
-        turning = [joint_turns(run.mechanism.model, r.joints[0]) for r in loop.rows.joint_rows]
+        turning = [is_angle(run.mechanism.model, r.joints[0]) for r in loop.rows.joint_rows]
         numbers = range(loop.rows.count)
         angles = [*numbers[alignments], *(i for i, t in zip(numbers[joints], turning) if t)]
         for own, unit in (
@@ -195,7 +195,7 @@ def _by_row(
 def _drives(run: SimulationResult) -> list[Draw]:
     model = run.mechanism.model
     turning = {
-        drive.name: drive.joint is not None and joint_turns(model, drive.joint)
+        drive.name: drive.joint is not None and is_angle(model, drive.joint)
         for each in run.segments
         for drive in each.mechanism.drives
     }

@@ -23,7 +23,7 @@ PLACEMENTS = ("automatic", "off")
 
 
 def backend() -> str:
-    """What ``backend="auto"`` takes where it can: ``"kernel"`` or ``"python"``.
+    """The backend that ``backend="auto"`` takes where it can: ``"kernel"`` or ``"python"``.
 
     ``"python"`` where there is no kernel (``srm-mbs info`` says why), or where the environment
     variable SRM_MBS_BACKEND is ``python``.

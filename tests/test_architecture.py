@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -91,7 +92,7 @@ def test_no_module_imports_private_names_of_another(module: str) -> None:
             private = [
                 alias.name
                 for alias in node.names
-                if alias.name.startswith("_") and alias.asname is None
+                if re.match(r"_(?!_)", alias.name) and alias.asname is None
             ]
             assert not private, f"{module} imports {private} from {node.module}"
 

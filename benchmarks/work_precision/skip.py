@@ -218,7 +218,7 @@ def _lazy_results() -> Item:
 def _placement() -> Item:
     mechanism = srm.load("four_bar")
     run = lambda: _run(mechanism, 5.0)  # noqa: E731
-    near = lambda: patch.object(split_step, "FAR", 1e300)  # noqa: E731
+    near = lambda: patch.object(split_step, "FAR_STEPS", 1e300)  # noqa: E731
     return Item(
         "placement and zone while sigma is far", "four_bar, 5 s", run, _under(near, run), _last
     )
@@ -227,7 +227,7 @@ def _placement() -> Item:
 def _history() -> Item:
     mechanism = srm.load("four_bar")
     run = lambda: _run(mechanism, 5.0)  # noqa: E731
-    always = lambda: patch.object(split_step, "WATCHED", 1e300)  # noqa: E731
+    always = lambda: patch.object(split_step, "WATCHED_SIGMA", 1e300)  # noqa: E731
     return Item(
         "multiplier history while sigma is far", "four_bar, 5 s", run, _under(always, run), _last
     )

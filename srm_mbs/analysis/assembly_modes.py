@@ -1,8 +1,8 @@
-"""All assembly modes: the closed configurations that a mechanism has for given held joints.
+"""All assembly modes: the closed configurations of a mechanism for given held joints.
 
-Closing starts from many configurations, some structured (each joint turned by quarter turns), the
-rest random; what is found is sorted into distinct modes.  How often each was found says how sure
-it is that none is missing.
+Newton's method closes the loops from many starts, some structured (each joint rotated by quarter
+turns), the others random; its results are sorted into distinct modes.  The number of starts that
+led to each mode indicates how likely it is that none is missing.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_po
 
 log = logging.getLogger(__name__)
 
-SAME = 1e-6
-"""Largest difference (rad, scene diagonals) of two closings of one mode."""
-INDEPENDENT = 1e-6
-"""Part of a motion that holding a joint must stop to count."""
-SEARCH_STEPS = 40
-"""Of one closing: what takes longer mostly ends where nothing closes."""
-LOOKS = 3
-"""Modes that must leave the mechanism free to move before the search is given up."""
+SAME_MODE_TOLERANCE = 1e-6
+"""Largest difference (rad, scene diagonals) of two solutions of one mode."""
+INDEPENDENCE_TOLERANCE = 1e-6
+"""Smallest rate of a joint, over that of the motion, with which it moves."""
+MAX_NEWTON_STEPS = 40
+"""Most Newton steps from one start; longer iterations mostly do not converge."""
+MIN_MOVABLE_MODES = 3
+"""Number of modes in which the mechanism can move after which the search ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class AssemblyMode(Assembly):
     Attributes
     ----------
     found, starts
-        How many of the starts led to it, of how many.
+        Number of starts that led to this mode, and of all starts.
     held
         Names of the joints that were held.
     """
@@ -54,7 +54,8 @@ class AssemblyMode(Assembly):
 
 
 def _joints_to_hold(mechanism: Mechanism, problem: ClosureProblem, q: FloatArray) -> list[str]:
-    """One-degree joints, those next to the ground first, that together stop every motion at q."""
+    """Joints of one degree of freedom that together prevent every motion at q, those closest to the
+    ground first."""
     depth = {
         name: len(mechanism.model.supports[k + 1]) for k, name in enumerate(mechanism.joint_names)
     }
@@ -63,10 +64,10 @@ def _joints_to_hold(mechanism: Mechanism, problem: ClosureProblem, q: FloatArray
     for name in sorted(mechanism.joint_names, key=lambda name: depth[name]):
         joint = mechanism.joint(name)
         row = rest[joint.idx_v]
-        if joint.nv > 1 or not np.linalg.norm(row) > INDEPENDENT:
+        if joint.nv > 1 or not np.linalg.norm(row) > INDEPENDENCE_TOLERANCE:
             continue
         chosen.append(name)
-        # What is left moves without it: the complement of its row.
+        # The motions that remain: the null space of its row.
         rest = rest @ np.linalg.svd(row[None])[2][1:].T
     return chosen
 
@@ -80,7 +81,7 @@ def _starts(
     for angle in (np.pi, 0.5 * np.pi, -0.5 * np.pi):
         shifts += list(angle * np.eye(len(free)))
     for k in range(count):
-        # At most half of them structured.
+        # At most half of them are structured.
         if k < min(len(shifts), count // 2):
             yield problem.move(q, shifts[k], free)
         else:
@@ -88,7 +89,7 @@ def _starts(
 
 
 def _apart(problem: ClosureProblem, a: FloatArray, b: FloatArray) -> float:
-    """Largest difference of two configurations in units, hinges modulo whole turns."""
+    """Largest difference of two configurations in units, angles of hinges modulo 2 pi."""
     away = problem.difference(a, b)
     periodic = problem.periodic
     away[periodic] = (away[periodic] + np.pi) % (2.0 * np.pi) - np.pi
@@ -103,7 +104,7 @@ def assembly_modes(
     starts: int = 200,
     seed: int = 0,
 ) -> list[AssemblyMode]:
-    """All closed configurations that were found with some joints held.
+    """Find all closed configurations with some joints held.
 
     Parameters
     ----------
@@ -111,17 +112,18 @@ def assembly_modes(
         Joint name -> position that is held (as for :func:`srm_mbs.assemble`); the others start from
         the initial configuration.
     hold
-        Further joints that keep their initial position.  If neither is given, as many one-degree
-        joints as there are degrees of freedom are held, those next to the ground first.
+        Further joints that keep their initial position.  If neither is given, as many joints of one
+        degree of freedom as the mechanism has degrees of freedom are held, those closest to the
+        ground first.
     starts, seed
-        Number of configurations from which closing starts, and seed of the random ones among them.
+        Number of starts, and seed of the random ones among them.
 
     Returns
     -------
     list of AssemblyMode
-        At rest, the one nearest to the initial configuration first; hinge angles within half a turn
-        of it.  Each says how often it was ``found``: where one was found only a few times, more may
-        be missing, and more ``starts`` would tell.  Empty if nothing closes.
+        At rest, the one closest to the initial configuration first; hinge angles within half a turn
+        of it.  If one was ``found`` from few starts only, others may be missing; more ``starts``
+        find them.  Empty if no configuration closes.
 
     Raises
     ------
@@ -139,7 +141,7 @@ def assembly_modes(
         raise InputError(
             f"seed = {seed!r} is not a natural number", element="seed", remedy="Give 0, 1, 2 ..."
         )
-    mechanism = mechanism.undriven  # modes are those of the loops
+    mechanism = mechanism.undriven  # modes are those of the loops alone
     if not mechanism.loops:
         raise InputError(
             "a mechanism without loops has no assembly modes",
@@ -159,17 +161,17 @@ def assembly_modes(
     modes: list[FloatArray] = []
     counts: list[int] = []
     for guess in _starts(problem, start, free, int(starts), int(seed)):
-        closed = close_positions(problem, guess, free, SEARCH_STEPS)
+        closed = close_positions(problem, guess, free, MAX_NEWTON_STEPS)
         if not problem.closed(closed):
             continue
         closed = onto_singular_point(problem, closed, free)
         distances = [_apart(problem, closed, mode) for mode in modes]
-        if distances and min(distances) < SAME:
+        if distances and min(distances) < SAME_MODE_TOLERANCE:
             counts[int(np.argmin(distances))] += 1
             continue
         modes.append(closed)
         counts.append(1)
-        if len(modes) >= LOOKS:
+        if len(modes) >= MIN_MOVABLE_MODES:
             _check_isolated(mechanism, problem, modes, free, held)
     if modes:
         _check_isolated(mechanism, problem, modes, free, held)
@@ -196,14 +198,14 @@ def _check_isolated(
     bases = [tangent_basis(problem, mode, free)[0] for mode in modes]
     least = min(bases, key=lambda basis: basis.shape[1])
     everything = np.arange(mechanism.model.nv)
-    # A singular mode can be isolated though the closures seem to let it move.
+    # A singular mode can be isolated although its tangent space has more directions.
     singular = all(
         tangent_basis(problem, mode, everything)[0].shape[1] > mechanism.degrees_of_freedom
         for mode in modes
     )
-    if not least.shape[1] or (singular and len(modes) < LOOKS):
+    if not least.shape[1] or (singular and len(modes) < MIN_MOVABLE_MODES):
         return
-    moving = np.flatnonzero(np.linalg.norm(least, axis=1) > INDEPENDENT)
+    moving = np.flatnonzero(np.linalg.norm(least, axis=1) > INDEPENDENCE_TOLERANCE)
     labels = coordinate_names(mechanism)
     what = f"with {', '.join(held)} held" if held else "with no joint held"
     raise InputError(

@@ -1,11 +1,11 @@
-r"""Static equilibria: where gravity, force elements and closures balance at rest.
+r"""Static equilibria: configurations in which gravity, force elements and closures balance.
 
 In minimal coordinates z around the current configuration
 (:mod:`srm_mbs.dynamics.constraints.local_coordinates`) the forces at rest are Q(z) = S^T f, S the
 velocities per unit z', and an equilibrium has Q = 0.  With K = -dQ/dz, the Hessian of the potential
-where there is one, *stable* equilibria are searched by trust-region steps (K + mu) p = Q that the
-forces do work on, the *nearest* one by Levenberg-Marquardt steps on Q.  S^T f = S^T M v', with the
-constrained acceleration v' at rest.
+if there is one, *stable* equilibria are found by trust-region steps (K + mu) p = Q along which the
+forces do positive work, the *nearest* one by Levenberg-Marquardt steps on Q.  S^T f = S^T M v',
+with the constrained acceleration v' at rest.
 """
 
 from __future__ import annotations
@@ -41,22 +41,25 @@ from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
 
 log = logging.getLogger(__name__)
 
-ITERATIONS = 150
+MAX_ITERATIONS = 150
 LARGEST_STEP = 0.5
-"""Of the trust region: rad, scene diagonals."""
-FARTHEST = 30.0
-"""Way downhill, in these units, after which there is no bottom: some turns of a crank."""
-CONVERGED = 1e-13
-"""Last Newton step, in these units."""
+"""Largest radius of the trust region, rad and scene diagonals."""
+MAX_TRAVEL = 30.0
+"""Length of descent (rad, scene diagonals) after which the potential has no minimum: some turns of
+a crank."""
+STEP_TOLERANCE = 1e-13
+"""Largest last Newton step, rad and scene diagonals."""
 SMALLEST_STEP = 1e-9
-"""Trust region at which only rounding is left of the work done by a step."""
-NEUTRAL = 1e-8
-"""Stiffness over inertia times the squared characteristic rate that counts as zero."""
-BALANCED = 1e-7
-"""Largest force left at an equilibrium, over stiffness and inertia times that squared rate."""
-NEAR_SINGULAR = 1e-5
+"""Step (rad, scene diagonals) whose work is rounding."""
+NEUTRAL_STIFFNESS = 1e-8
+"""Stiffness that is regarded as zero, over inertia times the squared characteristic rate."""
+FORCE_TOLERANCE = 1e-7
+"""Largest residual force at an equilibrium, over the larger of stiffness and inertia times the
+squared characteristic rate."""
+SINGULAR_TOLERANCE = 1e-5
 """Singular value of the closures below which an equilibrium is a singular configuration."""
-REACH = 1e-3
+SINGULAR_RADIUS = 1e-3
+"""Distance (rad, scene diagonals) within which this singular configuration is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,21 +73,22 @@ class Equilibrium:
     multipliers : {loop: (rows,)}, reactions : {loop: (6,)}
         As ``reaction_multipliers`` and ``reactions`` of a solution, at rest.
     holding : {joint: (n,)}
-        Forces (N, N m) that hold the held joints.
+        Forces (N, N m) at the held joints.
     residual
-        Largest force left on a motion of the mechanism (N m; N times the scene diagonal).
+        Largest residual force on a motion of the mechanism (N m; N times the scene diagonal).
     eigenvalues : (k,)
-        Of the stiffness over the mass matrix on the closures, 1/s^2, rising: the squared
-        circular frequencies of small undamped oscillations.
+        Generalised eigenvalues of stiffness and mass matrix on the closures, 1/s^2, ascending: the
+        squared circular frequencies of small undamped oscillations.
     modes : (nv, k)
         Their joint motions; the largest entry, in units, is 1.
     stable
-        Whether all eigenvalues are positive; True too where nothing can move.
+        Whether all eigenvalues are positive; also True if nothing can move.
     neutral
-        Whether one of them is zero: there are equilibria, or nearly so, next to this one.
+        Whether an eigenvalue is zero: neighbouring configurations are equilibria as well, or
+        nearly.
     singular
-        Whether q is a singular configuration.  Then ``eigenvalues`` and ``stable`` hold on the
-        branch that the search came along.
+        Whether q is a singular configuration.  ``eigenvalues`` and ``stable`` then refer to the
+        branch of the search.
     """
 
     q: FloatArray
@@ -108,18 +112,18 @@ class _Statics:
         self.system = make_system(mechanism)
         self.rate = mechanism.structure.units.rate
         self.rest = np.zeros(mechanism.model.nv)
-        self.sense = 1.0  # -1 turns every hill into a valley
+        self.sense = 1.0  # -1 reverses the forces: maxima of the potential become minima
         self.basis, _ = tangent_basis(self.geometry, q, free)
 
     def chart(self, q: FloatArray) -> TangentChart:
-        """Minimal coordinates around q; at a singular configuration along the branch so far."""
+        """Minimal coordinates around q; at a singular configuration along the previous branch."""
         basis, _ = tangent_basis(self.geometry, q, self.free)
         if basis.shape == self.basis.shape:
             self.basis = basis
         return TangentChart(self.geometry, q, self.basis, self.free)
 
     def unbalanced(self, q: FloatArray) -> FloatArray:
-        """M v' (nv,) at rest, in units: what accelerates the mechanism along its closures."""
+        """M v' (nv,) at rest, in units: the force that accelerates the mechanism."""
         state = np.concatenate([q, self.rest])
         rate = self.system.evaluate(0.0, state).rate()[len(self.rest) :]
         self.geometry.closure(q)
@@ -158,7 +162,7 @@ class _Statics:
         return float(self.rate**2 * inertia)
 
     def imbalance(self, q: FloatArray) -> float:
-        """Largest force left, over stiffness and over inertia times the squared rate."""
+        """Largest residual force, over stiffness or inertia times the squared rate."""
         chart = self.chart(q)
         if not chart.size:
             return 0.0
@@ -180,16 +184,16 @@ def _work(statics: _Statics, chart: TangentChart, p: FloatArray) -> float | None
 
 
 def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
-    """Trust-region steps on which the forces do work, until they are Newton's and vanish."""
+    """Trust-region steps along which the forces do work, until Newton steps converge."""
     reach, travelled = 0.1, 0.0
-    for _ in range(ITERATIONS):
-        if travelled > FARTHEST:
+    for _ in range(MAX_ITERATIONS):
+        if travelled > MAX_TRAVEL:
             break
         chart = statics.chart(q)
         Q, K = statics.force(statics.at(chart, np.zeros(chart.size))), statics.stiffness(chart)
         K = 0.5 * (K + K.T)
         values, vectors = np.linalg.eigh(K)
-        floor = NEUTRAL * statics.force_unit(chart)
+        floor = NEUTRAL_STIFFNESS * statics.force_unit(chart)
         along = vectors.T @ Q
         if values.min(initial=0.0) > -floor:
             soft = (np.abs(values) <= floor) & (np.abs(along) <= floor)
@@ -198,7 +202,7 @@ def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
             newton = np.full(len(values), np.inf)
         if np.abs(newton).max(initial=0.0) <= reach:
             p = vectors @ newton
-            if np.abs(p).max(initial=0.0) <= CONVERGED:
+            if np.abs(p).max(initial=0.0) <= STEP_TOLERANCE:
                 return q
         else:
             p = vectors @ _bounded(values, along, reach)
@@ -227,7 +231,7 @@ def _bounded(values: FloatArray, along: FloatArray, reach: float) -> FloatArray:
     along = along.copy()
     lowest = float(values[0])
     scale = max(float(np.abs(values).max()), float(np.abs(along).max()) / reach, 1e-100)
-    # On top of a hill nothing pulls: leave it along the steepest direction.
+    # At a maximum the force is zero: leave it along the direction of lowest stiffness.
     along[0] += np.copysign(1e-8 * scale * reach, along[0])
 
     def excess(mu: float) -> float:
@@ -242,15 +246,15 @@ def _bounded(values: FloatArray, along: FloatArray, reach: float) -> FloatArray:
 
 
 def _nearest(statics: _Statics, start: FloatArray) -> FloatArray:
-    """By Levenberg-Marquardt steps; where these stay in a hollow of |Q|, down or up the hill."""
+    """Levenberg-Marquardt steps; if they end in a local minimum of |Q|, descent or ascent."""
     found = _balance(statics, start)
-    if statics.imbalance(found) <= BALANCED:
+    if statics.imbalance(found) <= FORCE_TOLERANCE:
         return found
     ends = []
     for statics.sense in (1.0, -1.0):
         with suppress(AnalysisError):
             end = _descend(statics, start)
-            if statics.imbalance(end) <= BALANCED:
+            if statics.imbalance(end) <= FORCE_TOLERANCE:
                 ends.append(end)
     statics.sense = 1.0
     distances = [np.linalg.norm(statics.geometry.difference(start, end)) for end in ends]
@@ -262,13 +266,13 @@ def _balance(statics: _Statics, q: FloatArray) -> FloatArray:
     damping = 1e-3
     chart = statics.chart(q)
     Q = statics.force(statics.at(chart, np.zeros(chart.size)))
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         K = statics.stiffness(chart)
         left, values, right = np.linalg.svd(K)
-        soft = NEUTRAL * statics.force_unit(chart)
+        soft = NEUTRAL_STIFFNESS * statics.force_unit(chart)
         used = values > soft
         size = np.inf
-        while size > CONVERGED:
+        while size > STEP_TOLERANCE:
             mu = damping * values[0] if len(values) else 0.0
             inverse = np.where(used, values / (values**2 + mu**2 + (values == 0.0)), 0.0)
             p = right.T @ (inverse * (left.T @ Q))
@@ -295,21 +299,21 @@ def equilibrium(
     hold: str | Iterable[str] = (),
     search: Literal["stable", "nearest"] = "stable",
 ) -> Equilibrium:
-    """A configuration in which the mechanism stays at rest.
+    """Find a configuration in which the mechanism stays at rest.
 
-    Gravity, springs, bushings, constant torques and wrenches act, and what follows a law over time
-    as it is at t = 0; damping and friction do not, at rest (friction is smooth here, and holds
-    nothing for ever).
+    Gravity, springs, bushings, constant torques and wrenches act, and elements with a law over time
+    at their value for t = 0.  Damping and friction vanish at rest (smooth friction has no
+    sticking).
 
     Parameters
     ----------
     q : (nq,) or {joint: position}
-        Where the search starts; by default the initial configuration.
+        The start of the search; by default the initial configuration.
     hold
         Joints that keep their position.
     search
-        ``"stable"`` goes downhill, to a stable equilibrium; ``"nearest"`` solves for zero forces
-        and finds unstable ones too.
+        ``"stable"`` descends to a stable equilibrium; ``"nearest"`` solves for zero forces, and
+        also finds unstable equilibria.
 
     Raises
     ------
@@ -339,7 +343,7 @@ def equilibrium(
     statics = _Statics(mechanism, start.q, free)
     found = (_descend if search == "stable" else _nearest)(statics, start.q)
     left = statics.imbalance(found)
-    if left > BALANCED:
+    if left > FORCE_TOLERANCE:
         raise AnalysisError(
             "no equilibrium was found: at the best configuration the forces still accelerate the "
             f"mechanism by {left:.1e} of what they can",
@@ -347,9 +351,9 @@ def equilibrium(
             remedy="Give another start",
         )
     geometry, rank = statics.geometry, mechanism.structure.rank
-    singular = rank > 0 and smallest_singular_value(geometry, found, rank) < NEAR_SINGULAR
+    singular = rank > 0 and smallest_singular_value(geometry, found, rank) < SINGULAR_TOLERANCE
     if singular:
-        exact = nearest_singular(geometry, found, rank, REACH)
+        exact = nearest_singular(geometry, found, rank, SINGULAR_RADIUS)
         found = found if exact is None else exact
     return _described(mechanism, statics, found, held, bool(singular))
 
@@ -376,8 +380,8 @@ def _described(
     point = statics.at(chart, np.zeros(chart.size))
     shapes = point.slopes @ vectors
     shapes = shapes / np.abs(shapes).max(axis=0, initial=0.0)
-    neutral = bool(np.any(np.abs(values) <= NEUTRAL * statics.rate**2))
-    # M v' = f - G^T lam is left for the held joints to carry, up to closures they share it with.
+    neutral = bool(np.any(np.abs(values) <= NEUTRAL_STIFFNESS * statics.rate**2))
+    # M v' = f - G^T lam is balanced by the held joints, up to loads shared with closures.
     columns = joint_coordinates(mechanism, held)
     _, G = geometry.closure(q)
     rest = statics.unbalanced(q)

@@ -1,12 +1,12 @@
 r"""Inverse dynamics on closures: the forces of chosen joints for a prescribed motion.
 
-With the velocities N that keep the loops closed, and the acceleration a_0 that the mechanism has
-without actuators in the same state, M a + nle - forces = S^T tau - G^T lam becomes
+With a basis N of the velocities that keep the loops closed, and the acceleration a_0 of the
+mechanism without actuators in the same state, M a + nle - forces = S^T tau - G^T lam becomes
 
     N^T S^T tau = N^T M (a - a_0),
 
-without the multipliers.  Where there are more actuators than degrees of freedom the tau of least
-weighted norm is taken.
+which does not contain the multipliers.  With more actuators than degrees of freedom, tau has least
+weighted norm.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.simulation.options import numbers
 from srm_mbs.simulation.result import SimulationResult
 
-TOLERANCE = 1e-6
-"""Default of ``tolerance``."""
-ACTUATES = 1e-12
-"""Relative singular value below which the actuators do not move a direction."""
+MOTION_TOLERANCE = 1e-6
+"""Default of ``tolerance``: relative error of the motion, and of its forces."""
+RANK_TOLERANCE = 1e-12
+"""Relative singular value below which the actuators do not act on a direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class InverseDynamics:
-    """Forces that a motion needs.
+    """Forces of the actuators for a motion.
 
     Attributes
     ----------
@@ -49,9 +49,9 @@ class InverseDynamics:
     torques : (n, na)
         Their forces, N m and N.
     power : (n,) W
-        What they give to the mechanism.
+        Power that they transfer to the mechanism.
     residual : (n,)
-        Force that the actuators could not give, over the largest that the motion needs.
+        Missing force that the actuators cannot exert, over the largest that the motion needs.
     """
 
     t: FloatArray
@@ -67,7 +67,7 @@ class InverseDynamics:
 
     @property
     def reactions(self) -> Mapping[str, FloatArray]:
-        """Per loop (n, 6), as ``solution.reactions``; computed when first read."""
+        """Per loop (n, 6), as ``solution.reactions``; computed on first use."""
         return self._computed[0]
 
     @property
@@ -77,7 +77,7 @@ class InverseDynamics:
 
 
 def _arrays(parts: Callable[[], Iterable[Any]]) -> list[FloatArray]:
-    """The parts of a motion; none if they are no numbers."""
+    """The arrays of a motion; empty if they are not numeric."""
     try:
         return [np.array(part, dtype=float) for part in parts()]
     except (TypeError, ValueError):
@@ -87,7 +87,7 @@ def _arrays(parts: Callable[[], Iterable[Any]]) -> list[FloatArray]:
 def _motion(
     mechanism: Mechanism, motion: Any, t: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """t (n,), q (n, nq), v (n, nv), a (n, nv) of what was given."""
+    """t (n,), q (n, nq), v (n, nv), a (n, nv) of a motion in any of its forms."""
     nq, nv = mechanism.model.nq, mechanism.model.nv
     if isinstance(motion, SimulationResult):
         if (motion.mechanism.model.nq, motion.mechanism.model.nv) != (nq, nv):
@@ -135,36 +135,36 @@ def inverse_dynamics(
     *,
     t: Any = None,
     weights: Any = None,
-    tolerance: float = TOLERANCE,
+    tolerance: float = MOTION_TOLERANCE,
 ) -> InverseDynamics:
-    """The forces of the actuated joints that a motion needs.
+    """Compute the forces of the actuated joints for a motion.
 
     Parameters
     ----------
     mechanism
         Its gravity, force elements, damping and friction act as well.
     motion
-        A run (:class:`~srm_mbs.api.Solution`; its controller is part of what is to be
-        found), arrays (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t
-        that returns q, v, a.
+        A run (:class:`~srm_mbs.Solution`; the forces include that of its controller), arrays
+        (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t that returns q,
+        v, a.
     actuated
         Names of the joints with actuators; by default all joints.
     t : (n,) s
-        Times for a function, or to read a run at.
+        Times of a function or a run.
     weights : (na,)
-        Where the forces are not unique, the sum of weight times force squared is least; ones by
-        default, 1/N^2 m^2 and 1/N^2.
+        If the forces are not unique, the sum of weight times squared force is minimal; by default
+        ones, 1/(N m)^2 and 1/N^2.
     tolerance
-        Largest error of the motion against the closures, over units and rates, and largest force
-        that the actuators may leave, over the largest needed.
+        Largest error of the motion in the closures, over units and rates, and largest missing
+        force, over the largest needed.
 
     Raises
     ------
     InputError
-        If the motion violates the closures, stands on a singular configuration, or needs forces
-        that the actuated joints cannot give.
+        If the motion violates the closures, includes a singular configuration, or needs forces that
+        the actuated joints cannot exert.
     """
-    mechanism = mechanism.undriven  # the actuators take the place of drives
+    mechanism = mechanism.undriven  # the actuators replace the drives
     times, q, v, a = _motion(mechanism, motion, t)
     names = mechanism.joint_names if actuated is None else actuated
     columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
@@ -200,7 +200,7 @@ def inverse_dynamics(
         right = inertia @ ((a[i] - own) / unit)
         needed = max(needed, *np.abs(right), *np.abs(inertia @ (a[i] / unit)), 0.0)
         reach = basis[columns].T * (unit[columns] / np.sqrt(weight))
-        found = np.linalg.lstsq(reach, right, rcond=ACTUATES)[0]
+        found = np.linalg.lstsq(reach, right, rcond=RANK_TOLERANCE)[0]
         torques[i] = found / np.sqrt(weight)
         missing[i] = np.abs(reach @ found - right).max(initial=0.0)
     residual = missing / needed if needed else missing
@@ -231,9 +231,9 @@ def _check_motion(
     a: FloatArray,
     tolerance: float,
 ) -> None:
-    """Refuse positions, rates u and accelerations a, in units, that the closures forbid."""
+    """Refuse positions, rates u and accelerations a, in units, that violate the closures."""
     g, G = geometry.closure(q)
-    # At rest what is left is rounding: it counts against the mechanism's own rate.
+    # At rest the error is rounding: it is compared with the characteristic rate.
     rate = structure_of(geometry.mechanism).units.rate
     speed = max(float(np.abs(u).max(initial=0.0)), rate)
     bias = geometry.bias(q, u) * geometry.row_size

@@ -35,13 +35,14 @@ from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = logging.getLogger(__name__)
 
-CLOSED, TANGENT = 1e-9, 1e-9
-"""Largest closure error and rate of the state, over units."""
-SMOOTH = 0.01
-"""Part of the friction speed that differences of rates stay below."""
-INDEPENDENT = 1e-6
-"""Smallest singular value of a choice of coordinates that determine the others."""
+CONSTRAINT_TOLERANCE, RATE_TOLERANCE = 1e-9, 1e-9
+"""Largest closure error of the state and its rate, over units."""
+FRICTION_STEP = 0.01
+"""Largest difference of rates, over the friction speed."""
+INDEPENDENCE_TOLERANCE = 1e-6
+"""Smallest singular value of coordinates that determine the others."""
 FRAMES = 120
+"""Default number of frames of a mode shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ class Linearisation:
 
     @property
     def eigenvalues(self) -> Any:
-        """Those of A (2 k,), complex, 1/s."""
+        """Eigenvalues of A (2 k,), complex, 1/s."""
         return self._eigen[0]
 
     @cached_property
@@ -97,7 +98,7 @@ class Linearisation:
         shapes = self.to_joints @ self._eigen[1][:k]
         largest = np.argmax(np.abs(shapes) / unit[:, None], axis=0)
         size = shapes[largest, range(shapes.shape[1])] / unit[largest]
-        # A mode in which no joint moves has no shape: only rates, of a double eigenvalue zero.
+        # A mode without joint motion has rates only: it belongs to a double eigenvalue zero.
         return shapes / np.where(size == 0.0, 1.0, size)
 
     @property
@@ -121,9 +122,9 @@ class Linearisation:
         return bool(np.all(self.eigenvalues.real < -1e-9 * size))
 
     def mode_shape(self, mode: int, amplitude: float = 0.2, frames: int = FRAMES) -> JointMotion:
-        """One period of a mode as a motion that can be played, every frame closed.
+        """One period of a mode as a motion that can be animated, with closed loops in every frame.
 
-        Without its growth or decay, so that it can repeat.
+        Growth and decay are left out, so that it can be repeated.
 
         Parameters
         ----------
@@ -158,7 +159,7 @@ class Linearisation:
             )
         turning = abs(float(self.eigenvalues[mode].imag))
         period = 2.0 * np.pi / turning if turning > 0.0 else 1.0
-        # Joint shapes are L^-1 of the coordinates' own: pick those back.
+        # Coordinates of the shape: z = L times the joint motion.
         shape = self.chart.left @ (self.modes[:, mode] / self.chart.geometry.unit)
         phases = np.linspace(0.0, 2.0 * np.pi, frames + 1)
         configurations = []
@@ -185,7 +186,7 @@ def _chosen(mechanism: Mechanism, basis: FloatArray, names: Iterable[str] | None
     smallest = (
         np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) if len(chosen) == k else 0.0
     )
-    if smallest < INDEPENDENT:
+    if smallest < INDEPENDENCE_TOLERANCE:
         raise InputError(
             f"{len(chosen)} coordinates of these joints do not determine the {k} degrees of "
             "freedom here",
@@ -205,23 +206,22 @@ def linearise(
     coordinates: str | Iterable[str] | None = None,
     step: float = TAU,
 ) -> Linearisation:
-    """Linearise the motion of a mechanism at a state.
+    """Linearise the equations of motion of a mechanism at a state.
 
     Parameters
     ----------
     mechanism
-        Gravity, force elements, joint damping and (smoothed) friction act; what follows a law over
-        time, as it is at t = 0.
+        Gravity, force elements, joint damping and (smoothed) friction act; elements with a law over
+        time at their value for t = 0.
     q : (nq,), v : (nv,)
         The state, with closed loops and consistent rates.  By default the initial state; at rest
         if only q is given.
     controller
-        A law tau(t, q, v) that acts as well, at t = 0: the closed loop is linearised.
+        A control law tau(t, q, v), at t = 0, with which the closed loop is linearised.
     inputs
         Names of the joints whose forces are the inputs of B; all joints by default.
     coordinates
-        Names of joints that shall be the coordinates z; chosen among those that move most by
-        default.
+        Names of the joints whose positions are z; by default those that move most.
     step
         Step of the differences, rad or scene diagonals; their error is proportional to its sixth
         power.
@@ -279,14 +279,14 @@ def linearise(
     rough = mechanism.model.friction > 0.0
     reach = np.abs(unit[:, None] * velocities)[rough].max(initial=0.0)
     if reach > 0.0:
-        size = min(size, SMOOTH * mechanism.friction_speed / (reach * step))
+        size = min(size, FRICTION_STEP * mechanism.friction_speed / (reach * step))
     steps = step * np.concatenate([np.ones(k), np.full(k, size)])
     scale = np.tile(unit[chosen], 2)
     A = differences(field, steps) * scale[:, None] / scale
     names = mechanism.joint_names if inputs is None else inputs
     columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
     drift = field(np.zeros(2 * k)) * scale
-    # The last evaluation was at the state: its factorisation gives the response to forces.
+    # The factorisation at the state gives the response to forces.
     terms = system.evaluate(0.0, np.concatenate([q, v]))
     U = cholesky(pin.crba(mechanism.model, workspace(mechanism.model), q))
     pushed = unwhiten(U, whiten(U, np.asfortranarray(np.eye(nv)[:, columns])))
@@ -311,7 +311,9 @@ def linearise(
 def _check_state(geometry: ClosureGeometry, q: FloatArray, v: FloatArray) -> None:
     g, G = geometry.closure(q)
     rate = np.abs(G @ (v / geometry.unit)).max(initial=0.0)
-    if np.abs(g).max(initial=0.0) > CLOSED or rate > TANGENT * max(1.0, np.abs(v).max()):
+    if np.abs(g).max(initial=0.0) > CONSTRAINT_TOLERANCE or rate > RATE_TOLERANCE * max(
+        1.0, np.abs(v).max()
+    ):
         raise InputError(
             f"the state is not consistent: closure error {np.abs(g).max():.1e}, rate {rate:.1e} "
             "(over units)",

@@ -1,4 +1,7 @@
-"""Dragging joints through given values, on one branch; see :mod:`srm_mbs.assembly.continuation`."""
+"""Paths of a mechanism whose joints are dragged through given values, on one branch.
+
+The continuation method is in :mod:`srm_mbs.assembly.continuation`.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +21,13 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import position_of
+from srm_mbs.model.numbers import finite_array
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = logging.getLogger(__name__)
 
-KEPT = 0.9
-"""Smallest cosine between neighbouring tangents on one branch."""
+BRANCH_COSINE = 0.9
+"""Smallest cosine between successive tangents on one branch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,27 +42,27 @@ class PathPoint:
 
 @dataclass(frozen=True, eq=False)
 class FollowedPath:
-    """What following held values gave.
+    """A path along which joints were dragged.
 
     Attributes
     ----------
     mechanism
-        What was moved.
+        The mechanism.
     q : (m, nq)
         Configurations at the first m of the given values; all of them if it is ``complete``.
     complete
         Whether all values were reached.
     limit
-        Where the dragged joints go no further (a turning point of the path); None if the path is
+        Turning point of the path, beyond which the dragged joints cannot move; None if the path is
         complete.
     singular
-        Singular configurations on the way, in order.
+        Singular configurations on the path, in order.
     branch_kept
-        Whether the tangent turned but little from each configuration to the next.
+        Whether the angle between the tangents of successive configurations was always small.
     path : (k, nq)
-        All configurations on the way.
+        All configurations on the path.
     message
-        How it ended.
+        The end of the path, as a sentence.
     """
 
     mechanism: Mechanism
@@ -71,7 +75,7 @@ class FollowedPath:
     message: str
 
     def motion(self, duration: float = 3.0) -> JointMotion:
-        """The path over ``duration`` (s), to be played.
+        """The path as a motion of ``duration`` (s), which can be animated.
 
         Raises
         ------
@@ -93,17 +97,14 @@ def _dragged(mechanism: Mechanism, values: Mapping[str, Any]) -> FloatArray:
     columns = []
     for name, given in values.items():
         joint = mechanism.joint(name)
-        try:
-            array = np.atleast_1d(np.asarray(given, dtype=float))
-        except (TypeError, ValueError):
-            array = np.full(1, np.nan)
-        if joint.nv != 1 or array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+        array = finite_array(given)
+        if joint.nv != 1 or array is None or array.ndim > 1 or not array.size:
             raise InputError(
                 f"joint {name!r} cannot be dragged along {given!r}",
                 element="values",
                 remedy="Give finite numbers (rad, m) for a joint of one degree of freedom",
             )
-        columns.append(array)
+        columns.append(np.atleast_1d(array))
     if not columns or len({len(column) for column in columns}) > 1:
         raise InputError(
             f"the joints have {[len(column) for column in columns]} values",
@@ -119,10 +120,10 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     Parameters
     ----------
     values
-        Joint name -> positions (n,) (rad, m; angles count turns) that are followed in their order,
-        in straight lines.  The joints go to the first of them from where they are.
+        Joint name -> positions (n,) (rad, m; angles unwrapped) that are reached in order, along
+        straight lines, from the start to the first of them.
     q : (nq,)
-        Where to start; by default the initial configuration.
+        The start; by default the initial configuration.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     AssemblyError
         If the start cannot be closed.
     """
-    mechanism = mechanism.undriven  # what is dragged takes the place of drives
+    mechanism = mechanism.undriven  # dragged joints replace the drives
     wanted = _dragged(mechanism, values)
     if not mechanism.loops:
         raise InputError(
@@ -165,7 +166,7 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     singular = tuple(PathPoint(named(met.values), met.q, met.loops) for met in found.met)
     limit = None if found.complete else PathPoint(named(found.values[-1]), found.path[-1])
     reached = found.q[1:].copy()
-    for k, name in enumerate(values):  # exactly as given
+    for k, name in enumerate(values):  # without rounding
         joint = mechanism.joint(name)
         if joint.nq == 1:
             reached[:, joint.idx_q] = wanted[: len(reached), k]
@@ -177,7 +178,7 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
         found.complete,
         limit,
         singular,
-        found.cosine > KEPT,
+        found.cosine > BRANCH_COSINE,
         found.path,
         message,
     )

@@ -109,7 +109,7 @@ def joint_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         v = [_without_noise(value) for value in mechanism.v0[joint.idx_v : joint.idx_v + joint.nv]]
-        rate = f"{v[0]:.6g} {_unit(mechanism, name)}/s" if joint.nv == 1 else _vector(v)
+        rate = f"{v[0]:.6g} {_unit(mechanism, name)}/s" if joint.nv == 1 else vector_text(v)
         yield name, _joint_type(joint), position_text(mechanism, name, mechanism.q0), rate
 
 
@@ -117,7 +117,7 @@ def position_text(mechanism: Mechanism, name: str, q: FloatArray) -> str:
     """Position of the joint ``name`` in q (nq,), with its unit if it has one degree of freedom."""
     joint = mechanism.joint(name)
     if joint.nv > 1:
-        return _vector(map(_without_noise, q[joint.idx_q : joint.idx_q + joint.nq]))
+        return vector_text(map(_without_noise, q[joint.idx_q : joint.idx_q + joint.nq]))
     return f"{_without_noise(position_of(mechanism, q, name)):.6g} {_unit(mechanism, name)}"
 
 
@@ -139,7 +139,7 @@ def _in_units(values: FloatArray, angular: list[bool], units: list[str]) -> str:
     if len(angular) == 1:
         return f"{values[0]:.6g} {units[not angular[0]]}"
     parts = groupby(zip(angular, values.tolist()), itemgetter(0))
-    return ", ".join(f"{_vector(x for _, x in own)} {units[not angle]}" for angle, own in parts)
+    return ", ".join(f"{vector_text(x for _, x in own)} {units[not angle]}" for angle, own in parts)
 
 
 def _without_noise(value: float) -> float:
@@ -165,7 +165,7 @@ def body_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
             links.setdefault(int(frame.parentJoint), []).append(frame.name)
     for k, name in enumerate(mechanism.joint_names, start=1):
         inertia = model.inertias[k]
-        centre = _vector(map(_without_noise, inertia.lever)) + " m" if inertia.mass else ""
+        centre = vector_text(map(_without_noise, inertia.lever)) + " m" if inertia.mass else ""
         yield ", ".join(links.get(k, ())), name, f"{inertia.mass:.6g} kg", centre
 
 
@@ -220,7 +220,7 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
                     angular = BUSHING_ANGULAR if joint is None else _angular(mechanism, joint)
                     text, units = _in_units(np.atleast_1d(value), angular, units), [""]
                 elif isinstance(value, tuple):
-                    text = _vector(value)
+                    text = vector_text(value)
                 elif callable(value):
                     text = getattr(value, "__name__", "of the user")
                 values.append(f"{key.name} {text} {units[0]}".rstrip())
@@ -232,7 +232,7 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
     for drive in mechanism.drives:
         place = drive.joint or ""
         if drive.a is not None and drive.b is not None:
-            along = "distance" if drive.axis is None else f"along {_vector(drive.axis)}"
+            along = "distance" if drive.axis is None else f"along {vector_text(drive.axis)}"
             place = f"{_anchor(drive.a)}, {_anchor(drive.b)}, {along}"
         values = []
         for key in fields(drive.law):  # type: ignore[arg-type]
@@ -240,7 +240,7 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
             if isinstance(value, tuple) and len(value) > MAX_LISTED:
                 values.append(f"{key.name} {value[0]:.6g} .. {value[-1]:.6g} ({len(value)})")
             elif value is not None:
-                text = _vector(value) if isinstance(value, tuple) else f"{value:.6g}"
+                text = vector_text(value) if isinstance(value, tuple) else f"{value:.6g}"
                 values.append(f"{key.name} {text}")
         values += ["absolute"] if drive.absolute else []
         yield drive.name, drive.law.type, place, ", ".join(values)
@@ -249,11 +249,12 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
 def _anchor(anchor: Anchor) -> str:
     text = anchor.where
     if any(anchor.xyz):
-        text += f" xyz {_vector(anchor.xyz)} m"
+        text += f" xyz {vector_text(anchor.xyz)} m"
     if any(anchor.rpy):
-        text += f" rpy {_vector(anchor.rpy)} rad"
+        text += f" rpy {vector_text(anchor.rpy)} rad"
     return text
 
 
-def _vector(values: Iterable[float]) -> str:
+def vector_text(values: Iterable[float]) -> str:
+    """``values`` as ``[1, 0.5, 0]``."""
     return f"[{', '.join(f'{value:.6g}' for value in values)}]"

@@ -1,8 +1,8 @@
-"""Consistent initial states: close the loops, then make the rates fit.
+"""Consistent initial states: positions that close the loops, then velocities that keep them closed.
 
-Positions come from :mod:`srm_mbs.assembly.position`, rates from :mod:`srm_mbs.assembly.velocity`.
-
-Where drives begin that prescribe positions and not only motions.
+Positions come from :mod:`srm_mbs.assembly.position`, velocities from
+:mod:`srm_mbs.assembly.velocity`.  Drives that prescribe positions, not only motions from the
+initial ones, hold their coordinates where their laws begin.
 """
 
 from __future__ import annotations
@@ -30,16 +30,19 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
+from srm_mbs.model.numbers import finite_array
 
-CONTRADICTS = 1e-9
-"""Difference (rad, m) between a held position and where a drive begins."""
+log = logging.getLogger(__name__)
+
+LARGEST_CONTRADICTION = 1e-9
+"""Largest difference (rad, m) between a held position and the initial value of a drive."""
 
 
 def with_absolute_drives(
     mechanism: Mechanism, start: FloatArray, held: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Mechanism]:
-    """Put what absolute drives begin with: joints into ``start`` and ``held``, points into the
-    loops of the mechanism.
+    """Hold absolute drives at their initial values: joints in ``start`` and ``held``, points by
+    additional loops of the mechanism.
 
     Raises
     ------
@@ -54,9 +57,9 @@ def with_absolute_drives(
         if drive.joint is None:
             loops.append(drive.frozen(value))
             continue
-        wanted = start.copy()
-        set_position(mechanism, wanted, drive.joint, value)
-        if drive.joint in held and np.abs(wanted - start).max() > CONTRADICTS:
+        driven = start.copy()
+        set_position(mechanism, driven, drive.joint, value)
+        if drive.joint in held and np.abs(driven - start).max() > LARGEST_CONTRADICTION:
             raise AssemblyError(
                 f"the held position of {drive.joint!r} contradicts the drive {drive.name!r}, "
                 f"which begins at {value:.6g}",
@@ -66,14 +69,11 @@ def with_absolute_drives(
                 element="initial.q",
                 remedy="Free it, or remove absolute from the drive: its law then begins there",
             )
-        start[:] = wanted
+        start[:] = driven
         held = (*held, *(() if drive.joint in held else (drive.joint,)))
     if len(loops) == len(mechanism.loops):
         return held, mechanism
     return held, replace(mechanism, loops=tuple(loops), drives=())
-
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +124,8 @@ def _positions(
 
 
 def _vector(values: Any, size: int, what: str) -> FloatArray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (size,) or not np.isfinite(array).all():
+    array = finite_array(values, (size,))
+    if array is None:
         raise InputError(
             f"{what} must be {size} finite numbers",
             element=what,

@@ -7,8 +7,8 @@ values H(s), straight from knot to knot (at s = 0, 1, ...), the path solves
 
 followed by pseudo-arclength continuation: a step along the tangent, Newton's iteration across it
 (E. Allgower, K. Georg, *Introduction to Numerical Continuation Methods*, SIAM 2003, chapters 2, 6).
-Where dh/ds of the tangent vanishes, the path turns back: the joints go no further.  Where the
-closures lose rank, branches cross; the tangent leads across.
+Where dh/ds of the tangent vanishes, the path turns back: the joints reach no further value.  Where
+the closures lose rank, branches cross; the path continues along its tangent.
 """
 
 from __future__ import annotations
@@ -19,7 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.assembly.position import CLOSED, RANK, ClosureProblem, onto_singular_point
+from srm_mbs.assembly.position import (
+    CONSTRAINT_TOLERANCE,
+    RANK_TOLERANCE,
+    ClosureProblem,
+    onto_singular_point,
+)
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.singularities.local_analysis import (
     analyse_singular,
@@ -51,7 +56,7 @@ class Met:
 
 @dataclass(frozen=True, eq=False)
 class Drag:
-    """How far the dragged coordinates came.
+    """The path of the dragged coordinates, up to where it ended.
 
     Attributes
     ----------
@@ -138,14 +143,14 @@ class _Follower:
             def next_point() -> _Moved:
                 system = np.vstack([self.rows(G), across])
                 right = np.concatenate([g, miss, [across @ moved]])
-                step = np.linalg.lstsq(system, right, rcond=RANK)[0]
+                step = np.linalg.lstsq(system, right, rcond=RANK_TOLERANCE)[0]
                 q = problem.move(point.q, -step[:-1])
                 return _Point(q, point.h - step[self.columns], point.s - step[-1]), moved - step
 
             return max(np.abs(g).max(), np.abs(miss).max(initial=0.0)), next_point
 
         (best, moved), error = newton((guess, np.zeros(len(across))), linearise, ITERATIONS)
-        return (best, float(np.linalg.norm(moved))) if error <= CLOSED else None
+        return (best, float(np.linalg.norm(moved))) if error <= CONSTRAINT_TOLERANCE else None
 
     def advance(self, length: float, end: float) -> tuple[_Point, float] | None:
         """A step of ``length`` along the tangent, or less to s = end; its point and correction."""

@@ -1,4 +1,5 @@
-"""Why loops do not close: which, how far, and what is in the way."""
+"""Diagnosis of loops that do not close: their residuals, and the held joints or limits that
+prevent it."""
 
 from __future__ import annotations
 

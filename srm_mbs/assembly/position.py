@@ -1,11 +1,11 @@
-r"""Closing loops: the closure equations of a mechanism as a root-finding problem.
+r"""Assembly of positions: the closure equations as a root-finding problem.
 
-Two stages on the configuration manifold: a trust-region least-squares solve from the guess
-(SciPy), whose residual has the intended closing as its only zero, and Gauss-Newton on the closure
-rows to round-off.  The guess chooses the branch: where the closing found lies far from it, others
-are looked for and the nearest is taken.
+It has two stages on the configuration manifold: a trust-region least-squares solve from the guess
+(SciPy), whose residual has the intended closed configuration as its only zero, and Newton's
+iteration on the closure rows to round-off.  The guess determines the branch: if the closed
+configuration that was found lies far from it, others are searched and the nearest is the result.
 
-Position limits of joints: which are left, and closing within them.
+The last part is about position limits of joints: which are violated, and assembly within them.
 """
 
 from __future__ import annotations
@@ -29,24 +29,29 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import OPEN_LIMIT, LimitSpring
 from srm_mbs.model.mechanism import MechanismData, per_model
 
-CLOSED = 1e-12
+CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
-RANK = 1e-10
+AXES_TOLERANCE = 1e-6
+"""Largest mismatch of an assembled state: larger ones have axes in the opposite sense."""
+RANK_TOLERANCE = 1e-10
 """Relative singular value below which a direction does not move the closures."""
 NEARLY_SINGULAR = 1e-4
-"""Singular value below which a closing may be an inaccurate singular one."""
+"""Singular value below which a closed configuration may be an inaccurate singular one."""
 FAR = 0.5
-"""Motion of a joint (rad, scene diagonals) from the guess beyond which nearer closings are looked
-for."""
+"""Motion of a joint (rad, scene diagonals) from the guess beyond which nearer closed configurations
+are searched."""
 OTHER_STARTS = 8
+"""Random starts of that search."""
 SEARCH_STEPS = 200
+"""Evaluations of the trust-region solve."""
 POLISHING_EVALUATIONS = 61
+"""Evaluations of Newton's iteration after it."""
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
-"""Sizes (rad, scene diagonals) of the restarts when the guess itself leads nowhere."""
+"""Sizes (rad, scene diagonals) of the restarts if the search from the guess itself fails."""
 
 
 def _plain(loop: LoopClosure) -> IndexArray:
-    """The rows of ``loop`` whose only zeros are the intended closing."""
+    """The rows of ``loop`` whose only zeros are the intended closed configurations."""
     lengths, alignments, joints = loop.rows.blocks
     rows = np.arange(loop.rows.count)
     turns = () if len(loop.rows.matched) else rows[alignments]
@@ -59,10 +64,11 @@ def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
 
 
 class ClosureProblem(ClosureGeometry):
-    """Closure equations of a mechanism, and how far it is from the intended closing."""
+    """The closure equations of a mechanism, and the distance from the intended closed state."""
 
     def mismatch(self, q: FloatArray) -> FloatArray:
-        """Closing residual whose only zero is the intended closing: gaps and axis differences."""
+        """Residual whose only zeros are the intended closed configurations: distances (in units)
+        and differences of axes."""
         g, _ = self.closure(q)
         parts, at = [], 0
         for loop in self.mechanism.loops:
@@ -92,7 +98,7 @@ class ClosureProblem(ClosureGeometry):
         return np.concatenate(parts)
 
     def loop_residuals(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
-        """Gap (m) and misalignment (rad) of each loop at q; None where a type has none."""
+        """Distance (m) and misalignment (rad) of each loop at q; None where a type has none."""
         g = self.closure(q)[0] * self.row_unit
         angles = row_angles(self.mechanism)
         out = {}
@@ -101,7 +107,7 @@ class ClosureProblem(ClosureGeometry):
             own = slice(at, at + loop.rows.count)
             at = own.stop
             rows, turned = g[own][_plain(loop)], angles[own][_plain(loop)]
-            gap = float(np.linalg.norm(rows[~turned])) if not turned.all() else None
+            apart = float(np.linalg.norm(rows[~turned])) if not turned.all() else None
             angle = float(np.linalg.norm(rows[turned])) if turned.any() else None
             if len(loop.rows.matched):
                 Ta, Tb = self._anchors(loop)
@@ -111,7 +117,7 @@ class ClosureProblem(ClosureGeometry):
                 angle = float(np.max(2.0 * np.arcsin(np.minimum(0.5 * chords, 1.0))))
             elif len(loop.rows.alignments):
                 angle = float(np.max(np.arcsin(np.minimum(np.abs(rows[turned]), 1.0))))
-            out[loop.name] = (gap, angle)
+            out[loop.name] = (apart, angle)
         return out
 
     def _anchors(self, loop: LoopClosure) -> tuple[pin.SE3, pin.SE3]:
@@ -124,8 +130,8 @@ class ClosureProblem(ClosureGeometry):
 
     @cached_property
     def _periodic(self) -> tuple[IndexArray, IndexArray]:
-        """Indices into q and into v of the angles of which whole turns do not matter: those of
-        coupled joints do."""
+        """Indices into q and into v of the periodic angles: a whole turn leads to the same
+        configuration.  Those of coupled joints are not among them."""
         coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
         turning = _periodic_coordinates(self.mechanism)
         in_q: list[int] = []
@@ -139,12 +145,11 @@ class ClosureProblem(ClosureGeometry):
 
     @property
     def periodic(self) -> IndexArray:
-        """Velocity indices of the angles of which whole turns do not matter: hinges and universal
-        joints."""
+        """Velocity indices of the periodic angles: hinges and universal joints."""
         return self._periodic[1]
 
     def unwrapped(self, q: FloatArray) -> FloatArray:
-        """q without full turns of its hinges away from the start, except of coupled ones."""
+        """q with its periodic angles within half a turn of those at the start."""
         own = self._periodic[0]
         turns = np.round((q[own] - self.start[own]) / (2.0 * np.pi))
         q = q.copy()
@@ -152,9 +157,11 @@ class ClosureProblem(ClosureGeometry):
         return q
 
     def closed(self, q: FloatArray) -> bool:
-        """Whether every loop is closed as intended, axes in the right sense."""
+        """Whether every loop is closed, with axes in the intended sense."""
         g, _ = self.closure(q)
-        return float(np.abs(g).max()) <= CLOSED and float(np.abs(self.mismatch(q)).max()) < 1e-6
+        return float(np.abs(g).max()) <= CONSTRAINT_TOLERANCE and (
+            float(np.abs(self.mismatch(q)).max()) < AXES_TOLERANCE
+        )
 
 
 def _search(
@@ -166,16 +173,16 @@ def _search(
     *,
     near: bool,
 ) -> FloatArray:
-    """Least-squares solve of the closing residual over the free coordinates, from q.
+    """Least-squares solve of :meth:`ClosureProblem.mismatch` over the free coordinates, from q.
 
-    To round-off: next to closings that are not isolated, or where G loses rank, convergence is
-    slow, and stopping early would leave the rest to Newton's steps, which may lead anywhere.
+    It converges to round-off: next to closed configurations that are not isolated, or where G
+    loses rank, convergence is slow, and Newton's iteration from a point further away may diverge.
 
-    Along directions that do not move the closures SciPy's trust region goes as far as it reaches,
-    to the side that rounding chooses.  With ``near``, Levenberg's damping, rows for the step with
-    the size of the residual, keeps such closings next to q (Yamashita, Fukushima: On the rate of
-    convergence of the Levenberg-Marquardt method, 2001); it vanishes with the residual, whose zeros
-    stay.
+    Along directions that do not move the closures SciPy's steps are as long as the trust region,
+    with a sign that rounding determines.  With ``near``, Levenberg's damping, additional rows for
+    the step with the size of the residual, keeps the solution next to q (Yamashita, Fukushima: On
+    the rate of convergence of the Levenberg-Marquardt method, 2001); it vanishes with the residual,
+    whose zeros remain.
     """
     from scipy.optimize import least_squares
 
@@ -191,7 +198,7 @@ def _search(
         at_end = problem.mismatch_jacobian(here) / problem.unit
         out: FloatArray = ((at_end @ chart) * problem.unit)[:, free]
         if near:
-            damping = max(float(np.linalg.norm(problem.mismatch(here))), CLOSED)
+            damping = max(float(np.linalg.norm(problem.mismatch(here))), CONSTRAINT_TOLERANCE)
             out = np.vstack([out, damping * np.eye(len(free))])
         return out
 
@@ -217,7 +224,7 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
         g, G = problem.closure(q)
 
         def step() -> FloatArray:
-            return problem.move(q, -min_norm_solution(G[:, free], g, RANK), free)
+            return problem.move(q, -min_norm_solution(G[:, free], g, RANK_TOLERANCE), free)
 
         return float(np.abs(g).max()), step
 
@@ -225,12 +232,12 @@ def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatAr
 
 
 def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
-    """Sharpen a double root of g; q itself where this does not help."""
+    """The singular configuration next to q, to round-off (g has a double root there); else q."""
     rows = problem.normalised(q)[:, free]
     if not smallest_singular_value(rows, 1e-13) < NEARLY_SINGULAR:
         return q
     rank = int(np.sum(np.linalg.svd(rows, compute_uv=False) > NEARLY_SINGULAR))
-    # A regular closing close to a singular one must stay: g may not become larger.
+    # A regular configuration close to a singular one is kept: g must not become larger.
     closed = max(2e-15, float(np.abs(problem.closure(q)[0]).max()))
     found = refine_singular_point(problem, q, rank, NEARLY_SINGULAR, closed, free)
     return q if found is None else found
@@ -243,13 +250,13 @@ def close_positions(
     steps: int = SEARCH_STEPS,
     bounds: tuple[Any, Any] = (-np.inf, np.inf),
 ) -> FloatArray:
-    """Where closing leads from q (nq,) while the ``free`` coordinates move; closed or not.
+    """The result of assembly from q (nq,) over the ``free`` coordinates, closed or not.
 
     ``bounds`` are the least and largest motions of these, in units.
     """
-    if np.linalg.norm(problem.mismatch(q)) <= CLOSED:
+    if np.linalg.norm(problem.mismatch(q)) <= CONSTRAINT_TOLERANCE:
         return problem.unwrapped(_polish(problem, q, free))
-    for near in (True, False):  # far away where loops close nowhere near, were it by rounding only
+    for near in (True, False):  # without damping where no configuration near q is closed
         found = _polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
         if problem.closed(found):
             break
@@ -286,8 +293,8 @@ def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexAr
     return onto_singular_point(problem, q, free)
 
 
-SLACK = 1e-9
-"""What rounding may take a joint beyond its limit, rad or m."""
+LIMIT_TOLERANCE = 1e-9
+"""Largest excess (rad or m) over a position limit that counts as rounding."""
 CONTACT = 100.0
 """Angular frequency of a default contact over the mechanism's characteristic rate."""
 DAMPING_RATIO = 0.1
@@ -317,9 +324,9 @@ def beyond_limits(mechanism: MechanismData, q: FloatArray) -> dict[str, tuple[fl
     """Joint name -> (its position in q (nq,), the limit that it is beyond), rad or m."""
     out = {}
     for name, i, _, low, high in _limited(mechanism):
-        if q[i] < low - SLACK:
+        if q[i] < low - LIMIT_TOLERANCE:
             out[name] = (float(q[i]), low)
-        elif q[i] > high + SLACK:
+        elif q[i] > high + LIMIT_TOLERANCE:
             out[name] = (float(q[i]), high)
     return out
 
@@ -345,7 +352,7 @@ def assemble_within_limits(
                 q[i] = np.clip(q[i], least + inside, largest - inside)
             low[j], high[j] = (least - q[i]) / problem.unit[j], (largest - q[i]) / problem.unit[j]
         closed = close_positions(problem, q, free, bounds=(low[free], high[free]))
-        # Angles count as they are: a turn more may be within the limits.
+        # Angles are not unwrapped: one turn more may be within the limits.
         if problem.closed(closed) and not beyond_limits(mechanism, closed):
             found.append(closed)
     return min(found, key=problem.distance, default=None)

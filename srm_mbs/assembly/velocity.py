@@ -1,4 +1,4 @@
-r"""Rates that fit the closures of a closed configuration.
+r"""Assembly of velocities: rates that satisfy the closures of a closed configuration.
 
 They solve G v = s', the rates of the drives, 0 in the rows of the loops.  Where the configuration
 is singular, that is not enough: a motion through it also has u^T (Gdot v - s'') = 0 for every left
@@ -22,7 +22,7 @@ from srm_mbs.dynamics.constraints.row_algebra import (
     smallest_singular_value,
 )
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.singularities.branch_limit import TELLS_THE_BRANCH, BranchLimit, branch_limit
+from srm_mbs.dynamics.singularities.branch_limit import BRANCH_RESOLUTION, BranchLimit, branch_limit
 from srm_mbs.dynamics.singularities.local_analysis import (
     SINGULAR,
     SingularConfiguration,
@@ -33,11 +33,12 @@ from srm_mbs.errors import AssemblyError
 from srm_mbs.model.coordinates import free_coordinates
 
 RATE_TOLERANCE = 1e-12
-ROUNDING, LOOSEST = 1e-14, 1e-8
+"""Largest |G v - s'| of assembled rates, in units per second."""
+CLOSURE_ROUNDING, LARGEST_RATE_ERROR = 1e-14, 1e-8
 """Closure error of q, which over the distance from a singular configuration is an error of G v, and
 the largest such error: the square root of round-off."""
 AT_REST = 1e-14
-"""Part of the given rates up to which what remains of them is rounding."""
+"""Part of the given rates below which the fitted rates are rounding of zero."""
 EXACTLY, NEARLY = 1e-12, 1e-3
 """Singular values of G, rows over their usual size, between which rates come from the branch."""
 CURVATURE = 1e-7
@@ -56,9 +57,9 @@ def assemble_velocity(
     Parameters
     ----------
     mechanism, problem
-        What moves, and its closures.
+        The mechanism and its closure equations.
     q : (nq,), v : (nv,)
-        A configuration with closed loops, and the rates asked for.
+        A configuration with closed loops, and the requested rates.
     held
         Joints whose rates stay as in ``v``.
 
@@ -70,7 +71,7 @@ def assemble_velocity(
     drives = DriveRows(mechanism, problem, q)
     _, G = problem.closure(q)
     G = np.concatenate([G, drives.rows])
-    asked = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
+    prescribed = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
     normalised = np.concatenate([problem.normalised(q), drives.rows])
     conditions, close = _conditions(mechanism, problem, q, drives)
     fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
@@ -82,7 +83,7 @@ def assemble_velocity(
         for _ in range(2):  # the second pass removes the rounding of the first
             u[free] -= moved.solve(to.rows @ u - to.right)
         if np.abs(u).max() <= AT_REST * fastest:
-            u[:] = 0.0  # what is left is rounding, which has no direction
+            u[:] = 0.0  # rounding, which has no direction
         return _onto_tangent(u, free, moved.null, to.curvature)
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
@@ -97,12 +98,12 @@ def assemble_velocity(
             linear = replace(conditions, curvature=lambda u: np.zeros(0))
             nearest = fit(start, free, linear)
             closest = start if nearest is None else nearest
-            return start, float(np.abs(G @ closest - asked).max()), False
-        return u, float(np.abs(G @ u - asked).max()), True
+            return start, float(np.abs(G @ closest - prescribed).max()), False
+        return u, float(np.abs(G @ u - prescribed).max()), True
 
     # Next to a singular configuration q lies off its branch by round-off over the distance.
     smallest = min(smallest_singular_value(normalised, EXACTLY), 1.0)
-    tolerance = max(RATE_TOLERANCE, min(ROUNDING / smallest, LOOSEST))
+    tolerance = max(RATE_TOLERANCE, min(CLOSURE_ROUNDING / smallest, LARGEST_RATE_ERROR))
     tolerance *= max(1.0, fastest)
 
     def consistent(error: float, moves: bool) -> bool:
@@ -147,7 +148,7 @@ def assemble_velocity(
 
 @dataclass(frozen=True, eq=False)
 class _Conditions:
-    """What the rates u (nv,) of a motion, in units, satisfy: rows u = right, curvature(u) = 0."""
+    """Conditions on the rates u (nv,), in units, of a motion: rows u = right, curvature(u) = 0."""
 
     rows: FloatArray
     right: FloatArray
@@ -157,13 +158,13 @@ class _Conditions:
 def _with_drives(
     rows: FloatArray, drives: DriveRows, curvature: Callable[[FloatArray], FloatArray]
 ) -> _Conditions:
-    """Those of the closures, rows u = 0, and of the drives."""
+    """The conditions of the closures, rows u = 0, and of the drives."""
     right = np.concatenate([np.zeros(len(rows)), drives.rates])
     return _Conditions(np.concatenate([rows, drives.rows]), right, curvature)
 
 
 def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Conditions:
-    """Those on one branch next to a singular configuration: the normal part vanishes."""
+    """The conditions on one branch next to a singular configuration: u has no normal part."""
     normal = limit.projector * unit / unit[:, None]
     return _with_drives(normal, drives, lambda u: np.zeros(0))
 
@@ -171,8 +172,8 @@ def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Cond
 def _conditions(
     mechanism: Mechanism, problem: ClosureProblem, q: FloatArray, drives: DriveRows
 ) -> tuple[_Conditions, SingularConfiguration | None]:
-    """The conditions at q, and the singular configuration so close to q that rates choose the
-    branch and not q."""
+    """The conditions at q, and the singular configuration if q is so close to one that the rates
+    determine the branch instead of q."""
     normalised = problem.normalised(q)
     left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
 
@@ -191,7 +192,7 @@ def _conditions(
         return here, None
     close = analyse_singular(problem, found, rank)
     away = problem.difference(found, q)
-    if np.linalg.norm(away) > TELLS_THE_BRANCH:
+    if np.linalg.norm(away) > BRANCH_RESOLUTION:
         limit = branch_limit(close, q, away)
         return (here if limit is None else _on_branch(limit, problem.unit, drives)), None
     return _with_drives(problem.normalised(found), drives, close.curvature), close

@@ -1,1 +1,1 @@
-"""The command ``srm-mbs``."""
+"""The command line ``srm-mbs``."""

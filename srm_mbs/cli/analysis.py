@@ -1,4 +1,4 @@
-"""The commands around the simulation: assembly modes, equilibria, linearisation, dragging."""
+"""The commands ``modes``, ``equilibrium``, ``linearise`` and ``drag``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import srm_mbs
-from srm_mbs.cli.output import RUN_FAILED, Model, check_output, reported, table
+from srm_mbs.cli.output import (
+    HTML_SUFFIXES,
+    RUN_FAILED,
+    Html,
+    Model,
+    check_output,
+    reported,
+    say_written,
+    table,
+)
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,9 +32,6 @@ Hold = Annotated[
         metavar="JOINT[=VALUE]",
         help="Keep a joint at VALUE (rad, m), or where it starts. May be given several times.",
     ),
-]
-Html = Annotated[
-    Path | None, typer.Option(metavar="FILE.html", help="Write the animation as one page.")
 ]
 
 
@@ -63,7 +69,7 @@ def _held(given: list[str] | None) -> tuple[dict[str, float], list[str]]:
 def _write_page(html: Path | None, motion: Callable[[], JointMotion]) -> None:
     if html is not None:
         motion().export_html(html)
-        typer.echo(f"written: {html}")
+        say_written(html)
 
 
 @reported()
@@ -166,7 +172,7 @@ def linearise(
             remedy="Give --html, or leave it out",
         )
     if html is not None:
-        check_output(html, "--html", (".html", ".htm"))
+        check_output(html, "--html", HTML_SUFFIXES)
     mechanism = srm_mbs.load(model)
     state = _state(mechanism, at)
     found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
@@ -214,7 +220,7 @@ def drag(
     from srm_mbs.cli.tables import path_rows, position_rows
 
     if html is not None:
-        check_output(html, "--html", (".html", ".htm"))
+        check_output(html, "--html", HTML_SUFFIXES)
     mechanism = srm_mbs.load(model)
     targets, bare = _values(values, "JOINT=VALUE")
     if bare:

@@ -1,6 +1,6 @@
-"""The command line ``srm-mbs``: thin, every command calls the package and prints.
+"""The command line ``srm-mbs``: every command calls the package and prints the result.
 
-Everything slow is imported inside the commands, so that ``srm-mbs --help`` answers at once.
+Slow imports are made inside the commands, so that ``srm-mbs --help`` answers at once.
 Exit status: 0; 1 when a run or a search did not reach its end; 2 for bad input.
 """
 
@@ -16,7 +16,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
-# Before NumPy is loaded: on matrices of this size the threads of BLAS cost many times their work.
+# Before NumPy is loaded: for matrices of this size the threads of BLAS cost more than they gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
@@ -25,11 +25,14 @@ import srm_mbs
 from srm_mbs.cli import analysis, playback, plot_report
 from srm_mbs.cli.output import (
     BAD_INPUT,
+    HTML_SUFFIXES,
     RUN_FAILED,
+    Html,
     Lines,
     Model,
     check_output,
     reported,
+    say_written,
     table,
     write_files,
 )
@@ -44,8 +47,8 @@ from srm_mbs.cli.playback import (
     check_overlays,
     check_pictures,
     check_time,
-    drawn,
     live_view,
+    overlay_options,
     play_run,
 )
 from srm_mbs.errors import InputError
@@ -153,10 +156,7 @@ def simulate(
         Path | None,
         typer.Option(metavar="FILE.csv", help="Write the motion at the steps as a table."),
     ] = None,
-    html: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Write the animation as one page."),
-    ] = None,
+    html: Html = None,
     image: Image = None,
     at: At = None,
     video: Video = None,
@@ -185,11 +185,11 @@ def simulate(
     if csv is not None:
         check_output(csv, "--csv", (".csv",))
     if html is not None:
-        check_output(html, "--html", (".html", ".htm"))
+        check_output(html, "--html", HTML_SUFFIXES)
     check_pictures(image, at, video)
 
     mechanism = srm_mbs.load(model)
-    shown = drawn(mechanism, trace, gaps, reactions)
+    overlays = overlay_options(mechanism, trace, gaps, reactions)
     check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
@@ -211,9 +211,9 @@ def simulate(
             (out, solution.save),
             (plot, solution.plot),
             (csv, solution.to_csv),
-            (html, partial(solution.export_html, **shown)),
-            (image, partial(solution.export_image, t=at, **shown)),
-            (video, partial(solution.export_video, **shown)),
+            (html, partial(solution.export_html, **overlays)),
+            (image, partial(solution.export_image, t=at, **overlays)),
+            (video, partial(solution.export_video, **overlays)),
         ]
     )
     rows = run_rows(solution, passages=solution.status != "interrupted")
@@ -224,7 +224,7 @@ def simulate(
         table(balance_rows(solution.energy_balance))
     typer.echo(solution.message, err=not solution.success)
     if play or view:
-        play_run(solution, shown, view)
+        play_run(solution, overlays, view)
     if failed:
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
@@ -232,7 +232,7 @@ def simulate(
 
 
 def _first(*values: float | None) -> float:
-    """The first value that is given."""
+    """The first value that is not None."""
     return next(value for value in values if value is not None)
 
 
@@ -254,7 +254,7 @@ def convert(
 
     *written, notes = write(model, out, cut=cut or (), force=force)
     for path in written:
-        typer.echo(f"written: {path}")
+        say_written(path)
     for note in notes:
         typer.echo(f"note: {note}")
 
@@ -314,7 +314,7 @@ def _first_sentence(path: Path) -> str:
     lines = path.read_text(encoding="utf-8").splitlines()
     comment = takewhile(lambda line: line.startswith("#"), lines)
     text = " ".join(line.removeprefix("#").strip() for line in comment)
-    # An initial ("C. B. Macdonald") ends no sentence.
+    # The full stop of an initial ("C. B. Macdonald") ends no sentence.
     return re.split(r"(?<!\b[A-Z])\.(?:\s|$)", text, maxsplit=1)[0]
 
 
@@ -350,7 +350,7 @@ def benchmark(context: typer.Context) -> None:
             element="benchmark",
             remedy="Run it at the top of a checkout of the source",
         )
-    # A process of its own: it reads the number of threads before it loads anything.
+    # A new process, which reads the number of threads before it loads NumPy.
     command = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
     status = subprocess.run(command, check=False).returncode
     if status:

@@ -1,4 +1,4 @@
-"""What commands print and where, the files they write, and their exit status."""
+"""Output of commands: messages, tables, files and exit status; arguments that they share."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from typer.models import ArgumentInfo, OptionInfo
 from srm_mbs.errors import CHECK_WRITING, InputError, SrmError, SrmWarning
 
 RUN_FAILED, BAD_INPUT = 1, 2
+"""Exit status."""
 Given = ParamSpec("Given")
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
@@ -30,6 +31,10 @@ Model = Annotated[
         "another format, which its content tells (docs/formats.md).",
     ),
 ]
+Html = Annotated[
+    Path | None, typer.Option(metavar="FILE.html", help="Write the animation as one page.")
+]
+HTML_SUFFIXES = (".html", ".htm")
 
 
 def say(kind: str, text: object) -> None:
@@ -45,9 +50,9 @@ class Lines(logging.Handler):
 
 
 def reported() -> Callable[[Callable[Given, None]], Callable[Given, None]]:
-    """Decorates commands: warnings and expected errors are single lines, the latter with status 2.
+    """Decorator of commands: warnings and expected errors become single lines, errors exit with 2.
 
-    Errors name an option as it is written: ``--t-end``, not ``t_end``.
+    Errors name an option as on the command line: ``--t-end``, not ``t_end``.
     """
 
     def decorate(command: Callable[Given, None]) -> Callable[Given, None]:
@@ -57,7 +62,7 @@ def reported() -> Callable[[Callable[Given, None]], Callable[Given, None]]:
                 with _warnings_as_lines():
                     command(*args, **kwargs)
             except BrokenPipeError:
-                raise  # the reader of a pipe has gone: typer ends quietly
+                raise  # the reader of a pipe has ended: typer exits silently
             except SrmError as error:
                 if isinstance(error, InputError) and error.element is not None:
                     error.element = _as_written(error.element, command)
@@ -94,6 +99,7 @@ def _as_written(element: str, command: Callable[..., None]) -> str:
 
 
 def os_problem(error: OSError) -> str:
+    """File and reason of ``error``."""
     where = f"{error.filename}: " if error.filename else ""
     return f"{where}{error.strerror or error}"
 
@@ -112,7 +118,7 @@ def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
     console = Console(width=width, markup=False, emoji=False, highlight=False)
     with console.capture() as captured:
         console.print(grid)
-    # rich fills the last column with spaces
+    # rich pads the last column with spaces.
     typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
@@ -120,7 +126,13 @@ def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
 
 
 def check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse, before a long run, a file that could not be written after it."""
+    """Refuse a file that cannot be written, before a long run.
+
+    Raises
+    ------
+    InputError
+        If its suffix is not one of ``suffixes``, or it cannot be written.
+    """
     problem = remedy = ""
     folder = path.parent
     if path.suffix.lower() not in suffixes:
@@ -139,7 +151,13 @@ def check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
 def write_files(
     files: Iterable[tuple[Path | None, Callable[[Path], object]]],
 ) -> tuple[list[Path], bool]:
-    """Write each file that is asked for; one that fails does not keep the others from it."""
+    """Write each file whose path is not None, also after the failure of another one.
+
+    Returns
+    -------
+    (written, failed)
+        Paths of the written files, and whether a file could not be written, which is reported.
+    """
     written, failed = [], False
     for path, write in files:
         if path is None:
@@ -148,12 +166,17 @@ def write_files(
             write(path)
         except (OSError, SrmError) as error:
             if isinstance(error, OSError):
-                why = error.strerror or error
+                reason = error.strerror or error
                 error = InputError(
-                    f"it cannot be written: {why}", file=str(path), remedy=CHECK_WRITING
+                    f"it cannot be written: {reason}", file=str(path), remedy=CHECK_WRITING
                 )
             say("error", f"{path}: {str(error).removeprefix(f'{path}: ')}")
             failed = True
         else:
             written.append(path)
     return written, failed
+
+
+def say_written(path: Path) -> None:
+    """Name a written file on standard output."""
+    typer.echo(f"written: {path}")

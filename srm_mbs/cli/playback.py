@@ -1,4 +1,4 @@
-"""What is looked at from the command line: pages, pictures, films, and the command ``play``."""
+"""Options of animations, images and videos, and the command ``play``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import srm_mbs
-from srm_mbs.cli.output import BAD_INPUT, Run, check_output, reported, write_files
+from srm_mbs.cli.output import (
+    BAD_INPUT,
+    Run,
+    check_output,
+    reported,
+    say_written,
+    write_files,
+)
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,12 +62,12 @@ Reactions = Annotated[
 
 
 def check_pictures(image: Path | None, at: float | None, video: Path | None) -> None:
-    """Refuse files that could not be written after the run.
+    """Refuse image and video files that cannot be written, before the run.
 
     Raises
     ------
     InputError
-        If one cannot be, its encoder is missing, or there is a time and no picture.
+        If one cannot be written, its encoder is missing, or ``at`` is given without an image.
     """
     from srm_mbs.visualization.animation.video import FILMS, encoder_of
 
@@ -78,12 +85,12 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
 
 
 def check_time(at: float | None, t_end: float, start: float = 0.0) -> None:
-    """Refuse a picture of a time (s) that a run from ``start`` to ``t_end`` (s) does not have.
+    """Refuse the time ``at`` (s) of an image outside a run from ``start`` to ``t_end`` (s).
 
     Raises
     ------
     InputError
-        If it has not.
+        If it lies outside.
     """
     if at is not None and not (start <= at <= t_end or t_end <= start):
         raise InputError(
@@ -94,16 +101,23 @@ def check_time(at: float | None, t_end: float, start: float = 0.0) -> None:
 
 
 def check_overlays(
-    trace: list[str] | None, gaps: bool, reactions: bool, seen: Iterable[object]
+    trace: list[str] | None, gaps: bool, reactions: bool, animations: Iterable[object]
 ) -> None:
-    """Refuse what would be drawn where nothing is: none of the options ``seen`` is given.
+    """Refuse overlays without an animation.
+
+    Parameters
+    ----------
+    trace, gaps, reactions
+        Options of overlays.
+    animations
+        Options that ask for an animation, image or video.
 
     Raises
     ------
     InputError
-        If so.
+        If an overlay is requested, and none of ``animations``.
     """
-    if any(seen):
+    if any(animations):
         return
     for option, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
         if given:
@@ -114,15 +128,16 @@ def check_overlays(
             )
 
 
-def drawn(
+def overlay_options(
     mechanism: Mechanism, trace: list[str] | None, gaps: bool, reactions: bool
 ) -> dict[str, Any]:
-    """The options of playback, checked before a long run.
+    """The overlays as options of playback, checked before a long run.
 
     Raises
     ------
     InputError
-        If a trace is none, its point is not there or does not move, or no closure has reactions.
+        If a trace is malformed, its point does not exist or does not move, or no closure has
+        reactions.
     """
     from srm_mbs.visualization.animation.overlays import OverlayOptions
 
@@ -132,12 +147,12 @@ def drawn(
 
 
 def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
-    """The points LINK:X,Y,Z that were given to ``option``.
+    """The points LINK:X,Y,Z of ``option``.
 
     Raises
     ------
     InputError
-        If one is none.
+        If one is malformed.
     """
     found = []
     for text in texts:
@@ -175,7 +190,7 @@ def play(
     check_pictures(image, at, video)
     solution = srm_mbs.load_solution(run)
     check_time(at, solution.span[1], solution.span[0])
-    options = drawn(solution.mechanism, trace, gaps, reactions)
+    options = overlay_options(solution.mechanism, trace, gaps, reactions)
     if image is None and video is None:
         play_run(solution, options)
         return
@@ -186,24 +201,24 @@ def play(
         ]
     )
     for path in written:
-        typer.echo(f"written: {path}")
+        say_written(path)
     if failed:
         raise typer.Exit(BAD_INPUT)
 
 
 def live_view(mechanism: Mechanism) -> LiveView:
-    """The page of a run that is about to be computed."""
+    """The live view of a run that is going to be computed."""
     from srm_mbs.visualization.animation.live import LiveView
 
-    _tell_address()
+    _log_address()
     return LiveView(mechanism)
 
 
 def play_run(solution: Solution, options: dict[str, Any], view: LiveView | None = None) -> None:
     """Play a run until Ctrl-C, in its live view if it has one."""
-    _tell_address()
+    _log_address()
     typer.echo("Ctrl-C ends the playback.", err=True)
-    with suppress(KeyboardInterrupt):  # while the page is being made; later, play() takes it
+    with suppress(KeyboardInterrupt):  # while the page is made; later play() handles it
         if view is None:
             solution.play(**options)
         else:
@@ -212,6 +227,6 @@ def play_run(solution: Solution, options: dict[str, Any], view: LiveView | None 
                 view.wait()
 
 
-def _tell_address() -> None:
-    # Its messages are few, and one of them is the address of the page.
+def _log_address() -> None:
+    # One of its few messages is the address of the page.
     logging.getLogger("srm_mbs.visualization.animation.playback").setLevel(logging.INFO)

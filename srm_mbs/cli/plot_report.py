@@ -1,7 +1,4 @@
-"""The command ``plot``: pictures of a saved run.
-
-The command ``report``: one page about a run.
-"""
+"""The commands ``plot`` and ``report``, for saved runs."""
 
 from __future__ import annotations
 
@@ -11,66 +8,12 @@ from typing import Annotated, Any
 import typer
 
 import srm_mbs
-from srm_mbs.cli.output import Run, check_output, reported, table
+from srm_mbs.cli.output import HTML_SUFFIXES, Run, check_output, reported, say_written, table
 from srm_mbs.cli.playback import given_points
 from srm_mbs.errors import InputError
 
-
-@reported()
-def report(
-    run: Run,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="OUT.html",
-            help="Write the page to this file.",
-            show_default="RUN_report.html",
-        ),
-    ] = None,
-    no_animation: Annotated[
-        bool,
-        typer.Option("--no-animation", help="Leave out the animation: a small file."),
-    ] = False,
-    rtol: Annotated[
-        float | None,
-        typer.Option(
-            metavar="R",
-            help="Relative tolerance of the second run, for the error estimate; runs with fixed "
-            "steps are made again with smaller ones.",
-            show_default="a hundredth of the run's",
-        ),
-    ] = None,
-    no_second_run: Annotated[
-        bool,
-        typer.Option("--no-second-run", help="Leave out the second run and the error estimate."),
-    ] = False,
-) -> None:
-    """Write one page about a saved run.
-
-    It has the mechanism, motion, settings, accuracy and plots.  The run is made again at tighter
-    tolerances, to estimate its error.
-    """
-    from srm_mbs.analysis.report.report import write_report
-
-    path = run.with_name(f"{run.stem}_report.html") if out is None else out
-    check_output(path, "--out", (".html", ".htm"))
-    if no_second_run and rtol is not None:
-        raise InputError(
-            "it is the tolerance of the second run, which --no-second-run leaves out",
-            element="--rtol",
-            remedy="Leave out one of the two",
-        )
-    solution = srm_mbs.load_solution(run)
-    if not no_second_run:
-        typer.echo("making the run again, to estimate its error", err=True)
-    certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)
-    write_report(solution, path, animation=not no_animation, certificate=certificate)
-    table((found.topic, found.grade, found.text) for found in certificate.findings)
-    typer.echo(f"written: {path}")
-
-
 OPTIONS = {"joints": "--joint", "loops": "--loop", "rows": "--rows", "points": "--point"}
-"""Options of a picture in Python, and here."""
+"""Options of plots in Python, and on the command line."""
 
 
 @reported()
@@ -146,4 +89,57 @@ def plot(
         if error.element in ("kind", *OPTIONS):
             error.element = OPTIONS.get(error.element, "--kind")
         raise
-    typer.echo(f"written: {path}")
+    say_written(path)
+
+
+@reported()
+def report(
+    run: Run,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT.html",
+            help="Write the page to this file.",
+            show_default="RUN_report.html",
+        ),
+    ] = None,
+    no_animation: Annotated[
+        bool,
+        typer.Option("--no-animation", help="Leave out the animation: a small file."),
+    ] = False,
+    rtol: Annotated[
+        float | None,
+        typer.Option(
+            metavar="R",
+            help="Relative tolerance of the second run, for the error estimate; runs with fixed "
+            "steps are made again with smaller ones.",
+            show_default="a hundredth of the run's",
+        ),
+    ] = None,
+    no_second_run: Annotated[
+        bool,
+        typer.Option("--no-second-run", help="Leave out the second run and the error estimate."),
+    ] = False,
+) -> None:
+    """Write one page about a saved run.
+
+    It has the mechanism, motion, settings, accuracy and plots.  The run is made again at tighter
+    tolerances, to estimate its error.
+    """
+    from srm_mbs.analysis.report.report import write_report
+
+    path = run.with_name(f"{run.stem}_report.html") if out is None else out
+    check_output(path, "--out", HTML_SUFFIXES)
+    if no_second_run and rtol is not None:
+        raise InputError(
+            "it is the tolerance of the second run, which --no-second-run leaves out",
+            element="--rtol",
+            remedy="Leave out one of the two",
+        )
+    solution = srm_mbs.load_solution(run)
+    if not no_second_run:
+        typer.echo("making the run again, to estimate its error", err=True)
+    certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)
+    write_report(solution, path, animation=not no_animation, certificate=certificate)
+    table((found.topic, found.grade, found.text) for found in certificate.findings)
+    say_written(path)

@@ -1,8 +1,8 @@
-"""What analyses found as rows of text, for the command line."""
+"""Results of analyses as rows of text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,9 @@ from srm_mbs.analysis.assembly_modes import AssemblyMode
 from srm_mbs.analysis.equilibrium import Equilibrium
 from srm_mbs.analysis.linearisation import Linearisation
 from srm_mbs.analysis.path_following import FollowedPath
-from srm_mbs.analysis.summary import force_text, position_text
+from srm_mbs.analysis.summary import force_text, position_text, vector_text
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.simulation.energy_balance import EnergyBalance
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return f"[{', '.join(f'{value:.6g}' for value in values)}]"
 
 
 def position_rows(mechanism: Mechanism, q: FloatArray) -> list[tuple[str, str]]:
@@ -27,7 +23,7 @@ def position_rows(mechanism: Mechanism, q: FloatArray) -> list[tuple[str, str]]:
 
 
 def mode_rows(mechanism: Mechanism, modes: Sequence[AssemblyMode]) -> Iterator[tuple[str, ...]]:
-    """(number, how often found, singular, position of each joint) of each assembly mode."""
+    """(number, starts that led to it, singular, position of each joint) of each assembly mode."""
     for number, mode in enumerate(modes, 1):
         positions = (text for _, text in position_rows(mechanism, mode.q))
         yield (
@@ -56,7 +52,9 @@ def equilibrium_rows(mechanism: Mechanism, found: Equilibrium) -> list[tuple[str
         for name, force in found.holding.items()
     ]
     for name, wrench in found.reactions.items():
-        rows.append((f"reaction {name}", f"{_numbers(wrench[:3])} N, {_numbers(wrench[3:])} N m"))
+        rows.append(
+            (f"reaction {name}", f"{vector_text(wrench[:3])} N, {vector_text(wrench[3:])} N m")
+        )
     return rows
 
 
@@ -101,7 +99,7 @@ def balance_rows(found: EnergyBalance) -> list[tuple[str, str]]:
 
 
 def path_rows(found: FollowedPath) -> list[tuple[str, str]]:
-    """How a path ended, and the singular configurations on it: (quantity, value)."""
+    """End of a path, and the singular configurations on it: (quantity, value)."""
     rows = [
         ("path", found.message),
         ("configurations on the way", str(len(found.path))),

@@ -1,6 +1,7 @@
-"""Controllers: functions of the user that return generalised forces, called and checked.
+"""Controllers: functions of the user that return generalised forces, evaluated and checked.
 
-Forces held between samples, as a digital controller holds its outputs.
+:class:`HeldForce` is the controller of sampled runs: it holds a force from one sample to the next,
+as a digital controller holds its outputs.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from srm_mbs.errors import ControllerError
 
 
 class HeldForce:
-    """Generalised forces that are constant from one sample to the next.
+    """Generalised forces that are constant from one sample to the next, right-continuous.
 
-    A controller (:mod:`srm_mbs.dynamics.controllers`): called at any time of a run, also after it,
-    it returns what acted then; right-continuous.
+    A controller: at any time of a run, during it or afterwards, it returns the force that acted
+    then.
     """
 
     def __init__(self) -> None:
@@ -72,7 +73,7 @@ def evaluate_controller(
 
 
 def controller_error(given: FloatArray, size: int) -> str:
-    """What is wrong with an array that should be ``size`` finite numbers; empty if nothing is."""
+    """The fault of an array that should be ``size`` finite numbers; empty if it has none."""
     if given.shape != (size,):
         return f"an array of shape {given.shape}"
     return "" if np.isfinite(given).all() else "values that are not finite"

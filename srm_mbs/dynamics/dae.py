@@ -2,21 +2,17 @@ r"""A semi-explicit DAE of index 2 as a system.
 
     x' = f(t, x) - B(t, x) y,    0 = g(t, x),    yhat = B y = E (G f + g_t),    E = B (GB)^-1.
 
-The answers of an evaluated point are in :mod:`srm_mbs.dynamics.dae`.
-
-The algebra of a DAE at one point: E = B (GB)^-1, P = E G, rank and sigma.
-
-Column-pivoted QR of the scaled G^T = Q_G R_G and B = Q_B R_B; with C = Q_G^T Q_B,
+:class:`ObliqueProjection` is the algebra at one point.  With the column-pivoted QR of the scaled
+G^T = Q_G R_G and B = Q_B R_B, and C = Q_G^T Q_B,
 
     E r = Q_B C^-1 R_G^-T r,    P w = Q_B C^-1 Q_G^T w,
 
-so that where rows of G, or columns of B, become dependent only the cosines of the angles in C are
-divided by: P stays bounded there (thesis, (2.4)), which products with (GB)^-1 would not.
+so that the division is by the cosines of the angles in C only, where rows of G, or columns of B,
+become dependent: P stays bounded there (thesis, (2.4)), unlike products with (GB)^-1.
 
-Terms of one evaluated point of a semi-explicit DAE, :mod:`srm_mbs.dynamics.dae`.
-
-One sweep of the SRM: y_s = y_{s-1} + T g/eps, x_s' = f - B y_s, (2.2) of the thesis with T = I or
-(GB)^T; and for T = (GB)^-1 the form (2.4), which carries yhat = B y instead of y,
+:class:`DaeTerms` has the quantities of one evaluated point.  One sweep of the SRM is
+y_s = y_{s-1} + T g/eps, x_s' = f - B y_s, (2.2) of the thesis with T = I or (GB)^T; and for
+T = (GB)^-1 the form (2.4), which carries yhat = B y instead of y,
 
     yhat_s = P yhat_{s-1} + E g/eps,    P = E G,
 
@@ -225,7 +221,7 @@ WRONG_DERIVATIVE = 1e-3
 
 
 class DaeSystem:
-    """A :class:`~srm_mbs.model.dae.SemiExplicitDAE` behind the contract of the stepping.
+    """A :class:`~srm_mbs.model.dae.SemiExplicitDAE` as a :class:`~srm_mbs.dynamics.system.System`.
 
     Parameters
     ----------
@@ -236,7 +232,7 @@ class DaeSystem:
     t_end
         End of the run.
     T
-        ``"identity"``, ``"transpose"`` or ``"inverse"``: what the sweeps multiply g by.
+        ``"identity"``, ``"transpose"`` or ``"inverse"``: the factor of g in the sweeps.
 
     Raises
     ------
@@ -526,7 +522,7 @@ class DaeSystem:
         return self.factor_of(terms.multiplier(), terms.B)
 
     def uncarried(self, t: float, state: FloatArray, carried: FloatArray) -> FloatArray:
-        """y (ny,) of what sweeps carry."""
+        """y (ny,) from the quantity that sweeps carry, y or yhat."""
         if not self.carries_yhat:
             return carried
         return self.factor_of(carried, self.call("B", t, state))

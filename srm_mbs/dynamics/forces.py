@@ -1,20 +1,16 @@
 """Generalised forces of the force elements, from the kinematics of one evaluation.
 
-The elements on joints are in ``joint_forces``, those on links in ``link_forces``; here are the
-functions of the user, and all elements of a mechanism together.
-
-What the evaluators of force elements share: anchors, wrenches, numbers over time.
-
-A wrench W = (f, m) in world axes about the world origin that acts on body a, and -W on body b, is
+A wrench W = (f, m) in world axes about the world origin that acts on body a, and -W on body b,
+gives
 
     tau = (J_a - J_b)^T W
 
-with J the world-frame joint Jacobian: all elements between bodies are reduced to that.  Velocities
+with J the world-frame joint Jacobian; all elements between bodies are reduced to it.  Velocities
 are spatial, in world axes at the world origin; that of a point p is v_lin + w x p.
 
-Evaluators of the force elements on links: springs between points, wrenches, bushings.
-
-Evaluators of the force elements on one joint: torques, springs, limits.
+Each element of :mod:`srm_mbs.model.forces` has an :class:`Evaluator`: first those between links
+(springs, wrenches, bushings), then those on one joint (torques, springs, limits), then functions of
+the user.  :class:`ForceKinematics` has all elements of a mechanism.
 """
 
 from __future__ import annotations
@@ -61,7 +57,7 @@ class Evaluator(Protocol):
         """Its potential energy (J); ``data`` need hold the placements only."""
 
     def constants(self) -> dict[str, Any]:
-        """What the compiled kernel needs of it; ``kind`` numbers the kinds as forces.hpp does."""
+        """Constants for the compiled kernel; ``kind`` numbers the kinds as forces.hpp does."""
 
 
 class HeldAnchor:
@@ -212,7 +208,7 @@ class BushingEvaluator:
         force = self.stiffness[:3] * relative.translation
         moment = self.stiffness[3:] * turn
         if self.damped:
-            # b's axes and origin move along: what is left is the motion seen from b.
+            # The motion relative to b's axes and origin.
             W = self.a.velocity(data) - self.b.velocity(data)
             rate = Tb.rotation.T @ point_velocity(W, Ta.translation)
             spin = L.T @ (Tb.rotation.T @ W.angular)
@@ -425,7 +421,7 @@ class ForceKinematics:
         return tau
 
     def constants(self) -> list[dict[str, Any]]:
-        """What the compiled kernel needs of each element but the functions of the user."""
+        """Constants of each element for the compiled kernel, without the functions of the user."""
         return [
             element.constants()
             for element in self._elements

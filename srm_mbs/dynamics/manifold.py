@@ -1,9 +1,6 @@
-r"""The states of a mechanism, x = (q, v): moves on the configuration manifold, sizes and limits.
+r"""The state space of a mechanism, x = (q, v): charts, moves, norms and limits.
 
-What depends on q alone through its joints belongs here; nothing here knows masses, forces or
-closures.
-
-Tangent charts on the configuration manifold.
+It depends on the joints alone, not on masses, forces or closures.
 
 Within a step the configuration is q = q_n \oplus u, and u' = dexp^{-1}_u(v) with the body
 velocity v.  The chart keeps the full order of a Runge-Kutta scheme where nq != nv; a naive
@@ -32,8 +29,8 @@ LARGEST_ROTATION = 2.5
 """Rotation (rad) of a stage that the charts accept: the series errs by 2e-11 there."""
 
 FARTHEST_NODE = 2.0
-"""Rotation (rad) of a node of an interpolant.  With one step more (by ROTATION_PER_STEP, and a part
-of it that was skipped) a joint that has turned on does not seem to be within it again."""
+"""Largest rotation (rad) of a node of an interpolant.  One step more (ROTATION_PER_STEP, and a part
+of it that was skipped) does not bring a joint that turns on back within it."""
 
 
 def _bernoulli_terms(count: int) -> tuple[float, ...]:
@@ -93,8 +90,8 @@ def group_joints(model: pin.Model) -> tuple[GroupJoint, ...]:
     Raises
     ------
     InputError
-        If a joint has nq != nv in a way that this version does not know (a composite joint with
-        a ball inside, a mimic joint).
+        If a joint has nq != nv and is not one of these (a composite joint with a ball inside, a
+        mimic joint).
     """
     found = []
     for joint_id in range(1, model.njoints):
@@ -186,7 +183,7 @@ def _caps(mechanism: Mechanism) -> FloatArray:
 
 
 class Manifold:
-    """The state space of ``mechanism``, as :class:`~srm_mbs.dynamics.system.System` asks for it."""
+    """The state space of ``mechanism``; see :class:`~srm_mbs.dynamics.system.System`."""
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.mechanism = mechanism
@@ -211,7 +208,7 @@ class Manifold:
         return _angle_pairs(self.mechanism)
 
     def chart_constants(self) -> dict[str, Any]:
-        """What the compiled kernel needs to know of the manifold, independent of the start."""
+        """Constants for the compiled kernel, independent of the start."""
         return {
             "position_of": [int(i) for i in self._position_of],
             "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
@@ -290,7 +287,7 @@ class Manifold:
     def state_scale(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
 
-        Angles are capped at 1 rad so that the accuracy does not decay with winding.
+        Angles are capped at 1 rad so that the accuracy does not decay with the number of turns.
         """
         if self._flat:
             sizes: FloatArray = np.minimum(np.abs(state), self._caps)

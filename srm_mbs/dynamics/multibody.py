@@ -1,20 +1,14 @@
-r"""Mechanisms as systems: the evaluation of a stage, without closures and with them.
+r"""Mechanisms as systems: the equations of motion, without closures and with them.
 
     q' = v,   M(q) v' = f(q, v, t) - G^T lam,   g(q) = s(t),   f = tau - nle(q, v),
 
-s the motion of the drives, 0 in the rows of the loops; tau the applied forces.  States and their
-moves are in ``manifold``, the applied forces and the energy in ``mechanics``, the answers of an
-evaluated stage in ``mechanism_terms``.  Only these, ``loops``, ``driven``, ``forces`` and the
-load-time analysis call Pinocchio algorithms.
+with s the motion of the drives, 0 in the rows of the loops, and tau the forces of the controller,
+joint damping and friction, and force elements.
 
-Terms of one stage of a mechanism: what a method asks of it, in tangent coordinates.
-
-The systems (:mod:`srm_mbs.dynamics.multibody`) fill them in; the algebra of the closures is in
+:class:`OpenSystem` and :class:`ClosedSystem` evaluate a stage; :class:`OpenTerms` and
+:class:`ClosedTerms` hold its quantities in tangent coordinates.  States and their moves are in
+:mod:`srm_mbs.dynamics.manifold`, the algebra of the closures in
 :mod:`srm_mbs.dynamics.constraints.projection`.
-
-What open and closed mechanisms share besides their states: applied forces, energy, counts.
-
-The forces tau are those of the controller, joint damping and friction, and force elements.
 """
 
 from __future__ import annotations
@@ -182,7 +176,7 @@ _NO_ROWS = np.zeros(0)
 
 
 class Mechanics(Manifold):
-    """A mechanism and the controller that acts on it, whatever its closures."""
+    """Applied forces, energy and constants of a mechanism and its controller, open or closed."""
 
     carries_yhat = True
     predicts = True
@@ -204,7 +198,7 @@ class Mechanics(Manifold):
         # Terms and workspaces share memory, which copies of them would not.
         return type(self), (self.mechanism, self._controller)
 
-    # Made when the reference first evaluates: the compiled kernel has its own.
+    # Allocated when the reference first evaluates; the compiled kernel has its own.
     @cached_property
     def data(self) -> pin.Data:
         """Pinocchio's workspace."""
@@ -234,12 +228,12 @@ class Mechanics(Manifold):
         return self._controller if isinstance(self._controller, HeldForce) else None
 
     def count(self, evaluations: int, factorisations: int) -> None:
-        """Count what the compiled kernel did for this system."""
+        """Add the work of the compiled kernel for this system to the counters."""
         self.evaluations += evaluations
 
     def between(self, first: float, last: float) -> None:
-        """Evaluate at times within [``first``, ``last``] (s) only, the nearer of them for others:
-        on one side of a breakpoint, whatever ``evaluate`` is given."""
+        """Limit the times of evaluations to [``first``, ``last``] (s): the equations on one side of
+        a breakpoint, where its other side would be evaluated otherwise."""
         self._first, self._last = first, last
 
     def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
@@ -323,7 +317,7 @@ class Mechanics(Manifold):
 _WORLD = pin.Convention.WORLD
 _sum_of_sizes = blas.dasum
 _OVERFLOW = 1e100
-"""Size of a state from which products of its rates may overflow."""
+"""Sum of |x_i| of a state above which products of its rates may overflow."""
 
 
 class OpenSystem(Mechanics):
@@ -459,7 +453,7 @@ class ClosedSystem(Mechanics):
         return super().constants_of_model() | self.loops.constants() | own
 
     def count(self, evaluations: int, factorisations: int) -> None:
-        """Count what the compiled kernel did for this system."""
+        """Add the work of the compiled kernel for this system to the counters."""
         super().count(evaluations, factorisations)
         self.projection.factorisations += factorisations
 
@@ -488,7 +482,7 @@ class ClosedSystem(Mechanics):
         nonLinearEffects the velocities and bias accelerations: the closures need no further call.
         """
         self.evaluations += 1
-        # First, because LAPACK may factorise what is not finite without reporting it.
+        # First, because LAPACK may factorise numbers that are not finite without reporting it.
         if not _sum_of_sizes(state) < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
         t = min(max(t, self._first), self._last)

@@ -1,7 +1,7 @@
-"""Units of the coordinates: what "one" means for an angle, a length and a rate.
+"""Units of coordinates, rows and rates.
 
-Tolerances and step rules use them, so that the same mechanism in millimetres, with other masses
-or on another time scale, takes the same steps.
+Tolerances and step rules count in them, so that the same mechanism in millimetres, with other
+masses or on another time scale, takes the same steps.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from srm_mbs.errors import EvaluationError
 from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.mechanism import MechanismData, per_model
 
-ROUNDING = 1e-12
-"""Accelerations below this part of the largest are rounding of zero; and so is a scene diagonal
-below this part of the distance from the origin, or of the largest radius of gyration."""
+RELATIVE_ROUNDING = 1e-12
+"""Accelerations below this part of the largest are rounding of zero; so is a scene diagonal below
+this part of the distance from the origin, or of the largest radius of gyration."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Units:
         Characteristic rate (1/s): sqrt(g / length); without gravity the median of the initial
         rates over their units, as far as they are not zero; at rest that of sqrt(|a| / unit), with
         the accelerations a that the force elements give the open tree; 1 if there are none.  A
-        median, so that a fast rotor does not loosen what is asked of the slow rest.
+        median, so that a fast rotor does not loosen the tolerances of the slow coordinates.
     """
 
     length: float
@@ -122,7 +122,7 @@ def row_units(mechanism: MechanismData, units: Units) -> FloatArray:
 
     A joint row is as large as its largest term, |c_i| times the unit of joint i, so that neither
     the rounding of a large ratio nor the pitch of a screw makes it impossible to close.  Closure
-    errors over these are pure numbers, whatever the unit of length.
+    errors over these are pure numbers, independent of the unit of length.
     """
     model = mechanism.model
     out: list[float] = []
@@ -162,7 +162,7 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
         points.append(data.oMi[joint].act(point))
     corners = np.array(points) if points else np.zeros((1, 3))
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
-    known_to = ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
+    known_to = RELATIVE_ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
     length = diagonal if diagonal > known_to else 1.0
     coordinate = np.where(_angle_components(data), 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
@@ -170,7 +170,7 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
         rates = np.abs(v) / coordinate
         if not rates.any() and mechanism.forces:
             pulled = np.abs(_acceleration_by_forces(mechanism, q)) / coordinate
-            rates = np.sqrt(np.where(pulled > ROUNDING * pulled.max(), pulled, 0.0))
+            rates = np.sqrt(np.where(pulled > RELATIVE_ROUNDING * pulled.max(), pulled, 0.0))
         rates = rates[rates > 0.0]
         rate = float(np.median(rates)) if rates.size else 1.0
     return Units(length, coordinate, rate)
@@ -180,7 +180,7 @@ def _gyration(model: pin.Model) -> float:
     """The largest radius of gyration (m) of a body about its centre of mass."""
     return max(
         (
-            # Rounding of what was lumped or shifted may leave a point mass with a negative trace.
+            # Lumping and shifting may round the trace of a point mass to a negative number.
             float(np.sqrt(max(np.trace(body.inertia), 0.0) / body.mass))
             for body in model.inertias.tolist()
             if body.mass > 0.0
@@ -216,7 +216,7 @@ def _acceleration_by_forces(mechanism: MechanismData, q: FloatArray) -> FloatArr
     try:
         tau = forces.generalised(data, q, rest, 0.0)
         U = cholesky(data.M)
-    except EvaluationError:  # a run from here says why
+    except EvaluationError:  # a run from here reports the fault
         return rest
     out: FloatArray = unwhiten(U, whiten(U, tau))
     return out

@@ -1,9 +1,10 @@
 r"""Breakpoints: times at which the right-hand side is not smooth.
 
-Knots of tables, switches of drives, samples of a controller.  Between two of them, on a *piece*,
-the equations are smooth and every scheme keeps its order.  So a step ends on each breakpoint; its
-last stages see the forces just before, the first stage after it is evaluated anew and sees those
-just after; multipliers are not extrapolated across, because they jump with the forces.
+Knots of tables, switches of drives, samples of a controller.  Between two of them, on a *smooth
+interval*, the equations are smooth and every scheme keeps its order.  So a step ends on each
+breakpoint.  Its last stages are evaluated with the forces just before, and the first stage after it
+is evaluated again with those just after.  Multipliers are not extrapolated across, because they
+jump with the forces.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
-from srm_mbs.integration.methods.near_singular import ROUNDING, ZONE_LARGEST
+from srm_mbs.integration.methods.near_singular import LARGEST_ZONE_SIGMA, POSITION_ROUNDING
 from srm_mbs.integration.singular_endpoints import NEAR_SINGULAR_SIGMA, singular_arrival, start
 
-APART = 2e-14
-"""Breakpoints closer to each other than this fraction of the run are one: no step is that short."""
-BESIDE = 8.0
-"""Distance (units of rounding of t) from a breakpoint at which the time on one side of it is
-taken, so that ``t < 0.3``, ``t <= 0.3`` and ``floor(t / 0.1)`` all mean the side they should."""
-CLOSER = 0.5
-"""A singular configuration is looked for again when sigma has fallen by this factor."""
-ALLOWED = 0.1
-"""Part of the tolerance that rounding in the first stage of a piece may take."""
-
+SMALLEST_DISTANCE = 2e-14
+"""Distance of two breakpoints, over the length of the run, below which they are one: no step is
+that short."""
+ROUNDING_BESIDE = 8.0
+"""Distance from a breakpoint, in units of rounding of t, of the nearest time on one side of it, so
+that ``t < 0.3``, ``t <= 0.3`` and ``floor(t / 0.1)`` all mean the intended side."""
+REPEATED_SEARCH_SIGMA = 0.5
+"""sigma, over that of the last search for a singular configuration, at which it is repeated."""
+FIRST_STAGE_ERROR = 0.1
+"""Part of the tolerance that rounding in the first stage of a smooth interval may take."""
 
 _UNBOUNDED = np.array([np.inf])
 _NONE = np.zeros(0, dtype=bool)
@@ -38,12 +39,12 @@ _NONE = np.zeros(0, dtype=bool)
 
 @dataclass(frozen=True, eq=False)
 class SmoothIntervals:
-    """The pieces of a run, n of them.
+    """The smooth intervals of a run, n of them.
 
     Attributes
     ----------
     ends : (n,) s
-        Where they end, the end of the run last.
+        Their ends, the end of the run last.
     first, last : (n,) s
         The times at which the system is evaluated lie between these.
     given : (n - 1,) bool
@@ -57,22 +58,22 @@ class SmoothIntervals:
 
     @property
     def count(self) -> int:
-        """Number of pieces."""
+        """Number of intervals."""
         return len(self.ends)
 
 
 def smooth_intervals(
     times: FloatArray, marked: FloatArray, t0: float, t_end: float
 ) -> SmoothIntervals:
-    """The pieces into which ``times`` cut the run from ``t0`` to ``t_end`` (s).
+    """The intervals into which ``times`` divide the run from ``t0`` to ``t_end`` (s).
 
     Parameters
     ----------
     times : (k,) s
         Breakpoints in any order; those outside the run are left out.
     marked : (j,) s
-        Further ones, which :attr:`SmoothIntervals.given` tells apart; those at the ends of the run
-        count as outside.
+        Further ones, which :attr:`SmoothIntervals.given` marks; those at the ends of the run count
+        as outside.
     """
     if not len(times) and not len(marked):
         return SmoothIntervals(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
@@ -80,7 +81,8 @@ def smooth_intervals(
     is_marked = np.arange(len(order)) < len(marked)
     by_time = np.argsort(order, kind="stable")
     order, is_marked = order[by_time], is_marked[by_time]
-    near = max(APART * (t_end - t0), BESIDE * float(np.spacing(max(abs(t0), abs(t_end)))))
+    rounding = float(np.spacing(max(abs(t0), abs(t_end))))
+    near = max(SMALLEST_DISTANCE * (t_end - t0), ROUNDING_BESIDE * rounding)
     inside = (order >= t0 - near) & (order <= t_end + near)
     order, is_marked = order[inside], is_marked[inside]
     # Each cluster of times that no step fits between is one breakpoint, at its first time.
@@ -90,8 +92,8 @@ def smooth_intervals(
     final = order[np.append(new[1:], True)] if len(order) else order
     has_marked = np.zeros(len(begin), dtype=bool)
     np.logical_or.at(has_marked, cluster, is_marked)
-    before = begin - BESIDE * np.spacing(np.abs(begin))
-    after = final + BESIDE * np.spacing(np.abs(final))
+    before = begin - ROUNDING_BESIDE * np.spacing(np.abs(begin))
+    after = final + ROUNDING_BESIDE * np.spacing(np.abs(final))
     between = (begin > t0 + near) & (begin < t_end - near)
     at_start, at_end = after[begin <= t0 + near], before[begin >= t_end - near]
     return SmoothIntervals(
@@ -103,39 +105,40 @@ def smooth_intervals(
 
 
 def direct_from(memory: IntegratorState, norm: ErrorNorm, span: float, nv: int) -> float:
-    """sigma from which the first stage of a piece of length ``span`` (s) can be evaluated directly.
+    """sigma from which the first stage of an interval of length ``span`` (s) can be evaluated
+    directly.
 
-    Rounding in a direct solve grows with 1/sigma^2; over a short piece it is harmless.  At most,
-    and without a tolerance (fixed steps), it is where the zone ends.
+    Rounding in a direct solve grows like 1/sigma^2; over a short interval it is harmless.  At most,
+    and without a tolerance (fixed steps), it is the sigma at which the zone ends.
     """
     if norm.negligible == 0.0:
-        return ZONE_LARGEST
+        return LARGEST_ZONE_SIGMA
     error = np.zeros(2 * nv)
-    turning = 3.0 * memory.sigma_slope**2 * norm.one[:nv]
-    error[nv:] = span * ROUNDING * (np.abs(memory.rate[nv:]) + turning)
+    rotation = 3.0 * memory.sigma_slope**2 * norm.one[:nv]
+    error[nv:] = span * POSITION_ROUNDING * (np.abs(memory.rate[nv:]) + rotation)
     weighed = norm(error, norm.weights(memory.state_scale))
-    return min(ZONE_LARGEST, float(np.sqrt(weighed / ALLOWED)))
+    return min(LARGEST_ZONE_SIGMA, float(np.sqrt(weighed / FIRST_STAGE_ERROR)))
 
 
 class SingularProximity:
-    """When the singular configuration next to the first stage of a piece is worth looking for.
+    """When the singular configuration next to the first stage of an interval is searched for.
 
     Attributes
     ----------
     looked
-        Half the sigma at which that was done last; NEAR_SINGULAR_SIGMA far away.
+        Half the sigma of the last search; NEAR_SINGULAR_SIGMA far away.
     """
 
     def __init__(self) -> None:
         self.looked = NEAR_SINGULAR_SIGMA
 
     def matters(self, fresh: IntegratorState, norm: ErrorNorm, span: float, nv: int) -> bool:
-        """Whether for ``fresh``, at the start of a piece of length ``span`` (s)."""
+        """Whether for ``fresh``, at the start of an interval of length ``span`` (s)."""
         if fresh.sigma >= NEAR_SINGULAR_SIGMA:
             self.looked = NEAR_SINGULAR_SIGMA
         if not fresh.sigma < self.looked or not fresh.sigma < direct_from(fresh, norm, span, nv):
             return False
-        self.looked = CLOSER * fresh.sigma
+        self.looked = REPEATED_SEARCH_SIGMA * fresh.sigma
         return True
 
 
@@ -149,14 +152,14 @@ def beside_singular(
     evaluator: Any,
     fresh: IntegratorState,
 ) -> IntegratorState:
-    """``fresh``, of the first stage of a piece up to ``end``, made accurate next to a singular
+    """``fresh``, of the first stage of an interval up to ``end``, made accurate next to a singular
     configuration; the parameters are those of
     :func:`~srm_mbs.integration.singular_endpoints.start`.
 
     Raises
     ------
     EvaluationError
-        If the motion on from there is not determined.
+        If the motion from there is not determined.
     """
     try:
         return start(system, method, t, state, norm, end, evaluator, fresh)
@@ -165,8 +168,7 @@ def beside_singular(
 
 
 class BreakpointHandler:
-    """What happens at the breakpoints of a run, and before those, or an end, that lie beside a
-    singular configuration; used by the drivers.
+    """The breakpoints of a run, and the ends beside a singular configuration; used by the drivers.
 
     Parameters
     ----------
@@ -175,7 +177,7 @@ class BreakpointHandler:
     system, method, norm
         Of the run.
     evaluator
-        Evaluates the first stage of a piece.
+        Evaluates the first stage of an interval.
 
     Attributes
     ----------
@@ -206,7 +208,7 @@ class BreakpointHandler:
 
     @property
     def end(self) -> float:
-        """End of the current piece (s)."""
+        """End of the current interval (s)."""
         return float(self.pieces.ends[self._index])
 
     def _evaluate_within(self, index: int) -> None:
@@ -214,7 +216,7 @@ class BreakpointHandler:
         self._evaluator.between(float(pieces.first[index]), float(pieces.last[index]))
 
     def enter(self, index: int, t: float, state: FloatArray) -> None:
-        """Go on to the piece ``index``, which starts at ``t`` (s): the system is evaluated in it.
+        """Enter the interval ``index``, which starts at ``t`` (s): the system is evaluated in it.
 
         Raises
         ------
@@ -227,7 +229,7 @@ class BreakpointHandler:
         self._evaluate_within(index)
 
     def next(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
-        """Go on to the next piece; ``memory`` with its first stage.
+        """Enter the next interval; ``memory`` with its first stage.
 
         Raises
         ------
@@ -243,13 +245,13 @@ class BreakpointHandler:
         return fresh
 
     def resolved(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
-        """``memory`` with the first stage of the current piece, from where it starts, evaluated
-        with a look at the singular configuration nearby.
+        """``memory`` with the first stage of the current interval, at its start, made accurate
+        next to a singular configuration.
 
         Raises
         ------
         EvaluationError
-            If it cannot be evaluated, or the motion on from there is not determined.
+            If it cannot be evaluated, or the motion from there is not determined.
         """
         fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
         return self._resolved(t, state, fresh)
@@ -262,11 +264,11 @@ class BreakpointHandler:
     def singular_arrival(
         self, t: float, state: FloatArray, memory: IntegratorState, index: int | None = None
     ) -> IntegratorState:
-        """``memory`` with the multipliers known up to the end of the piece, which lies beside a
+        """``memory`` with the multipliers known up to the end of the interval, which lies beside a
         singular configuration; see
         :func:`~srm_mbs.integration.singular_endpoints.singular_arrival`.
 
-        ``index``: of that piece, if the kernel went on to it by itself.
+        ``index``: of that interval, if the kernel entered it by itself.
         """
         if index is not None and index != self._index:
             self._index = index

@@ -1,4 +1,4 @@
-r"""Dense output: the state at any time of a run.
+r"""Dense output: the state at any time of a run, and angles followed through its steps.
 
 The Runge-Kutta extension of a step ends at the uncorrected point x^-; the correction (dq, dv) at
 the step end is added as a smooth ramp,
@@ -8,17 +8,11 @@ the step end is added as a smooth ramp,
 so that the interpolant joins the corrected states with matching slopes and stays within
 tolerance of the closures.  The extra stages of dop853 are evaluated only when a step is read.
 
-Times at which a run is read.
-
-Dense output next to singular configurations: Hermite interpolation of accepted states.
-
 Where a step passes, or almost touches, a singular configuration, the rates of its stages carry the
 rounding of the stage over its distance to that configuration, which the weights of a continuous
 extension multiply.  The accepted states and their rates do not: they lie further away.  States
-between them follow from the polynomial through the states and rates at the nearest ends of steps,
-in the chart at the start of the step.
-
-Angles of joints that turn without end, followed through the steps of a run.
+within such a step follow from Hermite interpolation (:class:`HermiteStep`): the polynomial through
+the states and rates at the nearest ends of steps, in the chart at the start of the step.
 """
 
 from __future__ import annotations
@@ -38,17 +32,30 @@ from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 
-SLACK = 1e-12
-"""Part of the time up to which a run is read beyond its ends, for rounding."""
+TIME_TOLERANCE = 1e-12
+"""Largest distance of an output time beyond the ends of a run, over the time, for rounding."""
+HERMITE_NODES = (4, 6, 8)
+"""Numbers of ends of steps: polynomials of degree 7, 11 and 15."""
+NODE_SPACING = 0.1
+"""Smallest distance of the ends of steps that are used, over the length of the step: closer ones
+would magnify their rounding."""
+CLOSE_SIGMA = 1.0
+"""Smallest sigma of a step, over the change of sigma in the step, below which the step is close to
+a singular configuration."""
+COMPARED_AT = np.array([0.25, 0.5, 0.75])
+"""Fractions of the step at which polynomials are compared."""
+STEP_PLACEMENTS = ("", "a priori", "redone")
+"""How steps are placed around singular configurations; see
+:class:`~srm_mbs.integration.methods.base.StepResult`."""
 
 
 def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
-    """``t`` (s) as a new array (k,), or () where a ``scalar`` is allowed.
+    """Output times ``t`` (s) as a new array (k,), or () where a ``scalar`` is allowed.
 
     Raises
     ------
     InputError
-        For more dimensions, or what are no numbers.
+        For more dimensions, or values that are not numbers.
     """
     try:
         times = np.array(t, dtype=float)
@@ -68,10 +75,10 @@ def check_within(t: FloatArray, start: float, end: float) -> None:
     Raises
     ------
     InputError
-        If there are such.
+        If there are any.
     """
-    slack = SLACK * max(abs(start), abs(end))
-    if len(t) and not (np.min(t) >= start - slack and np.max(t) <= end + slack):
+    tolerance = TIME_TOLERANCE * max(abs(start), abs(end))
+    if len(t) and not (np.min(t) >= start - tolerance and np.max(t) <= end + tolerance):
         raise InputError(
             f"the run covers t = {start:.9g} to {end:.9g} s, "
             f"asked for are {np.min(t):.9g} to {np.max(t):.9g} s",
@@ -80,24 +87,12 @@ def check_within(t: FloatArray, start: float, end: float) -> None:
         )
 
 
-NODES = (4, 6, 8)
-"""Numbers of ends of steps: polynomials of degree 7, 11 and 15."""
-SPACING = 0.1
-"""Smallest distance of the ends of steps that are used, over the length of the step: closer ones
-would magnify their rounding."""
-CLOSE = 1.0
-"""A step is close to a singular configuration if its smallest sigma is below CLOSE times the change
-of sigma over a step."""
-PROBES = np.array([0.25, 0.5, 0.75])
-"""Fractions of the step at which polynomials are compared."""
-
-
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
     """Whether stages of the step (abscissae and sigma, (s + 1,)) lie close to a zero of sigma."""
     if not np.isfinite(sigmas).all():
         return False
     change = float(np.max(np.abs(sigmas[1:] - sigmas[0]) / abscissae[1:]))
-    return bool(sigmas.min() < CLOSE * change)
+    return bool(sigmas.min() < CLOSE_SIGMA * change)
 
 
 class HermiteStep:
@@ -111,7 +106,7 @@ class HermiteStep:
     system, steps, step
         The run, and the number of the step.
     weights : (k,)
-        Those of the rates over a whole step, as far as they are in ``steps``.
+        Weights of the rates over a whole step, of those that are in ``steps``.
     """
 
     def __init__(self, system: System, steps: StepData, step: int, weights: FloatArray) -> None:
@@ -119,20 +114,20 @@ class HermiteStep:
         self._steps = steps
         self._step = step
         self._weights = weights
-        # Rates jump at breakpoints: a polynomial goes no further.
-        self._piece = steps.piece(step)
+        # Rates jump at breakpoints: a polynomial ends there.
+        self._interval = steps.smooth_interval(step)
         self._start = steps.states[step]
         self._h = steps.times[step + 1] - steps.times[step]
-        polynomials = [self._through(count) for count in NODES]
-        values = [polynomial(PROBES) for polynomial in polynomials]
+        polynomials = [self._through(count) for count in HERMITE_NODES]
+        values = [polynomial(COMPARED_AT) for polynomial in polynomials]
         changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
         self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
 
     def _nodes(self, count: int) -> list[int]:
         """Indices of up to ``count`` ends of steps around the step, none too close together."""
-        times, near = self._steps.times, SPACING * self._h
+        times, near = self._steps.times, NODE_SPACING * self._h
         states, reachable = self._steps.states, self._system.reachable
-        first, last = self._piece
+        first, last = self._interval
         before, after = [self._step], [self._step + 1]
         i, j = self._step - 1, self._step + 2
         while len(before) + len(after) < count and (i >= first or j <= last):
@@ -154,8 +149,8 @@ class HermiteStep:
         return sorted(before + after)
 
     def _moved(self, node: int) -> FloatArray:
-        """Motion (m,) from the step to a node, in the charts of the steps between: turns included,
-        however the rates change within a step."""
+        """Motion (m,) from the step to a node, in the charts of the steps between, whole turns
+        included."""
         steps = self._steps
         own = slice(min(node, self._step), max(node, self._step))
         count = len(self._weights)
@@ -167,7 +162,7 @@ class HermiteStep:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
-        last = self._piece[1]
+        last = self._interval[1]
         t0 = steps.times[self._step]
         points: list[float] = []
         values: list[FloatArray] = []
@@ -184,11 +179,6 @@ class HermiteStep:
         return np.array([self._system.retract(self._start, delta) for delta in deltas])
 
 
-PLACEMENTS = ("", "a priori", "redone")
-"""How steps are placed around singular configurations; see
-:class:`~srm_mbs.integration.methods.base.StepResult`."""
-
-
 @dataclass(frozen=True, eq=False)
 class StepData:
     """The accepted steps of a run as arrays, n steps of a tableau with s stages.
@@ -203,7 +193,7 @@ class StepData:
         Chart rates of the stages and the end point; of the extra stages as well for methods that
         evaluate them in every step.
     corrections : (n, m)
-        What was subtracted at each step end; (n, 0) without closures.
+        Corrections subtracted at each step end; (n, 0) without closures.
     sigmas : (n, s + 1)
         sigma at the stages and the end point.
     ranks : (n,)
@@ -211,7 +201,7 @@ class StepData:
     error_ratios : (n,)
         Error estimate over tolerance.
     placements : (n,)
-        How the step was placed around a singular configuration: index into PLACEMENTS.
+        How the step was placed around a singular configuration: index into STEP_PLACEMENTS.
     held : (n,)
         1 for steps that lingered next to a singular configuration, held on their branch, else 0.
     end_rate : (m,)
@@ -221,7 +211,7 @@ class StepData:
     stop
         Where a terminal event ended the run within the last step (s); None at the step's end.
     breaks : (k,)
-        Numbers of the steps that end on a breakpoint, counted from 1: behind it rates are others.
+        Numbers of the steps that end on a breakpoint, counted from 1: the rates jump there.
     break_rates : (k, m)
         Tangent rates before those breakpoints.
     """
@@ -251,8 +241,8 @@ class StepData:
         """Number of steps."""
         return len(self.times) - 1
 
-    def piece(self, step: int) -> tuple[int, int]:
-        """First and last end of a step, as indices into ``times``, between the breakpoints around
+    def smooth_interval(self, step: int) -> tuple[int, int]:
+        """First and last end of a step, as indices into ``times``, of the smooth interval around
         ``step``."""
         k = int(np.searchsorted(self.breaks, step, side="right"))
         first = int(self.breaks[k - 1]) if k else 0
@@ -260,7 +250,8 @@ class StepData:
         return first, last
 
     def rate_at(self, node: int, last: int) -> FloatArray:
-        """Tangent rate (m,) at the end ``node`` of a step of the piece that ends at ``last``."""
+        """Tangent rate (m,) at the end ``node`` of a step, of the smooth interval that ends at
+        ``last``."""
         rate: FloatArray
         if node < last:
             rate = self.rates[node, 0]
@@ -291,7 +282,7 @@ def step_data(
         sigmas=np.array([s.sigmas for s in steps]).reshape(n, stages),
         ranks=np.array([s.rank for s in steps], dtype=float),
         error_ratios=np.array([s.error_ratio for s in steps]),
-        placements=np.array([PLACEMENTS.index(s.placement) for s in steps], dtype=float),
+        placements=np.array([STEP_PLACEMENTS.index(s.placement) for s in steps], dtype=float),
         held=np.array([s.held for s in steps], dtype=float),
         end_rate=np.array(steps[-1].end_rate if n else np.zeros(tangent_size)),
         zones={
@@ -306,7 +297,7 @@ def step_data(
 
 
 def _corrections(steps: Sequence[StepResult]) -> FloatArray:
-    """What was subtracted at the ends of the ``steps``; 0 where a method does not in every step."""
+    """Corrections at the ends of the ``steps``; 0 in steps that a method does not correct."""
     size = max((s.correction.size for s in steps), default=0)
     nothing = np.zeros(size)
     rows = [s.correction if s.correction.size else nothing for s in steps]
@@ -315,7 +306,7 @@ def _corrections(steps: Sequence[StepResult]) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _abscissae(scheme: ButcherTableau) -> FloatArray:
-    """Those of the stages, and of the end."""
+    """Abscissae of the stages, and of the end."""
     return np.append(scheme.c, 1.0)
 
 
@@ -376,8 +367,8 @@ class DenseOutput:
         return times, states
 
     def complete(self) -> StepData:
-        """The steps with the rates of all stages that reading between them needs: for a reader
-        that does not have the controller."""
+        """The steps with the rates of all stages that dense output needs: for a reader without the
+        controller."""
         data, count = self._steps, self._extension.n_rates
         if not data.count or data.rates.shape[1] == count:
             return data
@@ -390,15 +381,15 @@ class DenseOutput:
 
     @cached_property
     def _whole(self) -> FloatArray:
-        """Weights of the rates over a whole step, as far as the steps have them: those of extra
+        """Weights of the rates over a whole step, of those that the steps have: those of extra
         stages are zero."""
         weights: FloatArray = self._extension.weights(np.ones(1))[0]
         return weights[: self._steps.rates.shape[1]]
 
     def _between_neighbours(self, step: int) -> bool:
-        """Whether a step is read from its neighbours (:mod:`.hermite`), not from its stages."""
+        """Whether a step is interpolated between ends of steps (:class:`HermiteStep`)."""
         data = self._steps
-        first, last = data.piece(step)
+        first, last = data.smooth_interval(step)
         return last - first > 1 and (
             step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
         )
@@ -415,7 +406,7 @@ class DenseOutput:
         ramps = self._ramps(step, theta, h)
         states = []
         for k in range(len(theta)):
-            # One at a time: how BLAS sums would depend on what else is read with it.
+            # One at a time: the order of BLAS sums would depend on the other times.
             x = system.retract(start, weights[k] @ rates)
             states.append(x if ramps is None else system.retract(x, ramps[k]))
         return np.array(states)
@@ -473,11 +464,11 @@ def unwrapped_angles(
     # A long step may turn the joint by more than pi: its chart coordinate knows by how much.
     h = np.diff(steps.times)
     turned = h * (steps.rates[:, : scheme.n_stages, joint.idx_v] @ scheme.b)
-    wound = principal[0] + np.concatenate([[0.0], np.cumsum(turned)])
-    wound = _nearest_turn(principal, wound)
+    unwrapped = principal[0] + np.concatenate([[0.0], np.cumsum(turned)])
+    unwrapped = _nearest_turn(principal, unwrapped)
     step = np.clip(np.searchsorted(steps.times, t, side="right") - 1, 0, steps.count - 1)
     theta = (t - steps.times[step]) / h[step]
-    return _nearest_turn(here, _between(wound, nq, joint.idx_v, steps, step, theta))
+    return _nearest_turn(here, _between(unwrapped, nq, joint.idx_v, steps, step, theta))
 
 
 def _nearest_turn(principal: FloatArray, guess: FloatArray) -> FloatArray:
@@ -486,10 +477,11 @@ def _nearest_turn(principal: FloatArray, guess: FloatArray) -> FloatArray:
 
 
 def _between(
-    wound: FloatArray, nq: int, k: int, steps: StepData, step: IndexArray, theta: FloatArray
+    unwrapped: FloatArray, nq: int, k: int, steps: StepData, step: IndexArray, theta: FloatArray
 ) -> FloatArray:
     """The angle (n,) at the fractions ``theta`` (n,) of the steps ``step`` (n,), by the polynomial
-    of degree 5 through the angle ``wound``, rate v_k and its derivative at both ends of a step."""
+    of degree 5 through the angle ``unwrapped``, the rate v_k and its derivative at both ends of a
+    step."""
     h, rate = np.diff(steps.times), steps.states[:, nq + k]
     place = steps.rates.shape[2] // 2 + k
     starts = steps.rates[:, 0, place]
@@ -498,8 +490,8 @@ def _between(
         ends[steps.breaks - 1] = steps.break_rates[:, place]
     v0, v1 = (h * rate[:-1])[step], (h * rate[1:])[step]
     a0, a1 = (h**2 * starts)[step], (h**2 * ends)[step]
-    start, gain = wound[step], np.diff(wound)[step]
-    # What is left of the cubic terms after the Taylor polynomial at the start.
+    start, gain = unwrapped[step], np.diff(unwrapped)[step]
+    # Differences from the Taylor polynomial at the start.
     p = gain - v0 - 0.5 * a0
     v = v1 - v0 - a0
     a = a1 - a0

@@ -67,7 +67,7 @@ class Attempt:
     t: float
     h: float
     error_ratio: float
-    verdict: StepDecision
+    decision: StepDecision
 
 
 @dataclass
@@ -178,7 +178,7 @@ def integrate(
     breakpoints: BreakpointHandler | None = None,
     words: ProblemVocabulary = MECHANISM,
 ) -> RunRecord:
-    """Integrate from ``t0`` to ``t_end``; never raises for what happens on the way.
+    """Integrate from ``t0`` to ``t_end``; errors on the way end the run, and are not raised.
 
     Parameters
     ----------

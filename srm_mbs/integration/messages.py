@@ -47,11 +47,11 @@ class RunFailure:
 
 @dataclass(frozen=True)
 class ProblemVocabulary:
-    """Names of the problem in messages: what is singular, what drives it, what to check."""
+    """Phrases of messages that name the problem: its singularity, its forces, and a check."""
 
     singular: str
     forces: str
-    goes_on: str
+    check: str
 
 
 MECHANISM = ProblemVocabulary(
@@ -91,7 +91,7 @@ def failure_message(
     return (
         f"Stopped at t = {t:.6g} s with step {h:.1e} s: {failure.sentence}.{near} "
         f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
-        f"tableau, or check that {words.goes_on}."
+        f"tableau, or check that {words.check}."
     )
 
 

@@ -34,7 +34,7 @@ from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.control.placement import SINGULAR_END_SIGMA
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.methods.multiplier_history import WINDOW, MultiplierHistory
-from srm_mbs.integration.methods.near_singular import ZONE_LARGEST
+from srm_mbs.integration.methods.near_singular import LARGEST_ZONE_SIGMA
 from srm_mbs.integration.methods.psrm import PSRM
 
 BLOCK_STEPS = WINDOW - 1
@@ -216,7 +216,7 @@ class BranchMotion:
         for _ in range(DEPARTURE_BLOCKS):
             span = min(self._block_time(points[-1].rate, longest), t_end - times[-1])
             block_times = np.linspace(times[-1], times[-1] + span, BLOCK_STEPS + 1)
-            block = self.block(points[-1], block_times, ZONE_LARGEST)
+            block = self.block(points[-1], block_times, LARGEST_ZONE_SIGMA)
             if block is None:
                 break
             times += block_times[1:].tolist()
@@ -434,7 +434,7 @@ def start(
     multiplier = limit.multiplier(v, free)
     rate = np.concatenate([v, free - multiplier])
     history = MultiplierHistory.begin(t, multiplier)
-    if begins or memory.sigma < ZONE_LARGEST:
+    if begins or memory.sigma < LARGEST_ZONE_SIGMA:
         try:
             history = motion.departure(t, Point(state, rate, multiplier, memory.sigma), t_end)
         except InputError:

@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.dynamics.constraints.structure import BLUNT
+from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.local_analysis import (
     Participants,
@@ -33,7 +33,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     smallest_singular_value,
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
-from srm_mbs.integration.dense_output import PLACEMENTS, DenseOutput, StepData
+from srm_mbs.integration.dense_output import STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 SLOPE_MARGIN = 1.5
@@ -372,9 +372,9 @@ def _placement(steps: StepData, i: int) -> str:
     # At the end of a step the next one's stages may be those that came too close.
     if any(k in steps.zones for k in (i - 1, i, i + 1)):
         return "zone"
-    here = PLACEMENTS[int(steps.placements[i])]
+    here = STEP_PLACEMENTS[int(steps.placements[i])]
     # Placing may shorten the step before, so that the next one passes in the middle.
-    return here or (PLACEMENTS[int(steps.placements[i - 1])] if i else "")
+    return here or (STEP_PLACEMENTS[int(steps.placements[i - 1])] if i else "")
 
 
 def crossing_at(
@@ -411,7 +411,7 @@ def find_crossings(
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
     monitor = ConstraintMonitor(analysis, dense)
-    if analysis.sigma_reference < BLUNT:
+    if analysis.sigma_reference < SMALL_REFERENCE_PIVOT:
         sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
     found: list[Crossing] = []

@@ -24,16 +24,18 @@ def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> Fl
         Lengths of the axes, None for an axis of any length; without a shape, any is accepted.
     """
     try:
-        if not np.isrealobj(values):  # NumPy drops imaginary parts with no more than a warning
+        given = np.asarray(values)
+        if given.dtype.kind == "c":  # NumPy drops imaginary parts with no more than a warning
             return None
-        array = np.array(values, dtype=float)
+        array: FloatArray = given.astype(float)
     except (TypeError, ValueError, OverflowError):
         return None
-    if shape is not None and (
-        array.ndim != len(shape)
-        or any(length not in (None, given) for length, given in zip(shape, array.shape))
-    ):
-        return None
+    if shape is not None and array.shape != shape:
+        fits = len(shape) == array.ndim and all(
+            length in (None, actual) for length, actual in zip(shape, array.shape)
+        )
+        if not fits:
+            return None
     return array if np.isfinite(array).all() else None
 
 

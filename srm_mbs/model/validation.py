@@ -117,7 +117,7 @@ def check_tree(model: pin.Model) -> None:
     Raises
     ------
     InputError
-        Naming what is wrong, or the joint that is out of order.
+        Naming the fault, or the joint that is out of order.
     """
     if model.nv == 0:
         raise InputError(

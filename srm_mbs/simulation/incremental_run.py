@@ -286,7 +286,7 @@ class ReferenceRun(_IncrementalRun):
         )
         if record.times:
             self.t, self.state = record.times[-1], record.steps[-1].state
-        rejected = sum(a.verdict is StepDecision.REJECTED for a in record.attempts)
+        rejected = sum(a.decision is StepDecision.REJECTED for a in record.attempts)
         zones = sum(step.zone is not None for step in record.steps)
         self._counted += [len(record.times), rejected, 0, 0, zones]
         if record.status is RunStatus.INTERRUPTED:

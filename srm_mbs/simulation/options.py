@@ -22,6 +22,7 @@ from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.thesis.srm import SRM
+from srm_mbs.model.numbers import finite_array
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""
@@ -199,12 +200,8 @@ def finite(value: Any, what: str) -> float:
 
 def numbers(values: Any, what: str, remedy: str) -> FloatArray:
     """``values`` as an array of finite numbers."""
-    try:
-        # NumPy would drop imaginary parts with no more than a warning.
-        array = np.array(values, dtype=float) if np.isrealobj(values) else np.full(1, np.nan)
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if not np.isfinite(array).all():
+    array = finite_array(values)
+    if array is None:
         raise InputError(
             f"{what} = {values!r} does not consist of finite numbers", element=what, remedy=remedy
         )

@@ -87,7 +87,7 @@ it was ``"rejected"`` for its error or ``"replaced"`` because of a singular conf
 
 def attempt_array(attempts: Iterable[Any]) -> NDArray[np.void]:
     """The ``attempts`` of a run as a structured array (k,) of :data:`ATTEMPT`."""
-    rows = [(a.t, a.h, a.error_ratio, a.verdict.value) for a in attempts]
+    rows = [(a.t, a.h, a.error_ratio, a.decision.value) for a in attempts]
     return np.array(rows, dtype=ATTEMPT)
 
 

@@ -523,7 +523,7 @@ def statistics(
     """Counts of a run, ``placed`` and ``replaced`` by its step placement."""
     return Statistics(
         steps=data.count,
-        rejected=sum(attempt.verdict is StepDecision.REJECTED for attempt in record.attempts),
+        rejected=sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
         placements=placed,
         replaced=replaced,
         zone_steps=len(data.zones),

@@ -1,4 +1,4 @@
-"""The cases of a sweep: what the caller may give, as a list of named parameter sets."""
+"""The cases of a sweep: every accepted form, as a list of named parameter sets."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 
 STARTS = ("q0", "v0", "q", "v")
-"""Parameters that say where a given mechanism starts."""
+"""Parameters of the start of a given mechanism."""
 RESERVED = ("case", "success", "status", "message")
-"""Columns that every table has."""
+"""Columns of every table, which no parameter or measure may have."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Case:
     Attributes
     ----------
     index
-        Its place among the cases.
+        Position among the cases.
     name
-        Its key in a mapping of cases; otherwise ``index``.
+        Key in a mapping of cases; otherwise ``index``.
     parameters
-        What it was given.
+        Name -> value.
     """
 
     index: int
@@ -37,17 +37,22 @@ class Case:
 
     @property
     def where(self) -> str:
-        """For messages."""
+        """Place of the case in messages."""
         return f"cases[{self.name!r}]"
 
 
 def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) -> tuple[Case, ...]:
-    """``cases`` in order, checked; ``free``: parameters of any name are allowed.
+    """``cases`` in order, checked.
+
+    Parameters
+    ----------
+    free
+        Whether parameters of any name are allowed for a given mechanism.
 
     Raises
     ------
     InputError
-        Naming the case.
+        If there are no cases, or one of them, which the message names, is malformed.
     """
     if isinstance(cases, Mapping):
         found = _from_mapping(cases)
@@ -96,9 +101,9 @@ def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
 
 def _check_names(case: Case, mechanism_given: bool, free: bool) -> None:
     names = set(case.parameters)
-    if taken := sorted(names & set(RESERVED)):
+    if reserved := sorted(names & set(RESERVED)):
         raise InputError(
-            f"{taken[0]!r} is a column of every table",
+            f"{reserved[0]!r} is a column of every table",
             element=case.where,
             remedy="Give the parameter another name",
         )

@@ -1,8 +1,12 @@
-"""A hash of anything that can be pickled, the same in every process: is this the same sweep?
+"""Fingerprint of anything that can be pickled, equal in all processes, to recognise a sweep.
 
-Pickles themselves do not do: their bytes depend on which equal objects are identical.  Here a value
-is taken apart as pickle would, and every part is hashed by its contents.  A function counts by its
-name, code, defaults, attributes and the variables that it encloses; what it calls is not followed.
+The bytes of a pickle depend on which equal objects are identical.  Here a value is divided as
+pickle does, and every part is hashed by its contents.  The fingerprint of a function covers its
+name, code, defaults, attributes and closure variables, not the functions that it calls.
+
+``joblib.hash`` would not do: it pickles functions by name, so that it does not notice a changed
+function and cannot hash a lambda, and it distinguishes lists from tuples and NumPy scalars from
+Python's, which cases read from other sources mix.
 """
 
 from __future__ import annotations
@@ -19,12 +23,12 @@ import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
 
-_NOT_COMPARED = ("name", "source", "defaults", "notes")
-"""Fields of a mechanism that change nothing in a run."""
+_IGNORED_FIELDS = ("name", "source", "defaults", "notes")
+"""Fields of a mechanism that do not influence a run."""
 
 
 def fingerprint(value: Any) -> str:
-    """32 hexadecimal digits.
+    """The fingerprint of ``value``, 32 hexadecimal digits.
 
     Raises
     ------
@@ -36,10 +40,10 @@ def fingerprint(value: Any) -> str:
     return hashed.hexdigest()
 
 
-def _add(value: Any, put: Any, inside: list[int]) -> None:
-    """Hash ``value``, a part of the objects with the ids ``inside``."""
-    if id(value) in inside:
-        put(b"<again>%d" % inside.index(id(value)))
+def _add(value: Any, put: Any, enclosing: list[int]) -> None:
+    """Hash ``value``, which the objects with the ids ``enclosing`` contain."""
+    if id(value) in enclosing:  # a reference to an enclosing object
+        put(b"<again>%d" % enclosing.index(id(value)))
         return
     tag, parts = _parts(value)
     head = tag.encode()
@@ -48,14 +52,14 @@ def _add(value: Any, put: Any, inside: list[int]) -> None:
         put(struct.pack("<q", len(parts)) + parts)
         return
     put(struct.pack("<q", len(parts)))
-    inside.append(id(value))
+    enclosing.append(id(value))
     for part in parts:
-        _add(part, put, inside)
-    inside.pop()
+        _add(part, put, enclosing)
+    enclosing.pop()
 
 
 def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
-    """A name for the kind of ``value``, and its contents: bytes, or further values."""
+    """A tag for the type of ``value``, and its contents: bytes, or further values."""
     if isinstance(value, np.generic):
         value = value.item()
     kind = type(value).__qualname__
@@ -71,7 +75,7 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
         case set() | frozenset():
             return kind, sorted(fingerprint(part).encode() for part in value)
         case Mapping():
-            # In the order of their keys' hashes: a dictionary is the same in any order.
+            # In the order of the fingerprints of the keys: the order of insertion does not count.
             items = sorted(value.items(), key=lambda item: fingerprint(item[0]))
             return "mapping", [part for item in items for part in item]
         case np.ndarray() if value.dtype != object:
@@ -79,7 +83,7 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
         case np.ndarray():
             return "objects", [value.shape, value.tolist()]
         case Mechanism():
-            names = [field.name for field in fields(value) if field.name not in _NOT_COMPARED]
+            names = [field.name for field in fields(value) if field.name not in _IGNORED_FIELDS]
             return kind, [getattr(value, name) for name in names]
         case pin.Model():
             return kind, value.saveToString().encode()
@@ -93,7 +97,7 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
             return "method", [value.__func__, value.__self__]
         case CodeType():
             return "code", [value.co_code, value.co_names, *value.co_consts]
-    if is_dataclass(value):  # without what it keeps beside its fields
+    if is_dataclass(value):  # without cached attributes
         parts = [getattr(value, field.name) for field in fields(value)]
     else:
         parts = _reduced(value)
@@ -105,7 +109,7 @@ def _name(value: Any) -> str:
 
 
 def _reduced(value: Any) -> list[Any]:
-    """What pickle would keep of an object."""
+    """The parts of an object that pickle stores."""
     reduced = value.__reduce_ex__(4)
     if isinstance(reduced, str):
         return [reduced]

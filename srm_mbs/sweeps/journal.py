@@ -1,8 +1,8 @@
-"""The file of a sweep that can be resumed: one JSON line per finished case.
+"""The journal of a sweep that can be resumed: a file with one JSON line per finished case.
 
-The first line says which sweep it is: a fingerprint of each part that decides what a run gives.  A
-case is known by the fingerprint of its parameters, and equal cases by their number, so that cases
-may be added, left out or put in another order when the sweep is resumed.
+The first line identifies the sweep by fingerprints of everything that determines the results.  A
+case is identified by the fingerprint of its parameters, and equal cases are numbered, so that cases
+may be added, removed or reordered when the sweep is resumed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from srm_mbs.sweeps.fingerprint import fingerprint
 from srm_mbs.sweeps.tasks import Outcome, Task
 
 FORMAT = 1
+"""Version of the file format."""
 
 
 class Journal:
@@ -30,20 +31,19 @@ class Journal:
     Parameters
     ----------
     path
-        Of the file; made if there is none.
+        Path of the file, which is created if it does not exist.
     task, cases
         Of the sweep.
 
     Attributes
     ----------
     known
-        Index of a case -> outcome, of those in the file.
+        Index of a case -> outcome, for the cases in the file.
 
     Raises
     ------
     InputError
-        If the file is of another sweep, is damaged elsewhere than in its last line, or cannot be
-        written.
+        If the file belongs to another sweep, is damaged before its last line, or cannot be written.
     """
 
     def __init__(self, path: Path, task: Task, cases: Sequence[Case]) -> None:
@@ -54,7 +54,7 @@ class Journal:
         try:
             whole = self._read(head) if path.exists() else 0
             self._file: TextIOWrapper = path.open("r+" if whole else "w", encoding="utf-8")
-            # A line that was cut off when the process died.
+            # The last line is incomplete if the process was killed.
             self._file.seek(whole)
             self._file.truncate()
             if not whole:
@@ -68,7 +68,7 @@ class Journal:
             ) from error
 
     def _read(self, head: Mapping[str, Any]) -> int:
-        """Take what is known; the length of the whole lines."""
+        """Read the known outcomes; returns the length (bytes) of the complete lines."""
         data = self._path.read_bytes()
         whole = data.rfind(b"\n") + 1
         lines = data[:whole].splitlines()
@@ -92,7 +92,7 @@ class Journal:
         return whole
 
     def _check(self, found: Any, head: Mapping[str, Any]) -> None:
-        """Refuse the file of another sweep."""
+        """Refuse the file of another sweep or format."""
         if not isinstance(found, dict) or found.get("format") != FORMAT:
             raise self._fault("it is not a file of a sweep, or is of another format")
         own, other = head["sweep"], found.get("sweep", {})
@@ -111,7 +111,7 @@ class Journal:
         )
 
     def add(self, case: Case, outcome: Outcome) -> None:
-        """Keep the outcome of a case; what was raised is not kept, so that it is tried again."""
+        """Write the outcome of a case, unless it raised: such cases are repeated."""
         if outcome.traceback:
             return
         kept = {key: value for key, value in asdict(outcome).items() if key != "traceback"}
@@ -134,7 +134,7 @@ class Journal:
 
 
 def _parts(task: Task) -> dict[str, str]:
-    """Fingerprints of what decides what the runs give."""
+    """Fingerprints of everything that determines the results."""
     options = [task.options, task.simulate_options]
     parts = {
         "mechanism": task.source,
@@ -142,13 +142,13 @@ def _parts(task: Task) -> dict[str, str]:
         "measure": task.measure,
         "options": options,
     }
-    return {name: _known(value, name) for name, value in parts.items()}
+    return {name: _checked_fingerprint(value, name) for name, value in parts.items()}
 
 
-def _known(value: Any, what: str) -> str:
+def _checked_fingerprint(value: Any, what: str) -> str:
     try:
         return fingerprint(value)
-    except Exception as error:  # objects may raise anything when they are taken apart
+    except Exception as error:  # objects may raise anything when they are pickled
         raise InputError(
             f"what it holds cannot be compared with a later sweep: {error}",
             element=what,
@@ -160,7 +160,7 @@ def _keys(cases: Sequence[Case]) -> list[str]:
     seen: Counter[str] = Counter()
     out = []
     for case in cases:
-        key = _known(case.parameters, case.where)
+        key = _checked_fingerprint(case.parameters, case.where)
         seen[key] += 1
         out.append(key if seen[key] == 1 else f"{key}-{seen[key]}")
     return out

@@ -1,4 +1,4 @@
-"""What a sweep returns: a table with one row per case, and what was raised."""
+"""The result of a sweep: a table with one row per case, and the failures."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs.errors import InputError
+from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.sweeps.cases import Case
 from srm_mbs.sweeps.tasks import Outcome
 
@@ -25,16 +26,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Failure:
-    """A case in which something was raised.
+    """A case that raised an exception.
 
     Attributes
     ----------
     index, name, parameters
         Of the case.
     message
-        What was raised: type and text.
+        Type and text of the exception.
     traceback
-        As text.
+        Its traceback as text.
     """
 
     index: int
@@ -52,10 +53,10 @@ class Sweep:
     cases
         Parameters of each case, in the order given.
     failures
-        The cases in which something was raised, with their parameters and the traceback.  Runs that
-        ended early are none: their rows say why.
+        The cases that raised an exception, with their parameters and the traceback.  A run that
+        ended early is no failure: its row has the reason.
     resumed
-        Number of cases that were taken from the file of ``resume``.
+        Number of cases that were read from the file ``resume``.
     """
 
     def __init__(self, cases: Sequence[Case], outcomes: Sequence[Outcome], resumed: int) -> None:
@@ -75,8 +76,8 @@ class Sweep:
     def table(self) -> dict[str, NDArray[Any]]:
         """Columns (cases,): ``case``, parameters, ``success``, ``status``, ``message``, measures.
 
-        Parameters that hold several values have a column for each, ``q0[0]`` or ``q.crank``.
-        Missing numbers are nan, missing texts empty.
+        Parameters with several values have a column for each, ``q0[0]`` or ``q.crank``.  Missing
+        numbers are nan, missing texts empty.
         """
         rows: list[dict[str, Any]] = [
             {
@@ -89,7 +90,7 @@ class Sweep:
             }
             for case, outcome in zip(self._cases, self._outcomes)
         ]
-        # The parameters of all cases stand before the measures of any.
+        # The parameters of all cases precede the measures.
         names = {"case": None} | dict.fromkeys(
             name for case in self.cases for name, _ in _flat(case)
         )
@@ -122,15 +123,13 @@ class Sweep:
         log.info("written: %s", path)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the table as comma-separated values, with as many digits as give the floats back.
+        """Write the table as comma-separated values, with enough digits to restore the floats.
 
         Raises
         ------
         OSError
             If the file cannot be written.
         """
-        from srm_mbs.simulation.csv_export import write_table
-
         write_table(self.table, Path(path))
 
     def __repr__(self) -> str:
@@ -142,7 +141,7 @@ class Sweep:
 
 
 def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Columns of the parameters of one case."""
+    """(column, value) of the parameters of one case."""
     for name, value in parameters.items():
         if isinstance(value, Mapping):
             yield from _flat({f"{name}.{key}": part for key, part in value.items()})
@@ -157,7 +156,7 @@ def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """Whole numbers, truth values, floats with nan, or texts: whichever holds all of them."""
+    """``values`` as integers, booleans, floats with nan, or texts: the first that holds all."""
     present = [value for value in values if value is not None]
     complete = len(present) == len(values)
     if complete and all(isinstance(value, bool) for value in present):

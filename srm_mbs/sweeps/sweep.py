@@ -1,4 +1,4 @@
-"""``sweep``: many runs on an executor, each kept as soon as it is finished."""
+"""``sweep``: many runs on an executor, each recorded as soon as it is finished."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from srm_mbs.sweeps.tasks import (
 
 log = logging.getLogger(__name__)
 
-OUTSTANDING = 512
-"""Chunks that an executor is given at once: each carries the mechanism, thousands would add up."""
-_OF_THE_SWEEP = {
+MAX_PENDING_CHUNKS = 512
+"""Most chunks that are submitted at once: each has a copy of the mechanism."""
+_REFUSED_OPTIONS = {
     "q0": "Give it in the cases",
     "v0": "Give it in the cases",
     "progress": "Give True, or a function of (done, total)",
     "raise_on_failure": "Leave it out: runs that end early are rows that say why",
 }
-"""Options of ``simulate`` that a sweep does not hand on, and what to do instead."""
+"""Options of ``simulate`` that a sweep does not accept, with the remedy."""
 
 
 def sweep(
@@ -57,37 +57,37 @@ def sweep(
     progress: bool | Counted = False,
     **simulate_options: Any,
 ) -> Sweep:
-    """Simulate many cases to ``t_end`` (s), and keep what ``measure`` says of each.
+    """Simulate many cases to ``t_end`` (s), and record the measures of each.
 
     Parameters
     ----------
     mechanism
-        A mechanism, whose cases differ in their start; or a function that makes the one of a case,
-        called with the parameters as keywords.  The function may return (mechanism, options): the
-        options, such as a controller, go to :func:`srm_mbs.simulate`.
+        A mechanism, whose cases differ in their start; or a function that makes the mechanism of a
+        case, called with the parameters as keywords.  The function may return (mechanism, options)
+        with options of :func:`srm_mbs.simulate`, such as a controller.
     cases
         A sequence of dictionaries of parameters, a mapping of names to such dictionaries, or a
         mapping of columns, parameter -> array with an entry or a row per case.  For a given
         mechanism the parameters are ``q0`` (nq,) and ``v0`` (nv,), a consistent state, or ``q`` and
-        ``v`` as :func:`srm_mbs.assemble` takes them, joint -> value; it assembles the case, and
-        rates not given are the least-norm ones.
+        ``v`` as for :func:`srm_mbs.assemble`, joint -> value, from which the case is assembled;
+        unspecified rates are those of least norm.
     t_end
         End of the runs (s).
     measure
-        Solution -> dictionary of numbers, texts or None, the columns of the table; only these come
-        back from a worker.  By default :func:`srm_mbs.standard_measures`.
+        Solution -> dictionary of numbers, texts or None, the columns of the table; workers return
+        only these.  By default :func:`srm_mbs.standard_measures`.
     options
         Parameters of a case -> further options of its run, ``t_end`` included.  With it the cases
-        of a given mechanism may have other parameters, too.
+        of a given mechanism may have other parameters as well.
     executor
-        Any executor of the kind of ``concurrent.futures``; by default the cases run one after the
-        other in this thread.  Threads share the mechanism; others get it pickled.
+        Any executor with the interface of ``concurrent.futures``; by default the cases run
+        sequentially in this thread.  Threads share the mechanism; processes get it pickled.
     chunk
-        Cases that a worker is given at a time, and that are lost together if it dies.  More than
-        one pays where a run takes less time than sending it.
+        Number of cases that a worker runs at a time, which are lost together if it dies.  More than
+        one is faster if a run takes less time than sending it.
     resume
-        A file to which every finished case is appended, and from which those that it holds already
-        are taken instead of being run.  Cases in which something was raised are tried again.
+        A file to which every finished case is appended; the cases that it already has are read
+        instead of being run.  Cases that raised an exception are repeated.
     progress
         True for a bar (on a terminal only), or a function of (done, total), called after each case.
     **simulate_options
@@ -96,14 +96,14 @@ def sweep(
     Returns
     -------
     Sweep
-        One row per case, in the order given, also of those that failed: neither a run that raises
-        nor a worker that dies ends the sweep.
+        One row per case, in the given order, including failed cases: neither a run that raises nor
+        a worker that dies ends the sweep.
 
     Raises
     ------
     InputError
-        For invalid cases or options, a file of another sweep, or functions that cannot be sent to
-        other processes; before any run.
+        Before any run, for invalid cases or options, a file of another sweep, or functions that
+        cannot be sent to other processes.
     """
     if not (isinstance(mechanism, Mechanism) or callable(mechanism)):
         raise InputError(
@@ -131,13 +131,13 @@ def sweep(
         )
     check_progress(progress, "(done, total)")
     _check_options(simulate_options)
-    if isinstance(simulate_options.get("events"), Iterator):  # for every run
+    if isinstance(simulate_options.get("events"), Iterator):  # read once, used by every run
         simulate_options["events"] = list(simulate_options["events"])
     given = listed(mechanism, cases, free=options is not None)
     _, t_end = checked_span(simulate_options.get("t0", 0.0), t_end)
     task = Task(mechanism, t_end, measure, options, simulate_options)
     if isinstance(mechanism, Mechanism):
-        _ = mechanism.structure  # found once, not by every worker
+        _ = mechanism.structure  # computed once, not by every worker
 
     with ExitStack() as stack:
         journal = None
@@ -147,7 +147,7 @@ def sweep(
             outcomes |= journal.known
         resumed = len(outcomes)
         log.info("sweep of %d cases, %d of them known", len(given), resumed)
-        told = stack.enter_context(counting(progress, "cases", len(given)))
+        report = stack.enter_context(counting(progress, "cases", len(given)))
         missing = [case for case in given if case.index not in outcomes]
         finished = stack.enter_context(closing(_finished(task, missing, executor, chunk)))
         for case, outcome in finished:
@@ -155,26 +155,26 @@ def sweep(
             log.debug("%s: %s", case.where, outcome.message)
             if journal is not None:
                 journal.add(case, outcome)
-            if told is not None:
-                told(len(outcomes), len(given))
+            if report is not None:
+                report(len(outcomes), len(given))
     found = Sweep(given, [outcomes[case.index] for case in given], resumed)
     log.info("sweep ended: %s", found)
     return found
 
 
 def _check_options(options: Mapping[str, Any]) -> None:
-    """Refuse options that no run would take."""
+    """Refuse options that runs do not accept."""
     known = set(inspect.signature(simulate).parameters) - {"mechanism", "t_end"}
     for name in options:
-        if name in _OF_THE_SWEEP:
+        if name in _REFUSED_OPTIONS:
             raise InputError(
-                f"a sweep has no option {name!r}", element=name, remedy=_OF_THE_SWEEP[name]
+                f"a sweep has no option {name!r}", element=name, remedy=_REFUSED_OPTIONS[name]
             )
         if name not in known:
             raise InputError(
                 f"there is no option {name!r}",
                 element=name,
-                remedy=f"Known: {', '.join(sorted(known - set(_OF_THE_SWEEP)))}",
+                remedy=f"Known: {', '.join(sorted(known - set(_REFUSED_OPTIONS)))}",
             )
     mechanism_method(options.get("method", "psrm"), options.get("tableau"))
 
@@ -182,7 +182,7 @@ def _check_options(options: Mapping[str, Any]) -> None:
 def _finished(
     task: Task, cases: Sequence[Case], executor: Executor | None, chunk: int
 ) -> Generator[tuple[Case, Outcome]]:
-    """Each case with its outcome, as soon as it is known."""
+    """Yield each case with its outcome, as soon as it is known."""
     if executor is None:
         for case in cases:
             yield case, task.run(case.parameters)
@@ -193,11 +193,11 @@ def _finished(
     done: SimpleQueue[Future[list[Outcome]]] = SimpleQueue()
     try:
         while True:
-            more = list(islice(chunks, OUTSTANDING - len(running)))
+            more = list(islice(chunks, MAX_PENDING_CHUNKS - len(running)))
             for part in more:
                 try:
                     future = executor.submit(run_chunk, sent, [case.parameters for case in part])
-                except Exception as error:  # its workers are dead, or it was shut down
+                except Exception as error:  # its workers have died, or it was shut down
                     yield from ((case, raised(error)) for case in part)
                 else:
                     running[future] = part
@@ -214,7 +214,7 @@ def _finished(
 
 
 def _outcomes(future: Future[list[Outcome]], count: int) -> Sequence[Outcome]:
-    """The outcomes of a chunk of ``count`` cases; the same one for all if its worker is lost."""
+    """The outcomes of a chunk of ``count`` cases; the same failure for all if its worker died."""
     try:
         return future.result()
     except Exception as error:

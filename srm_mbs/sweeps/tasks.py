@@ -1,4 +1,4 @@
-"""One run of a sweep, wherever it happens: made, simulated and measured."""
+"""One case of a sweep, in any process: make the mechanism, simulate it, measure the run."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs.api import Solution, simulate
+from srm_mbs.assembly.assemble import assemble
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.sweeps.cases import RESERVED, STARTS
@@ -20,18 +21,18 @@ Value = bool | int | float | str | None
 Measure = Callable[[Solution], Mapping[str, Any]]
 
 ERROR = "error"
-"""Status of a case in which something was raised."""
+"""Status of a case that raised an exception."""
 
 
 def standard_measures(solution: Solution) -> dict[str, Value]:
-    """What a sweep measures by default, at the ends of a run only: long runs stay cheap.
+    """Default measures of a sweep, at the ends of a run only, so that long runs stay cheap.
 
-    ``t_end`` (s) is where it ended, ``drift`` the closure error ||g|| (m, rad) there,
-    ``energy_change`` (J) kinetic plus potential energy there minus that of the start, ``steps`` the
-    accepted ones, ``wall_time`` in seconds.
+    ``t_end`` (s) is the time at which the run ended, ``drift`` the closure error ||g|| (m, rad)
+    there, ``energy_change`` (J) the change of kinetic plus potential energy since the start,
+    ``steps`` the number of accepted steps, ``wall_time`` in seconds.
     """
     ends = solution.at(solution.span)
-    # A state that runs away overflows in its energy.
+    # The energy of a divergent state overflows.
     with np.errstate(over="ignore", invalid="ignore"):
         drift, energy = ends.drift, ends.energy
     return {
@@ -45,17 +46,16 @@ def standard_measures(solution: Solution) -> dict[str, Value]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is known of a run afterwards.
+    """The outcome of a case.
 
     Attributes
     ----------
     success, status, message
-        Of the solution; False, ``"error"`` and the last line of the traceback if something was
-        raised.
+        Of the solution; False, ``"error"`` and the last line of the traceback after an exception.
     measures
-        Name -> number, text or None; empty if something was raised.
+        Name -> number, text or None; empty after an exception.
     traceback
-        Text of it; empty if nothing was raised.
+        As text; empty without an exception.
     """
 
     success: bool
@@ -66,14 +66,14 @@ class Outcome:
 
 
 def raised(error: BaseException) -> Outcome:
-    """The outcome of a case that ``error`` ended."""
+    """The outcome of a case that raised ``error``."""
     message = "".join(traceback.format_exception_only(error)).strip()
     return Outcome(False, ERROR, message, {}, "".join(traceback.format_exception(error)))
 
 
 @dataclass(frozen=True)
 class Task:
-    """What all runs of a sweep have in common; see :func:`srm_mbs.sweep`."""
+    """The common part of all cases of a sweep; see :func:`srm_mbs.sweep`."""
 
     source: Mechanism | Callable[..., Any]
     t_end: float
@@ -110,8 +110,6 @@ class Task:
             return mechanism, chosen | more
         start = {name: parameters[name] for name in STARTS if name in parameters}
         if "q" in start or "v" in start:
-            from srm_mbs.assembly.assemble import assemble
-
             state = assemble(self.source, **start)
             start = {"q0": state.q, "v0": state.v}
         return self.source, chosen | start
@@ -125,7 +123,7 @@ def checked_measures(
     Raises
     ------
     InputError
-        If they are no such values, or have the name of another column.
+        If they are not numbers, texts or None, or have the name of another column.
     """
     remedy = "Let measure= return a dictionary of numbers: name of a column -> number"
     if not isinstance(measures, Mapping):
@@ -174,12 +172,12 @@ def packed(task: Task) -> bytes:
 
 @lru_cache(maxsize=2)
 def _unpacked(data: bytes) -> Task:
-    """Once in every process: a mechanism takes longer to make than a short run."""
+    """The task of ``data``, made once in every process: this takes longer than a short run."""
     task: Task = pickle.loads(data)
     return task
 
 
 def run_chunk(task: Task | bytes, chunk: Sequence[Mapping[str, Any]]) -> list[Outcome]:
-    """The outcomes of several cases, in order; what an executor is given."""
+    """The outcomes of several cases, in order; this function is submitted to executors."""
     known = _unpacked(task) if isinstance(task, bytes) else task
     return [known.run(parameters) for parameters in chunk]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import srm_mbs as srm
 from tests.formats.test_loading import mass_matrix
 from tests.formats.urdf.test_urdf_loops import PAIR, gaps, measured, random_positions
+from tests.support.snapshots import check_messages, refused
 from tests.support.urdf_files import BRANCHES, MASSES, open_mechanism, placement, relative, tree
 
 FRAMES = PAIR.replace("closing_ring", "loop1")  # links loop1_1 and loop1_2 on fixed joints
@@ -98,41 +100,37 @@ def test_meshes_and_faults_belong_to_the_urdf(tmp_path: Path) -> None:
 
 
 FAULTS = {
-    "unequal closures": ("closed_loop: [[a, b]]\ntype: []\n", "type: it has 0 entries"),
-    "unequal joints": ("joint_name: [hip]\n", "joint_type: it has 0 entries, joint_name has 1"),
-    "no pair": ("closed_loop: [[loop1_1]]\ntype: [3d]\n", "not a pair of frames"),
-    "no frame": ("closed_loop: [[loop1_1, loop3]]\ntype: [3d]\n", "no frame 'loop3'"),
-    "another type": ("closed_loop: [[loop1_1, loop1_2]]\ntype: [5d]\n", "no type '5d'"),
-    "a number for a type": ("closed_loop: [[loop1_1, loop1_2]]\ntype: [6]\n", "6 is not text"),
-    "no joint": ("joint_name: [hop]\njoint_type: [FIXED]\n", "no joint 'hop'"),
-    "a fixed joint": ("joint_name: [loop1_1_frame]\njoint_type: [FIXED]\n", "it stays"),
-    "another joint type": ("joint_name: [hip]\njoint_type: [BALL]\n", "no type 'BALL'"),
-    "axes in line": ("joint_name: [hip]\njoint_type: [UJOINT_XX]\n", "in line"),
-    "a joint twice": ("joint_name: [hip, hip]\njoint_type: [FIXED, FIXED]\n", "twice"),
-    "an unknown key": ("closed_loop: []\ntype: []\nmotors: []\n", "motors: this key is unknown"),
-    "no list": ("closed_loop: ring\n", "closed_loop: a list is wanted"),
-    "no YAML": ("closed_loop: [[\n", "not valid YAML"),
-    "no keys": ("- closed_loop\n", "holds no keys"),
-    "nothing": ("", "holds no keys"),
+    "unequal closures": "closed_loop: [[a, b]]\ntype: []\n",
+    "unequal joints": "joint_name: [hip]\n",
+    "no pair": "closed_loop: [[loop1_1]]\ntype: [3d]\n",
+    "no frame": "closed_loop: [[loop1_1, loop3]]\ntype: [3d]\n",
+    "another type": "closed_loop: [[loop1_1, loop1_2]]\ntype: [5d]\n",
+    "a number for a type": "closed_loop: [[loop1_1, loop1_2]]\ntype: [6]\n",
+    "no joint": "joint_name: [hop]\njoint_type: [FIXED]\n",
+    "a fixed joint": "joint_name: [loop1_1_frame]\njoint_type: [FIXED]\n",
+    "another joint type": "joint_name: [hip]\njoint_type: [BALL]\n",
+    "axes in line": "joint_name: [hip]\njoint_type: [UJOINT_XX]\n",
+    "a joint twice": "joint_name: [hip, hip]\njoint_type: [FIXED, FIXED]\n",
+    "an unknown key": "closed_loop: []\ntype: []\nmotors: []\n",
+    "no list": "closed_loop: ring\n",
+    "no YAML": "closed_loop: [[\n",
+    "no keys": "- closed_loop\n",
+    "nothing": "",
     "aliases of aliases": (
         "closed_loop: [&a [x, x, x], &b [*a, *a, *a], &c [*b, *b, *b], &d [*c, *c, *c], [*d, *d]]\n"
-        "type: [3d, 3d, 3d, 3d, 3d]\n",
-        "not a pair of frames",
+        "type: [3d, 3d, 3d, 3d, 3d]\n"
     ),
-    "an object": ("closed_loop: !!python/object:os.system []\n", "not valid YAML"),
+    "an object": "closed_loop: !!python/object:os.system []\n",
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_faulty_yaml_is_one_clear_error(fault: str, tmp_path: Path) -> None:
-    yaml, needle = FAULTS[fault]
-    path = write(tmp_path, yaml)
-    with pytest.raises(srm.InputError) as caught:
-        srm.load(path)
-    message = str(caught.value)
-    assert message.startswith(str(path)), message
-    assert needle in message
-    assert caught.value.remedy
+def test_a_faulty_yaml_is_one_clear_error(tmp_path: Path) -> None:
+    messages = {}
+    for fault, yaml in FAULTS.items():
+        path = write(tmp_path, yaml)
+        messages[fault] = refused(partial(srm.load, path), tmp_path)
+        assert messages[fault].startswith(path.name)
+    check_messages("gepetto", messages)
 
 
 def test_a_yaml_without_urdf_is_refused(tmp_path: Path) -> None:

@@ -303,9 +303,9 @@ def test_passages_are_listed_where_the_last_pivot_stays_small_everywhere(
     thickness: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it would where balancing the rows made more of them independent."""
-    monkeypatch.setattr(structure, "BLUNT", 0.0)
+    monkeypatch.setattr(structure, "SMALL_REFERENCE_PIVOT", 0.0)
     mechanism = slender_slider_crank(thickness)
-    assert mechanism.structure.sigma_ref < crossings_module.BLUNT
+    assert mechanism.structure.sigma_ref < crossings_module.SMALL_REFERENCE_PIVOT
     expected = srm.simulate(srm.load("slider_crank"), 10.0, rtol=1e-10).crossings
     found = srm.simulate(mechanism, 10.0, rtol=1e-6).crossings
     assert [c.time for c in found] == pytest.approx([c.time for c in expected], abs=1e-4)

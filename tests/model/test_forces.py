@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from srm_mbs.cli.tables import equilibrium_rows
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.formats.build import friction_time
 from tests.support.mechanisms import along_x, rod
+from tests.support.snapshots import check_messages, refused
 
 Coordinates = Callable[[FloatArray], FloatArray]
 
@@ -850,56 +852,47 @@ def test_forces_of_a_file_are_those_it_describes(tmp_path: Path) -> None:
 
 
 FAULTS = {
-    "an unknown type": ('"torque"', '"torqe"', ("force[2].type", "'torqe'", "spring_damper, torq")),
-    "a number as type": ('"torque"', "3", ("force[2].type", "3", "spring_damper")),
-    "no type": ('type = "torque"\n', "", ("force[2].type", "missing", "spring_damper, torque")),
-    "an unknown key": ("damping = 2.0", "dampin = 2.0", ("force[0]", "'dampin'", "a, b")),
-    "a key of another type": ("torque = 0.5", "torque = 1\na = 1", ("force[2].a", "joint, torque")),
-    "an unknown key in an anchor": ("xyz = [1.2", "xzy = [1.2", ("force[0].a", "'xzy'", "xyz")),
-    "no joint": ('joint = "crank"\n', "", ("force[2].joint", "missing", "Add it")),
-    "no torque": ("torque = 0.5\n", "", ("force[2]", "no torque", "law or table")),
-    "no anchor": ('a = { frame = "crank" }\n', "", ("force[4].a", "missing")),
-    "a text as stiffness": ("stiffness = 40", 'stiffness = "40"', ("force[0].stiffness", "finite")),
-    "a nan": ("torque = 0.5", "torque = nan", ("force[2].torque", "nan", "finite number")),
-    "five stiffnesses": ("20, 3, 9, 5]", "20, 3, 9]", ("force[4].stiffness", "6 items", "right")),
-    "two components": ("[1.0, 2.0, 3.0]", "[1.0, 2.0]", ("force[3].force", "3 items")),
-    "an unknown frame": ('"link"\n', '"body"\n', ("force[3].frame", "'world' or", "Choose")),
-    "negative stiffness": ("stiffness = 40", "stiffness = -4", ("'strut'", "negative", ">= 0")),
-    "no rest length": ("rest_length = 0.5\n", "", ("force 'strut'", "rest_length", "in m")),
+    "an unknown type": ('"torque"', '"torqe"'),
+    "a number as type": ('"torque"', "3"),
+    "no type": ('type = "torque"\n', ""),
+    "an unknown key": ("damping = 2.0", "dampin = 2.0"),
+    "a key of another type": ("torque = 0.5", "torque = 1\na = 1"),
+    "an unknown key in an anchor": ("xyz = [1.2", "xzy = [1.2"),
+    "no joint": ('joint = "crank"\n', ""),
+    "no torque": ("torque = 0.5\n", ""),
+    "no anchor": ('a = { frame = "crank" }\n', ""),
+    "a text as stiffness": ("stiffness = 40", 'stiffness = "40"'),
+    "a nan": ("torque = 0.5", "torque = nan"),
+    "five stiffnesses": ("20, 3, 9, 5]", "20, 3, 9]"),
+    "two components": ("[1.0, 2.0, 3.0]", "[1.0, 2.0]"),
+    "an unknown frame": ('"link"\n', '"body"\n'),
+    "negative stiffness": ("stiffness = 40", "stiffness = -4"),
+    "no rest length": ("rest_length = 0.5\n", ""),
     "nothing": (
         "stiffness = 3.0\ndamping = 0.1\n",
-        "",
-        ("force 'torsion_spring_rocker'", "zero", "remove"),
-    ),
-    "an unknown joint": ('joint = "crank"', 'joint = "crnk"', ("force[2].joint", "'crnk'", "Kn")),
+        ""),
+    "an unknown joint": ('joint = "crank"', 'joint = "crnk"'),
     "an unknown link": (
         'at = { link = "coupler"',
-        'at = { link = "cupler"',
-        ("force 'push', anchor at", "'cupler'", "Known: coupler"),
-    ),
-    "no link": ('a = { frame = "crank" }', "a = {}", ("force[4], anchor a", "link or a frame")),
-    "one body": ('{ frame = "crank" }', '{ link = "coupler" }', ("'bushing_coupler_c", "same")),
-    "two torques on a hinge": ("torque = 0.5", "torque = [1, 2]", ("'torque_crank'", "one number")),
-    "a name twice": ('"push"', '"strut"', ("force 'strut'", "used twice", "own name")),
-    "a single table": ("[[force]]", "[force]", ("TOML",)),
-    "no table": (FORCES, "force = [1]\n", ("force[0]", "a table is wanted, not 1")),
+        'at = { link = "cupler"'),
+    "no link": ('a = { frame = "crank" }', "a = {}"),
+    "one body": ('{ frame = "crank" }', '{ link = "coupler" }'),
+    "two torques on a hinge": ("torque = 0.5", "torque = [1, 2]"),
+    "a name twice": ('"push"', '"strut"'),
+    "a single table": ("[[force]]", "[force]"),
+    "no table": (FORCES, "force = [1]\n"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_faulty_force_is_refused_by_key(fault: str, tmp_path: Path) -> None:
-    old, new, needles = FAULTS[fault]
-    assert old in FORCES
-    text = FORCES.replace(old, new, 1)
-    path = write(tmp_path, text) if fault != "no table" else write(tmp_path, "", text)
-    with pytest.raises(srm.InputError) as caught:
-        srm.load(path)
-    message = str(caught.value)
-    assert message.startswith(str(path))
-    for needle in needles:
-        assert needle in message, f"{needle!r} is not in: {message}"
-    assert caught.value.remedy
-    assert "pydantic" not in message
+def test_a_faulty_force_is_refused_by_key(tmp_path: Path) -> None:
+    messages = {}
+    for fault, (old, new) in FAULTS.items():
+        assert old in FORCES
+        text = FORCES.replace(old, new, 1)
+        path = write(tmp_path, text) if fault != "no table" else write(tmp_path, "", text)
+        messages[fault] = refused(partial(srm.load, path), tmp_path)
+        assert messages[fault].startswith(path.name)
+    check_messages("forces", messages)
 
 
 def test_a_force_on_a_locked_joint_is_refused(tmp_path: Path) -> None:

@@ -433,7 +433,7 @@ def test_runs_start_at_any_time(ball: srm.Mechanism) -> None:
         (lambda t, q, v: 1 / 0, "raised ZeroDivisionError"),
         (lambda t, q, v: 3, "cannot be carried out"),
         (lambda t, q, v: (q,), "cannot be carried out"),
-        (lambda t, q, v: (q, [1.0, 2.0]), "shape"),
+        (lambda t, q, v: (q, [1.0, 2.0]), "finite numbers"),
         (lambda t, q, v: srm.Switch(None), "same joints"),  # type: ignore[arg-type]
         (lambda t, q, v: srm.Switch(flywheels()), "same joints"),
     ],

@@ -1,4 +1,4 @@
-"""What the numbers of a certificate mean, in sentences."""
+"""Assessments of a certificate: its numbers as grades and sentences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError
 from srm_mbs.analysis.accuracy.error_estimate import (
-    DISAGREE,
+    DISAGREEMENT,
     ROUNDING,
     Comparison,
     ErrorEstimate,
@@ -23,40 +23,40 @@ Grade = Literal["good", "fair", "poor", "unknown"]
 GRADES: tuple[Grade, ...] = ("good", "fair", "unknown", "poor")
 """From the best to the worst."""
 
-CLOSED = (1e-9, 1e-4)
-"""Drift (units) up to which it is good, and fair."""
-BALANCED = (1e-6, 1e-3)
-"""Part of the energy that took part up to which a balance is good, and fair."""
-ACCURATE = (1e-3, 0.05)
-"""Estimated error (units) up to which it is good, and fair."""
-CLOSE = 0.3
-"""How far an observed order may be below the expected one."""
-FALLS = 0.3
-"""Slope of log error over log tolerance from which errors fall as they should."""
-LEFT = 1e-9
-"""Error (units) below which rounding may be what keeps it from falling: on its way through singular
-configurations it grows by some decades."""
-CLEAR = 3.0
-"""Quotient of the differences of two runs from which that of the tighter one does not matter."""
-GROWS = 10.0
-"""Growth of a difference in the second and in the last third of a run from which it is exponential:
-with the cube of time it grows by 8 and 3.4."""
-LONG = 10.0
-"""Length of a run, times the characteristic rate, from which its growth tells anything."""
+DRIFT_LIMITS = (1e-9, 1e-4)
+"""Largest good and largest fair drift, in units."""
+RESIDUAL_LIMITS = (1e-6, 1e-3)
+"""Largest good and largest fair residual of the energy balance, over the energy that took part."""
+ERROR_LIMITS = (1e-3, 0.05)
+"""Largest good and largest fair estimated error, in units."""
+ORDER_TOLERANCE = 0.3
+"""Largest good deficit of the observed order below the expected one."""
+SMALLEST_SLOPE = 0.3
+"""Smallest good slope of log error over log tolerance."""
+ROUNDING_ERROR_LIMIT = 1e-9
+"""Error (units) below which accumulated rounding may dominate: it grows by some decades through
+singular configurations."""
+CONVERGED_QUOTIENT = 3.0
+"""Quotient of the differences of two runs from which the error of the tighter one is negligible."""
+EXPONENTIAL_GROWTH = 10.0
+"""Growth of a difference in the second and in the last third of a run from which it is exponential;
+proportional to the cube of time it would grow by 8 and 3.4."""
+SHORTEST_RUN = 10.0
+"""Shortest run, times the characteristic rate, in which growth of differences is assessed."""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One verdict of a certificate.
+class Assessment:
+    """The assessment of one topic of a certificate.
 
     Attributes
     ----------
     topic
-        What it is about.
+        For example ``closed loops``.
     grade
         ``good``, ``fair``, ``poor`` or ``unknown``.
     text
-        A sentence or several.
+        One or several sentences.
     """
 
     topic: str
@@ -69,13 +69,15 @@ def _grade(value: float, limits: tuple[float, float]) -> Grade:
     return "good" if value <= good else "fair" if value <= fair else "poor"
 
 
-def status_finding(solution: SimulationResult) -> Finding:
-    """Whether the run came to its end."""
+def assess_status(solution: SimulationResult) -> Assessment:
+    """Whether the run reached its end."""
     start, end = solution.span
     if solution.status == "finished":
-        return Finding("end of the run", "good", f"It reached its end at t = {end:.6g} s.")
+        return Assessment("end of the run", "good", f"It reached its end at t = {end:.6g} s.")
     if solution.status == "event":
-        return Finding("end of the run", "good", f"An event ended it at t = {end:.6g} s, as asked.")
+        return Assessment(
+            "end of the run", "good", f"An event ended it at t = {end:.6g} s, as asked."
+        )
     asked = "" if solution.request is None else f" of {solution.request.t_end:.6g} s"
     word = "was interrupted" if solution.status == "interrupted" else "failed"
     text = (
@@ -83,33 +85,33 @@ def status_finding(solution: SimulationResult) -> Finding:
     )
     if end <= start:
         text = f"It {word} at its start: there is no motion to judge."
-    return Finding("end of the run", "poor", text)
+    return Assessment("end of the run", "poor", text)
 
 
-def drift_finding(drift: Sequence[Drift]) -> Finding:
-    """How well the closures were kept."""
+def assess_drift(drift: Sequence[Drift]) -> Assessment:
+    """How well the closures were satisfied."""
     if not drift:
-        return Finding(
+        return Assessment(
             "closed loops", "good", "It has neither loops nor drives: nothing can drift."
         )
     worst = max(row.relative for row in drift)
     sizes = " and ".join(f"{row.position:.1e} {row.unit}" for row in drift)
-    grade = _grade(worst, CLOSED)
+    grade = _grade(worst, DRIFT_LIMITS)
     meaning = {
         "good": "that is rounding, or close to it",
         "fair": "that is small beside the mechanism, but more than rounding",
         "poor": "the loops came visibly apart",
     }[grade]
-    return Finding("closed loops", grade, f"They stayed closed to {sizes}: {meaning}.")
+    return Assessment("closed loops", grade, f"They stayed closed to {sizes}: {meaning}.")
 
 
-def energy_finding(energy: EnergyError | str) -> Finding:
+def assess_energy(energy: EnergyError | str) -> Assessment:
     """Whether the energy balance closes."""
     if isinstance(energy, str):
-        return Finding("energy balance", "unknown", f"It cannot be computed: {energy}")
+        return Assessment("energy balance", "unknown", f"It cannot be computed: {energy}")
     if energy.scale <= energy.rounding:
-        return Finding("energy balance", "good", "Nothing moved, and no energy was exchanged.")
-    grade = _grade(energy.relative, BALANCED)
+        return Assessment("energy balance", "good", "Nothing moved, and no energy was exchanged.")
+    grade = _grade(energy.relative, RESIDUAL_LIMITS)
     rounded = grade != "good" and energy.residual <= energy.rounding
     text = "The energy, which should be constant, changes"
     if energy.works:
@@ -117,34 +119,37 @@ def energy_finding(energy: EnergyError | str) -> Finding:
     text += f" by at most {energy.residual:.1e} J, {energy.relative:.1e} of the"
     text += f" {energy.scale:.3g} J that took part."
     if rounded:
-        return Finding("energy balance", "good", f"{text} That is rounding of the energies.")
+        return Assessment("energy balance", "good", f"{text} That is rounding of the energies.")
     if grade == "poor":
         text += " The run is not accurate, or a force is not smooth where no step ends."
-    return Finding("energy balance", grade, text)
+    return Assessment("energy balance", grade, text)
 
 
 def _setting(estimate: ErrorEstimate, trial: Trial) -> str:
     return f"step {trial.setting:.3g} s" if estimate.fixed else f"rtol {trial.setting:.3g}"
 
 
-def error_findings(solution: SimulationResult, estimate: ErrorEstimate | str) -> list[Finding]:
-    """What the other runs say about the error of the run."""
+def assess_errors(solution: SimulationResult, estimate: ErrorEstimate | str) -> list[Assessment]:
+    """The error of the run, by comparison with the other runs."""
     if isinstance(estimate, str):
         return [
-            Finding(
+            Assessment(
                 "estimated error",
                 "unknown",
                 f"There is none, as there is no second run: {estimate}.",
             )
         ]
-    found = [_error(solution, estimate)]
-    found += _others(solution, estimate)
-    found.append(_order(estimate))
     rate = solution.mechanism.structure.units.rate
-    return found + _sensitivity(estimate.comparison, rate) + _shared(solution)
+    return [
+        _error(solution, estimate),
+        *_other_runs(solution, estimate),
+        _order(estimate),
+        *_sensitivity(estimate.comparison, rate),
+        *_common_errors(solution),
+    ]
 
 
-def _error(solution: SimulationResult, estimate: ErrorEstimate) -> Finding:
+def _error(solution: SimulationResult, estimate: ErrorEstimate) -> Assessment:
     largest: dict[str, list[float]] = {}
     for row in estimate.joints:
         largest.setdefault(row.unit, []).append(row.position)
@@ -156,47 +161,47 @@ def _error(solution: SimulationResult, estimate: ErrorEstimate) -> Finding:
                 f"t = {estimate.branch:.6g} s on different branches, and are different motions "
                 "from there: at least one of them is wrong, and they do not tell which."
             )
-            return Finding("estimated error", "poor", text)
+            return Assessment("estimated error", "poor", text)
         text = (
             f"From t = {estimate.apart:.4g} s on the run and the one beside it are too far apart "
             "to tell where the mechanism is: what the run says later is a motion that could be, "
             f"not the one that follows from the start. Before that they differ by at most {sizes}."
         )
-        return Finding("estimated error", "poor", text)
-    grade = _grade(estimate.size, ACCURATE)
+        return Assessment("estimated error", "poor", text)
+    grade = _grade(estimate.size, ERROR_LIMITS)
     if estimate.bound:
         text = (
             f"The run beside it is looser and differs by {sizes}: the error of this run should be "
             "smaller, but there is no tighter one to show by how much."
         )
-        return Finding("estimated error", grade, text)
+        return Assessment("estimated error", grade, text)
     end = min(solution.span[1], float(estimate.comparison.t[-1]))
     text = (
         f"No joint is off by more than about {sizes} up to t = {end:.6g} s. This is an estimate, "
         "the difference to a tighter run, and no proven bound."
     )
-    return Finding("estimated error", grade, text)
+    return Assessment("estimated error", grade, text)
 
 
-def _others(solution: SimulationResult, estimate: ErrorEstimate) -> list[Finding]:
-    """What the other runs did that this one did not."""
+def _other_runs(solution: SimulationResult, estimate: ErrorEstimate) -> list[Assessment]:
+    """Differences in how the runs ended, and in their jumps."""
     out = []
     others = [trial for trial in estimate.trials if not trial.own]
     ended = [trial for trial in others if trial.status in ("finished", "event")]
     stopped = [trial for trial in others if trial not in ended]
 
-    def told(trials: Sequence[Trial]) -> str:
+    def runs_with(trials: Sequence[Trial]) -> str:
         runs = " and ".join(_setting(estimate, trial) for trial in trials)
         return f"The run{'s' * (len(trials) > 1)} with {runs}"
 
     if solution.status == "failed" and ended:
-        text = f"{told(ended)} went on where this one failed: it is the setting that failed."
-        out.append(Finding("second run", "poor", text))
+        text = f"{runs_with(ended)} went on where this one failed: it is the setting that failed."
+        out.append(Assessment("second run", "poor", text))
     if stopped and (solution.success or solution.status == "failed"):
         times = " and ".join(f"{trial.end:.9g} s" for trial in stopped)
         too = " as well" * (not solution.success)
-        text = f"{told(stopped)} stopped{too}, at t = {times}; compared is what both have."
-        out.append(Finding("second run", "poor" if solution.success else "fair", text))
+        text = f"{runs_with(stopped)} stopped{too}, at t = {times}; compared is what both have."
+        out.append(Assessment("second run", "poor" if solution.success else "fair", text))
     jumps = estimate.comparison.jumps
     if len(jumps):
         where = "jump by an event action" if len(jumps) == 1 else f"{len(jumps)} jumps by events"
@@ -204,49 +209,49 @@ def _others(solution: SimulationResult, estimate: ErrorEstimate) -> list[Finding
             f"At the {where} the times differ by at most {jumps.max():.1e} s; what lies between is "
             "left out of the comparison."
         )
-        out.append(Finding("jumps", "good", text))
+        out.append(Assessment("jumps", "good", text))
     return out
 
 
-def _order(estimate: ErrorEstimate) -> Finding:
+def _order(estimate: ErrorEstimate) -> Assessment:
     topic = "order" if estimate.fixed else "error over tolerance"
     order, expected = estimate.order, estimate.expected_order
     if order is None:
-        return Finding(topic, *_unseen(estimate))
+        return Assessment(topic, *_unobserved_order(estimate))
     if estimate.fixed:
         text = f"With the step, errors fall with order {order:.2f}"
         if expected is None:
-            return Finding(topic, "fair" if order > FALLS else "poor", f"{text}.")
-        good = order > expected - CLOSE
+            return Assessment(topic, "fair" if order > SMALLEST_SLOPE else "poor", f"{text}.")
+        good = order > expected - ORDER_TOLERANCE
         text += f"; that of the scheme is {expected:g}."
         if not good:
             text += (
                 " The steps are too large for it, or something is not smooth: take the error above "
                 "as a rough one."
             )
-        return Finding(topic, "good" if good else "fair", text)
-    if order < FALLS and estimate.size < LEFT:
+        return Assessment(topic, "good" if good else "fair", text)
+    if order < SMALLEST_SLOPE and estimate.size < ROUNDING_ERROR_LIMIT:
         text = (
             "The differences no longer fall with the tolerance: they are what rounding leaves, and "
             "a tighter one gains nothing."
         )
-        return Finding(topic, "good", text)
-    if order < FALLS:
+        return Assessment(topic, "good", text)
+    if order < SMALLEST_SLOPE:
         text = (
             f"The differences hardly fall with the tolerance (slope {order:.2f}, where 1 is "
             "usual): the estimate of the error cannot be relied on."
         )
-        return Finding(topic, "poor" if estimate.size > ACCURATE[0] else "fair", text)
+        return Assessment(topic, "poor" if estimate.size > ERROR_LIMITS[0] else "fair", text)
     text = f"Errors fall as the tolerance to the power {order:.2f}, where 1 is usual"
-    return Finding(topic, "good", f"{text}: a tighter tolerance pays, and the estimate holds.")
+    return Assessment(topic, "good", f"{text}: a tighter tolerance pays, and the estimate holds.")
 
 
-def _unseen(estimate: ErrorEstimate) -> tuple[Grade, str]:
-    """What can be said where differences are too close to rounding to fall regularly."""
+def _unobserved_order(estimate: ErrorEstimate) -> tuple[Grade, str]:
+    """Grade and text where differences are too close to rounding to decrease regularly."""
     differences = [t.difference for t in estimate.trials if t.difference is not None]
     if max(differences) < ROUNDING:
         return "good", "The differences are rounding already: there is nothing that could fall."
-    if len(differences) == 2 and CLEAR * differences[1] < differences[0]:
+    if len(differences) == 2 and CONVERGED_QUOTIENT * differences[1] < differences[0]:
         return "good", (
             f"The run in between differs from the tightest by {differences[1]:.1e} only, which is "
             "close to rounding: the estimate holds, but how fast errors fall is not seen."
@@ -254,15 +259,18 @@ def _unseen(estimate: ErrorEstimate) -> tuple[Grade, str]:
     return "unknown", "There are too few runs to see how the error falls."
 
 
-def _sensitivity(comparison: Comparison, rate: float) -> list[Finding]:
-    """Whether differences grow so fast that the motion cannot be followed for long."""
+def _sensitivity(comparison: Comparison, rate: float) -> list[Assessment]:
+    """Whether differences grow exponentially, so that no tolerance follows the motion for long."""
     size = np.maximum.accumulate(comparison.size.max(axis=1))
-    size = size[: np.searchsorted(size, DISAGREE)]  # what is far apart grows no more
+    size = size[: np.searchsorted(size, DISAGREEMENT)]  # beyond, differences saturate
     t = comparison.t[: len(size)]
-    if len(size) < 3 or rate * (t[-1] - t[0]) < LONG:
+    if len(size) < 3 or rate * (t[-1] - t[0]) < SHORTEST_RUN:
         return []
     first, second = np.searchsorted(t, t[0] + (t[-1] - t[0]) * np.array([1.0, 2.0]) / 3.0)
-    steady = GROWS * size[first] < size[second] and GROWS * size[second] < size[-1]
+    steady = (
+        EXPONENTIAL_GROWTH * size[first] < size[second]
+        and EXPONENTIAL_GROWTH * size[second] < size[-1]
+    )
     if not (steady and size[first] > 0.0):
         return []
     slope = float(np.polyfit(t[first:], np.log10(size[first:]), 1)[0])
@@ -270,11 +278,11 @@ def _sensitivity(comparison: Comparison, rate: float) -> list[Finding]:
         f"Small differences grow about tenfold every {1.0 / slope:.2g} s: the motion is sensitive, "
         "as chaotic ones are, and no tolerance follows it for ever."
     )
-    return [Finding("sensitivity", "fair", text)]
+    return [Assessment("sensitivity", "fair", text)]
 
 
-def _shared(solution: SimulationResult) -> list[Finding]:
-    """Errors that all runs have in common."""
+def _common_errors(solution: SimulationResult) -> list[Assessment]:
+    """Errors that all runs share, so that no difference shows them."""
     method = None if solution.request is None else solution.request.method
     eps = getattr(method, "eps", None)
     if eps is None or parse_eps(eps).power:
@@ -283,4 +291,4 @@ def _shared(solution: SimulationResult) -> list[Finding]:
         f"All runs have eps = {parse_eps(eps).factor:.3g} s; what that alone makes wrong is in "
         "none of the differences."
     )
-    return [Finding("regularisation", "unknown", text)]
+    return [Assessment("regularisation", "unknown", text)]

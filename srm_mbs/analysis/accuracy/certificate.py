@@ -1,4 +1,4 @@
-"""How accurate a run is: drift, energy balance, and an error estimate from other runs."""
+"""The accuracy of a run: drift, energy balance, and an error estimate by comparison with reruns."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 from srm_mbs.analysis.accuracy.assessment import (
     GRADES,
-    Finding,
+    Assessment,
     Grade,
-    drift_finding,
-    energy_finding,
-    error_findings,
-    status_finding,
+    assess_drift,
+    assess_energy,
+    assess_errors,
+    assess_status,
 )
 from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of, energy_error
 from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
@@ -30,28 +30,28 @@ class Certificate:
     name
         Of the mechanism.
     findings
-        Sentences, each with ``topic``, ``grade`` (``good``, ``fair``, ``poor`` or ``unknown``) and
-        ``text``.
+        The assessments, each with ``topic``, ``grade`` (``good``, ``fair``, ``poor`` or
+        ``unknown``) and ``text``.
     drift
         The largest closure errors, :class:`srm_mbs.analysis.accuracy.conservation.Drift` for each
         unit; empty for an open chain.
     energy
-        How well the energy balance closes,
+        Residual of the energy balance,
         :class:`srm_mbs.analysis.accuracy.conservation.EnergyError`; None if it cannot be computed.
     estimate
-        What the other runs say, :class:`srm_mbs.analysis.accuracy.error_estimate.ErrorEstimate`;
-        None without them.
+        Comparison with the reruns,
+        :class:`srm_mbs.analysis.accuracy.error_estimate.ErrorEstimate`; None without them.
     """
 
     name: str
-    findings: tuple[Finding, ...]
+    findings: tuple[Assessment, ...]
     drift: tuple[Drift, ...]
     energy: EnergyError | None
     estimate: ErrorEstimate | None
 
     @property
     def grade(self) -> Grade:
-        """The worst of all findings."""
+        """The worst grade of all assessments."""
         return max((finding.grade for finding in self.findings), key=GRADES.index)
 
     @property
@@ -85,33 +85,32 @@ def certify(
 ) -> Certificate:
     """Estimate how accurate a run is.
 
-    It is made again twice: at a tenth and a hundredth of its tolerance (no tighter than rounding
-    allows, 1e-12), or
-    with half and a quarter of its fixed step.  With dop853 this takes some three times as long as
-    the run, with fixed steps six times.  Functions of the user are called again.
+    The run is repeated twice: at a tenth and a hundredth of its tolerance (no tighter than rounding
+    allows, 1e-12), or with half and a quarter of its fixed step.  With dop853 this takes some three
+    times as long as the run, with fixed steps six times.  Functions of the user are called again.
 
     Parameters
     ----------
     solution
         A run, finished or not.
     rtol
-        Relative tolerance of the second run instead of a hundredth; the third lies between.  A
-        looser one gives a bound.
+        Relative tolerance of the tightest run, by default a hundredth of that of the run; another
+        one lies between.  A looser tolerance gives a bound.
     again
-        Whether the run is made again; without, there are drift and energy only.
+        Whether the run is repeated; otherwise the certificate has drift and energy only.
     progress
         As for :func:`srm_mbs.simulate`, of each run.
 
     Returns
     -------
     Certificate
-        If the run cannot be made again (a loaded one that had Python functions), it says why, and
-        has the rest.
+        If the run cannot be repeated (a loaded one that had Python functions), an assessment gives
+        the reason.
 
     Raises
     ------
     InputError
-        If ``solution`` is no run, or ``rtol`` cannot be used for it.
+        If ``solution`` is no run, or ``rtol`` is not valid for it.
     """
     if not isinstance(solution, SimulationResult):
         raise InputError(
@@ -128,10 +127,10 @@ def certify(
     return Certificate(
         solution.mechanism.name,
         (
-            status_finding(solution),
-            drift_finding(drift),
-            energy_finding(energy),
-            *error_findings(solution, estimate),
+            assess_status(solution),
+            assess_drift(drift),
+            assess_energy(energy),
+            *assess_errors(solution, estimate),
         ),
         drift,
         None if isinstance(energy, str) else energy,

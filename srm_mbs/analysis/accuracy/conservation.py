@@ -1,4 +1,4 @@
-"""What a run should keep, and how well it does: closed loops, and the balance of energy."""
+"""Conserved quantities of a run: drift of the closures, residual of the energy balance."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from srm_mbs.simulation.result import SimulationResult
 
 @dataclass(frozen=True)
 class Drift:
-    """The largest closure errors of one unit.
+    """The largest closure errors in one unit.
 
     Attributes
     ----------
     unit
         ``m`` or ``rad``.
     position, rate
-        At the ends of steps: of the rows g in ``unit``, of G v in ``unit``/s; norms of all rows.
+        Norms over all rows of g, in ``unit``, and of G v, in ``unit``/s, at the ends of steps.
     between_position, between_rate
-        The same on the dense output, at evenly spaced times between them as well.
+        The same with the dense output at evenly spaced times between them.
     relative
         ``position`` over the scene diagonal, or 1 rad.
     """
@@ -40,20 +40,20 @@ class Drift:
 
 @dataclass(frozen=True)
 class EnergyError:
-    """How well the energy balance of a run closes, at the ends of its steps.
+    """Residual of the energy balance of a run, at the ends of its steps.
 
     Attributes
     ----------
     residual
-        The largest of energy gained less all works, J.
+        The largest |energy gained - work of all forces|, J.
     scale
         The energy that took part, J (:attr:`srm_mbs.EnergyBalance.scale`).
     relative
-        One over the other; 0 where nothing moved but for rounding.
+        ``residual`` over ``scale``; 0 if nothing moved by more than rounding.
     works
-        Names of what did work.
+        Names of the forces that did work.
     rounding
-        Residual that rounding alone may leave, J (:attr:`srm_mbs.EnergyBalance.rounding`).
+        Bound of the residual that rounding causes, J (:attr:`srm_mbs.EnergyBalance.rounding`).
     """
 
     residual: float
@@ -71,7 +71,7 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
         if not mechanism.constrained:
             continue
         ends = part.steps.times
-        if part.steps.stop is not None:  # an event in the middle of the last step
+        if part.steps.stop is not None:  # an event within the last step
             ends = ends[:-1]
         angles = constraint_angles(mechanism)
         for unit, own in (("m", ~angles), ("rad", angles)):
@@ -103,8 +103,8 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
 
 
 def energy_error(solution: SimulationResult) -> EnergyError | str:
-    """How well the energy balance closes; why it cannot be computed, if so."""
-    if solution.t_eval is not None:  # few times, or none, would tell little of the run
+    """Residual of the energy balance, or the reason why it cannot be computed."""
+    if solution.t_eval is not None:  # few times, or none, do not represent the run
         ends = [[*part.steps.times[:-1], part.steps.end] for part in solution.segments]
         solution = solution.at(np.unique(np.concatenate(ends)))
     try:

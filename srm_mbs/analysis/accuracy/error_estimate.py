@@ -1,10 +1,8 @@
-"""The error of a run, estimated by making it again with other accuracies.
+"""Estimate of the error of a run by comparison with reruns of other accuracy.
 
-The difference to a tighter run is the error of the run, as far as that of the tighter one is
-smaller.  A third run in between shows whether it is: errors must fall as the tolerance does, or
-with the order of the scheme.  What all of them share is not seen.
-
-How far two runs of one mechanism are from each other, over time and joint by joint.
+The difference to a tighter run approximates the error of the run if the error of the tighter one is
+much smaller.  A third run between them verifies this: errors must decrease with the tolerance, or
+with the order of the scheme.  Errors that all runs share are not observed.
 """
 
 from __future__ import annotations
@@ -26,12 +24,29 @@ from srm_mbs.simulation.options import positive, tightest_rtol
 from srm_mbs.simulation.rerun import rerun
 from srm_mbs.simulation.result import SimulationResult
 
-STEP_ENDS = 2000
+MAX_STEP_ENDS = 2000
 """Most ends of steps at which two runs are compared."""
 EVEN_TIMES = 501
-"""Evenly spaced times at which they are compared as well: between the ends, by dense output."""
-BESIDE_JUMP = 1e-9
+"""Number of evenly spaced times at which they are compared as well, by dense output."""
+JUMP_MARGIN = 1e-9
 """Part of the run on either side of a jump of the state that is left out."""
+TIGHTEST_RATIO = 1e-2
+"""Tolerance of the tightest run over that of the run."""
+INTERMEDIATE_RATIO = 3.0
+"""Smallest factor between two tolerances for which a third run between them is made."""
+DIFFERENT_RATIO = 1.5
+"""Factor within which two tolerances are regarded as equal."""
+ROUNDING = 1e-12
+"""Difference of two runs (units) below which it is rounding, whose decrease is not observed."""
+DISAGREEMENT = 0.05
+"""Difference of two runs (units) from which they disagree about the position of the mechanism."""
+AGREEMENT = 1e-3
+"""Difference of two runs (units) below which they agree."""
+SUDDEN = 0.3
+"""Time between agreement and disagreement, times the characteristic rate, that is too short for
+chaos."""
+SMALLEST_ORDER = 0.5
+"""Observed order from which the differences of fixed steps are extrapolated to step 0."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +62,7 @@ class JointDifference:
     position, rate
         Largest difference, in ``unit`` and ``unit``/s; of several coordinates the norm.
     travel, speed
-        How far the joint got from its start, and its largest rate.
+        Largest distance of the joint from its start, and its largest rate.
     """
 
     joint: str
@@ -70,19 +85,19 @@ class JointDifference:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two runs side by side.
+    """Differences of two runs over time.
 
     Attributes
     ----------
     t : (n,) s
-        Where both were read.
+        Times of comparison.
     size : (n, 2)
         Largest difference of any coordinate in its unit: 1 rad, or the scene diagonal; and of any
         rate, those times the characteristic rate (:class:`srm_mbs.dynamics.scaling.Units`).
     joints
         The largest difference of each joint.
     jumps : (k,) s
-        How far apart in time the jumps of the state are, of runs with event actions.
+        Differences in time of the jumps of the state, of runs with event actions.
     """
 
     t: FloatArray
@@ -96,29 +111,249 @@ class Comparison:
         return float(self.size.max(initial=0.0))
 
     def until(self, limit: float) -> float | None:
-        """The time (s) from which on the runs are further apart than ``limit``; None if never."""
+        """The first time (s) at which ``size`` exceeds ``limit``; None if never."""
         beyond = np.flatnonzero((self.size > limit).any(axis=1))
         return float(self.t[beyond[0]]) if len(beyond) else None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One of the runs that were compared.
+
+    Attributes
+    ----------
+    setting
+        Its relative tolerance, or its step (s).
+    own
+        Whether it is the run itself.
+    steps, evaluations, wall_time
+        Its work; s.
+    status, end
+        Status and time (s) of its end.
+    difference
+        Its largest difference to the tightest run, in units (:attr:`Comparison.size`), up to the
+        time at which they disagree; None for the tightest run itself.
+    """
+
+    setting: float
+    own: bool
+    steps: int
+    evaluations: int
+    wall_time: float
+    status: str
+    end: float
+    difference: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorEstimate:
+    """The error of a run, estimated from reruns.
+
+    Attributes
+    ----------
+    fixed
+        Whether the run has fixed steps: ``setting`` of the trials is then the step.
+    trials
+        The runs that were compared, the tightest last.
+    joints
+        The estimated error of each joint: the largest over the run, or up to ``apart``.
+    size
+        The largest of all in units (:attr:`Comparison.size`).
+    bound
+        Whether ``joints`` and ``size`` are bounds only, because the run itself is the tightest.
+    order
+        With fixed steps the observed order, from three steps; otherwise the slope of log error over
+        log tolerance.  None if it cannot be observed.
+    expected_order
+        With fixed steps the order of the scheme, otherwise 1; None where theory gives none.
+    apart
+        The time (s) from which the runs disagree; None if they agree.
+    branch
+        The time (s) of a singular passage that they left on different branches; None if they agree.
+    comparison
+        Of the run with the tightest one or, if the run is the tightest, with the next looser one;
+        over the time that both cover.
+    """
+
+    fixed: bool
+    trials: tuple[Trial, ...]
+    joints: tuple[JointDifference, ...]
+    size: float
+    bound: bool
+    order: float | None
+    expected_order: float | None
+    apart: float | None
+    branch: float | None
+    comparison: Comparison
+
+
+def checked_settings(solution: SimulationResult, rtol: float | None) -> list[float]:
+    """Tolerances, or fixed steps, of the reruns, the tightest last.
+
+    Raises
+    ------
+    InputError
+        If ``rtol`` is no tolerance, is that of the run, or the run has fixed steps.
+    """
+    settings = solution.settings
+    if settings.step is not None:
+        if rtol is not None:
+            raise InputError(
+                f"the run has fixed steps of {settings.step:g} s: no tolerance decides its error",
+                element="rtol",
+                remedy="Leave rtol out: it is made again with half and a quarter of the step",
+            )
+        return [settings.step / 2.0, settings.step / 4.0]
+    # By default no tolerance is so tight that rounding dominates.
+    tightest = tightest_rtol(solution.scheme, True)
+    other = (
+        max(TIGHTEST_RATIO * settings.rtol, tightest) if rtol is None else positive(rtol, "rtol")
+    )
+    if rtol is None and settings.rtol < INTERMEDIATE_RATIO * tightest:
+        other = INTERMEDIATE_RATIO * settings.rtol  # a looser run gives a bound
+    if abs(math.log(other / settings.rtol)) < math.log(DIFFERENT_RATIO):
+        raise InputError(
+            f"rtol = {other:g} is that of the run: two runs alike tell nothing",
+            element="rtol",
+            remedy=f"Give for example rtol={max(TIGHTEST_RATIO * settings.rtol, tightest):g}",
+        )
+    found = [other]
+    if abs(math.log(other / settings.rtol)) > math.log(INTERMEDIATE_RATIO):
+        found.append(math.sqrt(other * settings.rtol))
+    return sorted(found, reverse=True)
+
+
+def estimate_error(
+    solution: SimulationResult, settings: list[float], progress: Any = False
+) -> ErrorEstimate | str:
+    """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed."""
+    fixed = solution.settings.step is not None
+    name = "step" if fixed else "rtol"
+    runs = [(float(solution.settings.step or solution.settings.rtol), solution)]
+    for setting in settings:
+        options: dict[str, Any] = {name: setting}
+        try:
+            again = rerun(solution, **options, progress=progress)
+        except InputError as error:
+            return f"the run at {name} = {setting:.3g} was refused: {error}"
+        if not again.steps.count:
+            return f"the run at {name} = {setting:.3g} did not start: {again.message}"
+        runs.append((setting, again))
+    runs.sort(key=lambda pair: pair[0], reverse=True)
+    tightest = runs[-1][1]
+    bound = tightest is solution
+    partner = runs[-2][1] if bound else tightest
+    times = sample_times(solution)
+    whole = compare(solution, partner, times)
+    apart = whole.until(DISAGREEMENT)
+    kept = whole
+    if apart is not None:
+        kept = compare(solution, partner, times[times < apart])
+    # A scheme has its order at the ends of steps only; the coarsest grid is a subset of the others.
+    grid = sample_times(runs[0][1], fixed=True) if fixed else times
+    grid = grid if apart is None else grid[grid < apart]
+    differences = [compare(run, tightest, grid).largest for _, run in runs[:-1]]
+    order = observed_order([setting for setting, _ in runs], differences)
+    beyond = 1.0
+    if fixed and order is not None and order > SMALLEST_ORDER:
+        beyond = 1.0 / (1.0 - 4.0**-order)
+    trials = [
+        Trial(
+            setting,
+            run is solution,
+            run.stats.steps,
+            run.stats.evaluations,
+            run.stats.wall_time,
+            run.status,
+            run.span[1],
+            difference,
+        )
+        for (setting, run), difference in zip(runs, [*differences, None])
+    ]
+    return ErrorEstimate(
+        fixed,
+        tuple(trials),
+        tuple(
+            replace(row, position=beyond * row.position, rate=beyond * row.rate)
+            for row in kept.joints
+        ),
+        beyond * kept.largest,
+        bound,
+        order,
+        _expected(solution, fixed),
+        apart,
+        None if apart is None else parted_at(whole, solution, partner),
+        whole,
+    )
+
+
+def observed_order(settings: Sequence[float], differences: Sequence[float]) -> float | None:
+    """Order p of errors c s^p at three settings s in the ratio 1 : r : r^2.
+
+    The differences to the last are c s^p (1 - r^2p) and c s^p (r^p - r^2p); their quotient is
+    r^-p + 1.
+    """
+    if len(differences) < 2 or min(differences[:2]) < ROUNDING:
+        return None
+    quotient = differences[0] / differences[1] - 1.0
+    if quotient <= 1.0:
+        return 0.0
+    return math.log(quotient) / math.log(settings[0] / settings[1])
+
+
+def _expected(solution: SimulationResult, fixed: bool) -> float | None:
+    if not fixed:
+        return 1.0
+    request = solution.request
+    method = "" if request is None else request.method
+    split = method == "psrm" or (isinstance(method, PSRM) and method.correction == "split")
+    return float(solution.scheme.order) if split else None
+
+
+def parted_at(whole: Comparison, run: SimulationResult, other: SimulationResult) -> float | None:
+    """The singular passage (s) at which two runs left on different branches.
+
+    The rates differ suddenly there; otherwise small differences grow over many times 1/rate.
+    """
+    rates = whole.size[:, 1]
+    beyond = np.flatnonzero(rates > DISAGREEMENT)
+    if not len(beyond):
+        return None
+    near = np.flatnonzero(rates[: beyond[0]] < AGREEMENT)
+    if not len(near):
+        return None
+    before, after = float(whole.t[near[-1]]), float(whole.t[beyond[0]])
+    if (after - before) * run.mechanism.structure.units.rate > SUDDEN:
+        return None
+    slack = after - before
+    met = [c.time for c in (*run.crossings, *other.crossings)]
+    met += [b.start for b in (*run.bifurcations, *other.bifurcations)]
+    return next((t for t in met if before - slack <= t <= after + slack), None)
+
+
+# Comparison of two runs ----------------------------------------------------------------------
 
 
 def sample_times(solution: SimulationResult, *, fixed: bool = False) -> FloatArray:
     """Times (n,) s at which a run is compared: ends of its steps, and evenly spaced ones.
 
-    With ``fixed``, the ends only, where the method has its order.
+    With ``fixed`` the ends only, at which the method has its order.
     """
     start, end = solution.span
     ends = solution.steps.times
     ends = ends[(ends >= start) & (ends <= end)]
-    if len(ends) > STEP_ENDS:
-        ends = ends[np.unique(np.linspace(0, len(ends) - 1, STEP_ENDS).astype(int))]
+    if len(ends) > MAX_STEP_ENDS:
+        ends = ends[np.unique(np.linspace(0, len(ends) - 1, MAX_STEP_ENDS).astype(int))]
     if fixed:
         return np.union1d(ends, [end])
     return np.union1d(ends, np.linspace(start, end, EVEN_TIMES))
 
 
 def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -> Comparison:
-    """Both runs at ``times`` (n,) s, as far as both go; windows around jumps of the state, which
-    differ in time as well, are left out."""
+    """Compare two runs at those of ``times`` (n,) s that both cover.
+
+    Windows around jumps of the state, whose times differ, are left out.
+    """
     end = min(run.span[1], other.span[1])
     times = times[times <= end]
     allowed, jumps = _between_jumps(run, other, times)
@@ -131,7 +366,7 @@ def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -
     units = mechanism.structure.units
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
-        if joint.nv == 1 and joint.nq > 1:  # its turns count
+        if joint.nv == 1 and joint.nq > 1:  # angle unwrapped
             angle, _ = a.joint(name)
             apart[:, joint.idx_v] = b.joint(name)[0] - angle
             moved[:, joint.idx_v] = angle - angle[:1]
@@ -178,239 +413,14 @@ def _jump_times(run: SimulationResult) -> Sequence[float]:
 def _between_jumps(
     run: SimulationResult, other: SimulationResult, times: FloatArray
 ) -> tuple[BoolArray, FloatArray]:
-    """Which times (n,) lie between the same jumps of both runs, and how far those are apart."""
+    """Which times (n,) lie between the same jumps of both runs, and the differences in time (k,) s
+    of the jumps."""
     pairs = list(zip(_jump_times(run), _jump_times(other)))
     allowed = np.ones(len(times), dtype=bool)
-    slack = BESIDE_JUMP * float(np.ptp(times)) if len(times) else 0.0
+    slack = JUMP_MARGIN * float(np.ptp(times)) if len(times) else 0.0
     for pair in pairs:
         allowed &= (times < min(pair) - slack) | (times > max(pair) + slack)
     more = [*_jump_times(run)[len(pairs) :], *_jump_times(other)[len(pairs) :]]
-    if more:  # one run jumps there, the other does not
+    if more:  # only one of the runs jumps there
         allowed &= times < more[0]
     return allowed, np.array([abs(a - b) for a, b in pairs])
-
-
-TIGHTER = 1e-2
-"""Tolerance of the tightest run over that of the run."""
-APART = 3.0
-"""Factor between two tolerances from which one between them is of use."""
-ROUNDING = 1e-12
-"""Differences (units) below this are rounding: nothing can be seen to fall."""
-DISAGREE = 0.05
-"""Difference (units) from which two runs do not agree: neither tells where the mechanism is."""
-SAME = 1e-3
-"""Difference (units) below which they still agreed."""
-AT_ONCE = 0.3
-"""Time from one to the other, times the characteristic rate, that is too short for chaos."""
-CREDIBLE = 0.5
-"""Observed order from which the differences of fixed steps are extrapolated to step 0."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One of the runs that were compared.
-
-    Attributes
-    ----------
-    setting
-        Its relative tolerance, or its step (s).
-    own
-        Whether it is the run itself.
-    steps, evaluations, wall_time
-        Its work; s.
-    status, end
-        How it ended, and when (s).
-    difference
-        Its largest difference to the tightest run, in units (:attr:`Comparison.size`), up to where
-        they disagree; None for that one.
-    """
-
-    setting: float
-    own: bool
-    steps: int
-    evaluations: int
-    wall_time: float
-    status: str
-    end: float
-    difference: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorEstimate:
-    """What other runs tell about the error of a run.
-
-    Attributes
-    ----------
-    fixed
-        Whether the run has fixed steps: ``setting`` of the trials is then the step.
-    trials
-        The runs that were compared, the tightest last.
-    joints
-        The estimated error of each joint: the largest over the run, or up to ``apart``.
-    size
-        The largest of all in units (:attr:`Comparison.size`).
-    bound
-        Whether they are a bound only, because the run itself is the tightest.
-    order
-        At fixed steps the observed order, from three steps; else the slope of log error over log
-        tolerance.  None if there is nothing to observe.
-    expected_order
-        The order of the scheme at fixed steps, 1 else; None where theory gives none.
-    apart
-        The time (s) from which on the runs do not agree; None if they do.
-    branch
-        The time (s) of a singular passage that they left on different branches; None if they agree.
-    comparison
-        The run beside the tightest one, or beside the next where it is that itself; over the whole
-        time that both cover.
-    """
-
-    fixed: bool
-    trials: tuple[Trial, ...]
-    joints: tuple[JointDifference, ...]
-    size: float
-    bound: bool
-    order: float | None
-    expected_order: float | None
-    apart: float | None
-    branch: float | None
-    comparison: Comparison
-
-
-def checked_settings(solution: SimulationResult, rtol: float | None) -> list[float]:
-    """Tolerances, or steps, of the runs to be made, the tightest last.
-
-    Raises
-    ------
-    InputError
-        If ``rtol`` is no tolerance, that of the run, or the run has fixed steps.
-    """
-    settings = solution.settings
-    if settings.step is not None:
-        if rtol is not None:
-            raise InputError(
-                f"the run has fixed steps of {settings.step:g} s: no tolerance decides its error",
-                element="rtol",
-                remedy="Leave rtol out: it is made again with half and a quarter of the step",
-            )
-        return [settings.step / 2.0, settings.step / 4.0]
-    # No tighter tolerance is taken unasked: rounding is left.
-    tightest = tightest_rtol(solution.scheme, True)
-    other = max(TIGHTER * settings.rtol, tightest) if rtol is None else positive(rtol, "rtol")
-    if rtol is None and settings.rtol < APART * tightest:
-        other = APART * settings.rtol  # none is tighter: it gives a bound
-    if abs(math.log(other / settings.rtol)) < math.log(1.5):
-        raise InputError(
-            f"rtol = {other:g} is that of the run: two runs alike tell nothing",
-            element="rtol",
-            remedy=f"Give for example rtol={max(TIGHTER * settings.rtol, tightest):g}",
-        )
-    found = [other]
-    if abs(math.log(other / settings.rtol)) > math.log(APART):
-        found.append(math.sqrt(other * settings.rtol))
-    return sorted(found, reverse=True)
-
-
-def estimate_error(
-    solution: SimulationResult, settings: list[float], progress: Any = False
-) -> ErrorEstimate | str:
-    """Make ``solution`` again at each of ``settings``, and compare; why not, if it cannot be."""
-    fixed = solution.settings.step is not None
-    name = "step" if fixed else "rtol"
-    runs = [(float(solution.settings.step or solution.settings.rtol), solution)]
-    for setting in settings:
-        options: dict[str, Any] = {name: setting}
-        try:
-            again = rerun(solution, **options, progress=progress)
-        except InputError as error:
-            return f"the run at {name} = {setting:.3g} was refused: {error}"
-        if not again.steps.count:
-            return f"the run at {name} = {setting:.3g} did not start: {again.message}"
-        runs.append((setting, again))
-    runs.sort(key=lambda pair: pair[0], reverse=True)
-    tightest = runs[-1][1]
-    bound = tightest is solution
-    partner = runs[-2][1] if bound else tightest
-    times = sample_times(solution)
-    whole = compare(solution, partner, times)
-    apart = whole.until(DISAGREE)
-    kept = whole
-    if apart is not None:
-        kept = compare(solution, partner, times[times < apart])
-    # Only at the ends of steps has a scheme its order, and the coarsest grid is in all others.
-    grid = sample_times(runs[0][1], fixed=True) if fixed else times
-    grid = grid if apart is None else grid[grid < apart]
-    differences = [compare(run, tightest, grid).largest for _, run in runs[:-1]]
-    order = observed_order([setting for setting, _ in runs], differences)
-    beyond = 1.0
-    if fixed and order is not None and order > CREDIBLE:
-        beyond = 1.0 / (1.0 - 4.0**-order)
-    trials = [
-        Trial(
-            setting,
-            run is solution,
-            run.stats.steps,
-            run.stats.evaluations,
-            run.stats.wall_time,
-            run.status,
-            run.span[1],
-            difference,
-        )
-        for (setting, run), difference in zip(runs, [*differences, None])
-    ]
-    return ErrorEstimate(
-        fixed,
-        tuple(trials),
-        tuple(
-            replace(row, position=beyond * row.position, rate=beyond * row.rate)
-            for row in kept.joints
-        ),
-        beyond * kept.largest,
-        bound,
-        order,
-        _expected(solution, fixed),
-        apart,
-        None if apart is None else parted_at(whole, solution, partner),
-        whole,
-    )
-
-
-def observed_order(settings: Sequence[float], differences: Sequence[float]) -> float | None:
-    """p of errors c s^p at three settings s, 1 : r : r^2, whose differences to the last are
-    c s^p (1 - r^2p) and c s^p (r^p - r^2p): their quotient is r^-p + 1."""
-    if len(differences) < 2 or min(differences[:2]) < ROUNDING:
-        return None
-    quotient = differences[0] / differences[1] - 1.0
-    if quotient <= 1.0:
-        return 0.0
-    return math.log(quotient) / math.log(settings[0] / settings[1])
-
-
-def _expected(solution: SimulationResult, fixed: bool) -> float | None:
-    if not fixed:
-        return 1.0
-    request = solution.request
-    method = "" if request is None else request.method
-    split = method == "psrm" or (isinstance(method, PSRM) and method.correction == "split")
-    return float(solution.scheme.order) if split else None
-
-
-def parted_at(whole: Comparison, run: SimulationResult, other: SimulationResult) -> float | None:
-    """The singular passage (s) at which two runs left on different branches.
-
-    There the rates differ at once, where otherwise small differences grow over many times 1/rate.
-    """
-    rates = whole.size[:, 1]
-    beyond = np.flatnonzero(rates > DISAGREE)
-    if not len(beyond):
-        return None
-    near = np.flatnonzero(rates[: beyond[0]] < SAME)
-    if not len(near):
-        return None
-    before, after = float(whole.t[near[-1]]), float(whole.t[beyond[0]])
-    if (after - before) * run.mechanism.structure.units.rate > AT_ONCE:
-        return None
-    slack = after - before
-    met = [c.time for c in (*run.crossings, *other.crossings)]
-    met += [b.start for b in (*run.bifurcations, *other.bifurcations)]
-    return next((t for t in met if before - slack <= t <= after + slack), None)

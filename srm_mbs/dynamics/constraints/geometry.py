@@ -1,21 +1,18 @@
-"""Closure rows without forces: g, G and Gdot v as pure numbers, for geometry on the loops.
+"""The closure equations in units: g, G and Gdot v as pure numbers, without forces.
 
-Drives are not part of it: what is singular here is singular whatever the motion.  With them, and
-time as one more coordinate, it is :mod:`srm_mbs.dynamics.constraints.geometry`.
+Coordinates are counted in their units (1 rad, the scene diagonal), rows in theirs; *normalised*
+rows are divided by their usual norm, so that singular values can be compared with a threshold.
 
-Coordinates count in their units (1 rad, the scene diagonal), rows in theirs; *normalised* rows are
-divided by their usual size, so that ranks can be judged.
-
-Closures and drives as pure numbers, with time as one more coordinate.
-
-The rows g(q) - s(t) of drives depend on (q, t) as those of closures do on q, and time passes
-evenly: with the coordinates (q, t) and the rates (v, 1), and ' for the derivative by t,
+:class:`ClosureGeometry` has the closures alone: a configuration that is singular there is singular
+in every motion.  :class:`DrivenGeometry` adds the drives, with time as one more coordinate.  The
+rows g(q) - s(t) of drives depend on (q, t) as those of closures depend on q, and t' = 1: with the
+coordinates (q, t), the rates (v, 1), and ' for the derivative by t,
 
     [G, -s'] (v, 1) = 0,     [G, -s'] (v', 0) + (Gdot v - s'') = 0.
 
-So what holds of singular configurations of closures, their branches and the constraint algebra on
-them, holds of drives in (q, t), where t has no inertia of its own: it is prescribed.  Where the
-rows G of closures and drives lose rank on a motion, [G, -s'] does, since G v = s' has a solution.
+Therefore the theory of singular configurations of closures, of their branches and of the constraint
+algebra on them applies to drives in (q, t), where t is prescribed and has no inertia.  Where the
+rows G of closures and drives lose rank on a motion, [G, -s'] does, because G v = s' has a solution.
 """
 
 from __future__ import annotations
@@ -37,12 +34,12 @@ from srm_mbs.model.mechanism import MechanismData
 
 
 class ClosureGeometry:
-    """Closure equations of a mechanism.
+    """The closure equations of a mechanism, without its drives.
 
     Parameters
     ----------
     mechanism
-        Its model and loops.
+        The mechanism, of which the model and the loops count.
     start : (nq,)
         Configuration at which units are measured.
 
@@ -51,7 +48,7 @@ class ClosureGeometry:
     coordinate_unit : (nv,), length, row_unit : (rows,)
         Units of the coordinates, the scene diagonal (m), units of the rows.
     unit : (n,)
-        Units of all that moves here: the coordinates, n = nv.
+        Units of the unknowns: the coordinates, n = nv.
     drives
         Names of the drives whose rows follow those of the loops: none.
     """
@@ -89,7 +86,7 @@ class ClosureGeometry:
             spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.unit
             _, G = self.closure(pin.integrate(self.model, self.start, spread))
             squares += (G**2).sum(axis=1) / 8
-            # What rows would measure if nothing in them cancelled: their rounding is eps of it.
+            # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
             J = world_jacobian(self.data)
             turn = np.linalg.norm(J[3:], axis=0) * self.unit
             shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.length + turn
@@ -106,7 +103,7 @@ class ClosureGeometry:
         return np.sqrt(np.where(squares > 0.0, squares, 1.0))
 
     def normalised(self, q: FloatArray) -> FloatArray:
-        """G of :meth:`closure`, rows over their usual size: what ranks are judged by."""
+        """G of :meth:`closure`, each row over its usual norm; its singular values give ranks."""
         return self.closure(q)[1] / self.row_size[:, None]
 
     @cached_property
@@ -126,7 +123,7 @@ class ClosureGeometry:
 
     @cached_property
     def _left(self) -> FloatArray:
-        """Size of what is left of each row (rows,), where the mechanism starts."""
+        """Norm of each row (rows,) after the eliminations, over that before them, at q0."""
         start = self.at(self.mechanism.q0, 0.0)
         before, left = (
             np.linalg.norm(rows, axis=1)
@@ -136,9 +133,10 @@ class ClosureGeometry:
         return out
 
     def separated(self, q: FloatArray) -> FloatArray:
-        """As :meth:`normalised`, where nearly parallel rows of closures between the same bodies
-        are replaced by their differences, as large as themselves: what is small everywhere hides
-        no singular configuration."""
+        """As :meth:`normalised`, with the difference in place of one of two nearly parallel rows of
+        closures between the same bodies, scaled to their norm.
+
+        Otherwise a singular value that is small everywhere would hide singular configurations."""
         return self._without_shares(q) / self._left[:, None] if self._shares else self.normalised(q)
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
@@ -155,7 +153,7 @@ class ClosureGeometry:
         return out
 
     def at(self, q: FloatArray, t: float) -> FloatArray:
-        """What the other methods take for the configuration q (nq,) at the time t (s): q itself."""
+        """The unknowns, as the other methods take them, at q (nq,) and t (s): q itself."""
         return q
 
     def rates(self, v: FloatArray) -> FloatArray:
@@ -184,14 +182,14 @@ class DriveRows:
     mechanism
         Its drives.
     geometry
-        What gives the units, and a model without gravity, whose rounding would not cancel.
+        Its units, and its model without gravity, whose rounding would not cancel.
     q : (nq,)
         The configuration.
 
     Attributes
     ----------
     rows : (k, nv), rates : (k,)
-        In units: the drives ask for rows u = rates.
+        In units: the drives prescribe rows u = rates.
     """
 
     def __init__(self, mechanism: MechanismData, geometry: ClosureGeometry, q: FloatArray) -> None:
@@ -267,7 +265,7 @@ class DrivenGeometry(ClosureGeometry):
         return np.concatenate([of_closures, np.ones(len(self.drives))])
 
     def _update(self, place: FloatArray, with_bias: bool) -> FloatArray:
-        """Evaluate the rows at (q, t); their Gdot v, without what the laws add."""
+        """Evaluate the rows at (q, t); returns their Gdot v, without the s'' of the laws."""
         self._rows.update(self.data, place[:-1], with_bias)
         bias = self._rows.bias.copy()
         self._rows.move_to(float(place[-1]))

@@ -24,9 +24,9 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, THIRD_ORDER
 
-CLOSED = 1e-12
+CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of a point of the chart, in row units."""
-CUT = 1e-10
+RANK_TOLERANCE = 1e-10
 """Relative singular value below which a direction does not move the closures."""
 ITERATIONS = 20
 
@@ -56,7 +56,7 @@ class ChartPoint:
         """V (nv, k): velocities on the closures with L V = 1."""
         chart = self.chart
         G = chart.geometry.closure(self.q)[1]
-        back = np.linalg.lstsq(G @ chart.complement, G @ chart.basis, rcond=CUT)[0]
+        back = np.linalg.lstsq(G @ chart.complement, G @ chart.basis, rcond=RANK_TOLERANCE)[0]
         out: FloatArray = chart.basis - chart.complement @ back
         return out
 
@@ -133,12 +133,14 @@ class TangentChart:
             def step() -> FloatArray:
                 D = self.derivative(u)
                 moves = G @ self.complement if D is None else G @ D @ self.complement
-                return u - self.complement @ np.linalg.lstsq(moves, g, rcond=CUT)[0]
+                return u - self.complement @ np.linalg.lstsq(moves, g, rcond=RANK_TOLERANCE)[0]
 
             return float(np.abs(g).max(initial=0.0)), step
 
         u, error = newton(self.basis @ z, linearise, ITERATIONS)
-        return ChartPoint(self, geometry.move(self.q, u), u) if error <= CLOSED else None
+        return (
+            ChartPoint(self, geometry.move(self.q, u), u) if error <= CONSTRAINT_TOLERANCE else None
+        )
 
 
 def differences(function: Callable[[FloatArray], FloatArray], steps: FloatArray) -> FloatArray:

@@ -1,8 +1,7 @@
-"""What can move: Gruebler counts against the true rank, redundant rows, stuck and idle joints.
+"""Degrees of freedom: Gruebler counts against the true rank, redundant rows, stuck and idle joints.
 
-Everything is judged where the rank of the closures is the structural one, at the initial
-configuration and a few others of a walk on the closure manifold, because single configurations may
-be singular.
+The analysis uses the initial configuration and some more of a walk on the closure manifold, as far
+as the closures have their structural rank there: single configurations may be singular.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Mobility:
     rank, degrees_of_freedom
         True (structural) rank of the rows, and nv minus it.
     redundant_rows
-        Rows that are zero wherever the loops are closed; left out of the solve.
+        Rows that are zero in every closed configuration; left out of the solve.
     pivoted_redundancy
         Number of further redundant rows, which pivoting leaves out at every evaluation.
     indeterminate_rows

@@ -10,9 +10,9 @@ reorthogonalisation is needed.  Truncating or damping small pivots would delete 
 direction next to a singular configuration; pivots are dropped for redundancy only, or in the
 zone, where a prediction takes their place.
 
-The next pivot is the column of the largest remaining norm.  With many loops it is looked for along
-their graph instead (:func:`swept_qr`): what a pivot fills in then stays next to it, so that the
-cost of the kernel's sparse twin grows with the number of loops and no faster.
+The next pivot is the column of the largest remaining norm.  With many loops the search follows
+their graph instead (:func:`swept_qr`): the fill-in of a pivot then stays next to it, so that the
+cost of the kernel's sparse factorisation grows linearly with the number of loops.
 """
 
 from __future__ import annotations
@@ -72,16 +72,16 @@ def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
 
 
 PIVOT_SHARE = 0.01
-"""Part of the largest norm from which a column may be a pivot where some depend on others."""
+"""Least norm of a pivot column, over the largest, where some columns depend on others."""
 
 PIVOT_WINDOW = 16
-"""Columns along the graph of which the largest is the next pivot."""
+"""Number of neighbouring columns along the graph, the largest of which is the next pivot."""
 
 ALIKE = 1.0 - 1e-8
-"""Squares of norms that differ by less are alike: rounding may have made the difference."""
+"""Ratio of squared norms above which they count as equal: rounding may make that difference."""
 
 ABOVE = 1.0 + 1e-12
-"""A norm so little above a floor counts as below it: rounding may move it there."""
+"""Ratio of a norm to a floor up to which it counts as below it: rounding may move it there."""
 
 
 def swept_qr(
@@ -89,12 +89,13 @@ def swept_qr(
 ) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
     """As :func:`pivoted_qr`, with pivots along ``order`` (m,).
 
-    The next pivot is the largest in a window that moves along the order: what is next to each
-    other is pivoted as by :func:`pivoted_qr`.  If it is below ``floor``, all columns in the window
-    wait for the next sweep, which goes back, so that pivots below the floor come after all others.
-    If some columns are left over in the end, those wait, too, that are below ``PIVOT_SHARE`` of
-    the largest norm at the start of the sweep: columns that depend on others but for the error of
-    a stage must not take the place of independent ones.  The twin is ``swept_projection.cpp``.
+    The next pivot is the largest in a window that moves along the order, so that neighbouring
+    columns are pivoted as by :func:`pivoted_qr`.  If it is below ``floor``, all columns in the
+    window wait for the next sweep, which runs in the opposite direction, so that pivots below the
+    floor come after all others.  If ``rank`` is less than the number of columns, columns below
+    ``PIVOT_SHARE`` of the largest norm at the start of the sweep wait, too: columns that depend on
+    others but for the error of a stage must not take the place of independent ones.  The kernel
+    has the same algorithm in ``swept_projection.cpp``.
 
     Parameters
     ----------
@@ -258,8 +259,8 @@ class Projection:
         self.white_multiplier = self.normal(self._permuted.take(permutation))
 
     def hold(self, normals: FloatArray) -> None:
-        """Keep the motion tangential to the last of ``normals`` (nv, k) in place of the dropped
-        rows, whose own normals cannot be told here."""
+        """Keep the motion tangential to the last of ``normals`` (nv, k), which replace the dropped
+        rows: their own normals are not determined here."""
         missing = self.structural_rank - self.rank
         white = self.U @ normals[:, -missing:]
         for _ in range(2):

@@ -1,6 +1,6 @@
-r"""Rows of loops and drives together: g(q) - s(t), and what depends on time in them.
+r"""Rows of loops and drives together, g(q) - s(t).
 
-A drive's row is that of a closure, or of a joint coordinate, that moves:
+The row of a drive is that of a closure, or of a joint coordinate, with a prescribed motion s(t):
 
     g(q) - s(t) = 0,     G v - s'(t) = 0,     G v' + Gdot v - s''(t) = 0.
 
@@ -36,7 +36,7 @@ class DrivenKinematics:
         s of each drive by its name; without them the rows are g(q) alone.
     scale, keep, eliminations
         As for :class:`~srm_mbs.dynamics.constraints.rows.LoopKinematics`, over all rows; those of
-        drives are kept in any case, and nothing is taken off them.
+        drives are always kept and are not changed by eliminations.
 
     Attributes
     ----------
@@ -97,11 +97,11 @@ class DrivenKinematics:
         return np.concatenate([self._inner.pattern(), joints])
 
     def constants(self) -> dict[str, Any]:
-        """What the compiled kernel needs of the closures, those of driven points included."""
+        """Constants of the closures for the compiled kernel, those of driven points included."""
         return self._inner.constants()
 
     def drive_constants(self) -> list[dict[str, Any]]:
-        """What it needs of each drive."""
+        """Constants of each drive for the compiled kernel."""
         joints = {row: (k, wound) for row, k, wound, _ in self._coordinates}
         in_v = {c[0]: k for c, k in zip(self._coordinates, self._in_v)}
         drives = []
@@ -114,7 +114,7 @@ class DrivenKinematics:
         return drives
 
     def update(self, data: pin.Data, q: FloatArray, with_bias: bool = True) -> None:
-        """Evaluate g and G, and Gdot v unless ``with_bias`` is false, as if nothing was driven.
+        """Evaluate g and G, and Gdot v unless ``with_bias`` is false, with s = 0.
 
         ``data`` as for :meth:`~srm_mbs.dynamics.constraints.rows.LoopKinematics.update`, at q
         (nq,).
@@ -128,7 +128,7 @@ class DrivenKinematics:
             self.bias[row] = 0.0
 
     def move_to(self, t: float) -> None:
-        """Take the motion of the drives at t (s) off the rows of :meth:`update`."""
+        """Subtract s, s' and s'' at t (s) from the rows of :meth:`update`."""
         for row, factor, curve in self._driven_rows:
             s, rate, bend = curve(t)
             self.g[row] -= factor * s

@@ -1,27 +1,23 @@
-r"""The pivoted factorisation of rows in a metric, for what is found out about a mechanism.
+r"""Column-pivoted QR of L^-1 G^T, used to analyse rank and mobility.
 
     M = L L^T,   W = L^-1 G^T,   W Pi = Q R,
 
-as in :mod:`srm_mbs.dynamics.constraints.projection`, but with its own cut of the pivots, and with
-the vectors that the rows do not see.  With M = 1 and all pivots above a cut it takes the place of
-singular values and least squares, at a fraction of their cost.  For many coordinates the kernel
-makes it, whose sparse algebra follows the graph of the loops; its twin is ``algebra.cpp``.
+as in :mod:`srm_mbs.dynamics.constraints.projection`, but with a threshold of its own for the
+pivots, and with the null space of the rows.  The module has three parts.
 
-The order of the rows along the graph of the loops, in which many of them are factorised.
+*Order of the rows.*  Two rows are neighbours if they have coordinates, or ancestors of these, in
+common.  With many coordinates the rows are factorised in the order of minimum degree, in postorder
+of the elimination tree: along a chain of loops from one end to the other, in a tree of loops from
+the leaves to the root.  Source: J. A. George, J. W. H. Liu, The evolution of the minimum degree
+ordering algorithm, SIAM Review 31 (1989) 1.
 
-Two rows meet where they have coordinates or ancestors of these in common.  Rows that meet the
-fewest others come first (greedy minimum degree), those that hang together next to each other (in
-postorder of the elimination tree): along a chain of loops from one end to the other, in a tree of
-loops from the leaves to the root.
+*The factorisation* :class:`RowAlgebra`, by LAPACK, or for many coordinates by the kernel
+(``algebra.cpp``), whose sparse algebra follows the graph of the loops.
 
-Source: J. A. George, J. W. H. Liu, The evolution of the minimum degree ordering algorithm, SIAM
-Review 31 (1989) 1.
-
-Rank, null vectors, weakest singular value and shortest solution of rows A x = b.
-
-Few coordinates: singular values.  Many: the pivoted factorisation A^T Pi = Q R on the pattern of A
-(:mod:`srm_mbs.dynamics.constraints.row_algebra`), whose cost follows the graph of the loops.  Both
-say the same unless A has singular values, or pivots, next to the cut.
+*Rank, null space, smallest singular value and minimum-norm solution* of A x = b.  With few
+coordinates they come from the singular values of A.  With many they come from the factorisation
+with M = 1, which costs a fraction of that; both agree unless A has singular values, or pivots, next
+to the threshold.
 """
 
 from __future__ import annotations
@@ -58,11 +54,11 @@ KERNEL_ABOVE = 64
 ARPACK_ABOVE = 64
 """Columns above which singular values come from a sparse factorisation."""
 
-FULL = 0.5
-"""Part of the entries of W from which there is no graph to follow."""
+LARGEST_FILL = 0.5
+"""Largest part of the entries of W that are not zero for which an order is computed."""
 
-COMMON = 16
-"""Loops that a coordinate is common to before it says nothing about their order."""
+LEAST_COMMON = 16
+"""Number of loops that share a coordinate up to which the coordinate makes them neighbours."""
 
 
 def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
@@ -85,7 +81,7 @@ def _ordered(shape: tuple[int, int], bits: bytes, parents: tuple[int, ...]) -> t
     size = shape[0] * shape[1]
     pattern = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape).astype(bool)
     supports = [_with_ancestors(np.flatnonzero(row).tolist(), parents) for row in pattern]
-    if sum(map(len, supports)) > FULL * size:
+    if sum(map(len, supports)) > LARGEST_FILL * size:
         return ()
     alike: dict[frozenset[int], list[int]] = {}
     for row, support in enumerate(supports):
@@ -110,7 +106,7 @@ def _neighbours(supports: Sequence[frozenset[int]]) -> list[set[int]]:
     for k, support in enumerate(supports):
         for coordinate in support:
             of.setdefault(coordinate, []).append(k)
-    most = max(COMMON, 10 * int(np.sqrt(len(supports))))
+    most = max(LEAST_COMMON, 10 * int(np.sqrt(len(supports))))
     found: list[set[int]] = [set() for _ in supports]
     for together in of.values():
         if len(together) <= most:
@@ -150,7 +146,7 @@ def _postordered(order: Sequence[int], parents: Sequence[int]) -> list[int]:
         children.setdefault(parents[k], []).append(k)
     out: list[int] = []
     waiting = children.get(-1, [])[:]
-    # From the root: each node before its children, the last ones first; then turned round.
+    # From the root each node before its children, the last ones first; then reversed.
     while waiting:
         k = waiting.pop()
         out.append(k)
@@ -159,7 +155,7 @@ def _postordered(order: Sequence[int], parents: Sequence[int]) -> list[int]:
 
 
 class RowAlgebra(Protocol):
-    """One factorisation, and what follows from it.
+    """A factorisation of M and G, and the products and solutions that it gives.
 
     Attributes
     ----------
@@ -189,7 +185,7 @@ class RowAlgebra(Protocol):
         """
 
     def tangential(self, w: FloatArray) -> FloatArray:
-        """(1 - P) w (nv,): the part of w that the rows in use do not see, in the metric M."""
+        """(1 - P) w (nv,): the part of w in the null space of the rows in use, M-orthogonally."""
 
     def solve(self, g: FloatArray) -> FloatArray:
         """E g (nv,): the shortest x in the metric M with G x = g (rows,) in the rows in use."""
@@ -199,7 +195,7 @@ class RowAlgebra(Protocol):
         :meth:`solve` where M = 1."""
 
     def complement(self) -> FloatArray:
-        """Orthonormal basis (nv, nv - rank) of L^T x over all x that the rows in use do not see."""
+        """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
 
 
 class DenseAlgebra:
@@ -312,7 +308,7 @@ class CompiledAlgebra:
         try:
             self._kernel_system.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
         except ArithmeticError:
-            cholesky(M)  # says whether it is the mass matrix
+            cholesky(M)  # raises if the fault is in the mass matrix
             raise EvaluationError("the closures are not finite") from None
 
     def tangential(self, w: FloatArray) -> FloatArray:
@@ -370,7 +366,7 @@ def coordinate_parents(model: pin.Model) -> list[int]:
 
 
 def trees(model: pin.Model) -> list[slice]:
-    """Velocity components of each tree that stands on the ground: the blocks of M."""
+    """Velocity components of each tree that is rooted in the ground: the blocks of M."""
     starts = [model.joints[i].idx_v for i in range(1, model.njoints) if not model.parents[i]]
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], int(model.nv)])]
 
@@ -381,7 +377,7 @@ INERT = 1e-9
 
 @dataclass(frozen=True)
 class RankRevealingQR:
-    """What is left of A (m, n) when singular values, or pivots, below a cut are zero.
+    """Null space and solution of A x = b, with singular values, or pivots, below a cut as zero.
 
     Attributes
     ----------
@@ -422,8 +418,8 @@ def null_basis(A: FloatArray, cut: float) -> FloatArray:
 
 
 def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
-    """The shortest x (n,) with the least |A x - b|; what is below rcond times the largest singular
-    value is zero.  By pivots, the rows in use are satisfied and dependent ones left out."""
+    """The shortest x (n,) that minimises |A x - b|; singular values below rcond times the largest
+    count as zero.  With many columns the rows in use are satisfied, dependent ones are left out."""
     longest = float(np.sqrt((A * A).sum(axis=1).max(initial=0.0)))
     algebra = _pivoted(A, rcond * longest)
     if algebra is not None:

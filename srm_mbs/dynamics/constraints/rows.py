@@ -16,15 +16,14 @@ m = R u, have
 with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row has constant
 entries c_i in G, and Gdot v = 0.
 
-Three numbers are multiplied before NumPy starts, so each row is made of plain floats, in the axes
-of the joint that carries b (the world's for a closure to the ground).  With e = R_b d and x the
-origin of anchor a, both in world axes, d^T X_lin = (e, x x e): one product with J is left for all
-rows together.  B_lin + w x r is A_a(x) - A_b(x) - 2 omega_b x r, with the classical acceleration
-A(x) = a + alpha x x + omega x (v + omega x x) of the point of a body that is at x.
+A joint row is a linear relation of joint coordinates, g = sum c_i q_i - s.
 
-Three numbers as plain floats: products of them before NumPy would have started.
-
-Joint rows of closures: linear relations of joint coordinates, g = sum c_i q_i - s.
+Vectors of three numbers are plain floats here, because NumPy's overhead is many times the cost of
+their products.  They are in the axes of the joint that carries b (the world's for a closure to the
+ground).  With e = R_b d and x the origin of anchor a, both in world axes, d^T X_lin = (e, x x e):
+one product with J is left for all rows together.  B_lin + w x r is A_a(x) - A_b(x) - 2 omega_b x r,
+with the classical acceleration A(x) = a + alpha x x + omega x (v + omega x x) of the point of a
+body that is at x.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ class JointRows:
     G : (count, nv)
         Their constant Jacobian.
     first_row, count
-        Where they stand among the rows of the mechanism.
+        Index of the first one among the rows of the mechanism, and their number.
     support : (nv,)
         0: the world Jacobian has no part in them.
     """
@@ -127,7 +126,7 @@ class JointRows:
             self._terms.append((terms, factor * row.offset))
 
     def constants(self) -> list[dict[str, Any]]:
-        """What the compiled kernel needs of each row."""
+        """Constants of each row for the compiled kernel."""
         return [
             {
                 "row": self.first_row + i,
@@ -140,7 +139,7 @@ class JointRows:
         ]
 
     def bind(self, data: pin.Data) -> None:
-        """Nothing of ``data`` enters."""
+        """Do nothing: joint rows depend on q alone."""
 
     def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
         """Append for each row six zeros for G, which is set apart, then g, then Gdot v = 0."""
@@ -152,7 +151,7 @@ class JointRows:
 
 
 COINCIDENT = 1e-9
-"""Distance of two points, over the length that it should have, from which it has a direction."""
+"""Distance of two points, over its nominal length, below which it has no direction."""
 
 
 def world_jacobian(data: pin.Data) -> FloatArray:
@@ -177,9 +176,10 @@ def support(model: pin.Model, joint: int) -> FloatArray:
 
 
 class _Body:
-    """Where a joint of ``data`` is and how it moves, read anew by every call.
+    """Placement of a joint in the world, and its velocity and bias acceleration in its own axes.
 
-    Placement in the world; velocity and bias acceleration (with -gravity) in the joint's axes.
+    The acceleration contains -gravity.  Every attribute is a function that reads the current
+    numbers of ``data``.
     """
 
     def __init__(self, data: pin.Data, joint: int) -> None:
@@ -321,9 +321,9 @@ class _LoopRows:
 
 
 class Elimination(NamedTuple):
-    """``factor`` times the row ``other`` is taken off the row ``row``, both unscaled.
+    """Subtract ``factor`` times the row ``other`` from the row ``row``, both unscaled.
 
-    Of closures between the same bodies, where no factor depends on the configuration.
+    Both belong to closures between the same bodies, so that the factor is constant.
     """
 
     row: int
@@ -412,7 +412,8 @@ class LoopKinematics:
         return out
 
     def constants(self) -> dict[str, Any]:
-        """What the compiled kernel needs of the rows: ``loops`` between anchors, ``joint_rows``."""
+        """Constants for the compiled kernel: ``loops`` between anchors, ``joint_rows``,
+        ``eliminations``."""
         return {
             "loops": [loop.constants() for loop in self._loops if isinstance(loop, _LoopRows)],
             "joint_rows": [row for rows in self._joint_rows for row in rows.constants()],

@@ -1,12 +1,10 @@
 """Load-time analysis of the closures: row scales, structural rank, redundant rows.
 
-A walk on the closure manifold (docs/notation.md, "Manifold sampling") visits
-closed configurations from several restarts, because the start may itself be singular, and open
-random configurations alone give the wrong rank for over-constrained loops.
+A random walk on the closure manifold, with several restarts, visits closed configurations: the
+start may itself be singular, and open random configurations alone give the wrong rank for
+over-constrained loops.
 
-The walk on the closure manifold that the load-time analysis makes, and its scaled rows.
-
-Source: docs/notation.md, "Load-time analysis".
+Source: docs/notation.md, "Load-time analysis" and "Manifold sampling".
 """
 
 from __future__ import annotations
@@ -32,8 +30,12 @@ from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.mechanism import MechanismData, per_start
 from srm_mbs.model.validation import check_inertia
 
+log = logging.getLogger(__name__)
+
 OPEN_SAMPLES = 24
+"""Random open configurations from which rows are scaled."""
 WALK_AMPLITUDE = 0.5
+"""Largest step of the walk, in units."""
 ROUNDING_ROW = 1e-12
 """Rows of one kind whose rms stays below this part of their uncancelled terms are rounding."""
 NULL = 1e-7
@@ -47,6 +49,20 @@ CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
 CLOSURE_ROUNDING = 1e-14
 """Closure error, in row units, at which Newton's iteration ends."""
+RESTARTS = 10
+WALK_STEPS = 12
+"""Walks from the start, and steps of each."""
+STRUCTURAL_PIVOT = 1e-6
+"""A pivot (of scaled rows) above this counts as independent."""
+ZERO_ROW = 1e-9
+"""A scaled row that stays below this in every closed sample is zero."""
+SMALL_REFERENCE_PIVOT = 0.1
+"""A last structural pivot with a median below this is close to zero everywhere: rows are
+eliminated and scaled anew."""
+BALANCING_SAMPLES = 12
+"""Closed configurations in which rows are measured against each other."""
+RANK_GAP = 1e3
+"""Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
 
 class ManifoldSampler:
@@ -62,7 +78,7 @@ class ManifoldSampler:
     scale : (rows,)
         Scale by which rows are divided; ones until :meth:`set_scale`.
     eliminations
-        Rows that are taken off others; none until :meth:`separate`.
+        Rows that are subtracted from others; none until :meth:`separate`.
     """
 
     def __init__(self, mechanism: MechanismData, units: Units) -> None:
@@ -144,7 +160,7 @@ class ManifoldSampler:
             spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
             rows, _ = self.factorised(pin.integrate(self.model, mechanism.q0, spread))
             squares += rows.row_squares
-            # What rows would measure if nothing in them cancelled: their rounding is eps of it.
+            # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
             J = world_jacobian(self.data)
             turn = np.linalg.norm(J[3:], axis=0)
             shift = np.linalg.norm(J[:3], axis=0) + self.units.length * turn
@@ -181,17 +197,17 @@ class ManifoldSampler:
         upper = np.triu(self.data.M)
         M = upper + np.triu(upper, 1).T
         size = np.sqrt(np.maximum(((X @ M) * X).sum(axis=1), 0.0))
-        # No row is further from any span than it is long; what seems to be is not in use.
+        # A row is no further from a span than it is long, unless it is not in use.
         used = size * np.sqrt(rows.row_squares) > 0.5
         out: FloatArray = np.divide(1.0, size, out=np.full(count, np.nan), where=used)
         return out
 
     def separate(self, samples: Sequence[FloatArray], kept: BoolArray) -> None:
-        """Take off rows what makes them nearly parallel to others between the same bodies.
+        """Find eliminations for rows that are nearly parallel to others between the same bodies.
 
-        Such as those of two points next to each other that hold a hinge: their difference, which
-        holds it against turning, is small everywhere.  The last pivot then tells that a row is
-        about to depend on others only where that is smaller still, whatever the scales.
+        An example are two points next to each other that hold a hinge: the difference of their
+        rows, which prevents a rotation, is small everywhere.  Without the elimination the last
+        pivot is small everywhere, too, and shows a loss of rank only where it is smaller still.
 
         Parameters
         ----------
@@ -236,10 +252,10 @@ class ManifoldSampler:
     def balance(self, samples: Sequence[FloatArray]) -> None:
         """Scale each row by its usual distance from the span of the others.
 
-        Where the rows of one closure differ much in size, as those that hold a slender body do,
-        their common scale makes some of them small everywhere.  A pivot that vanishes is the last
-        one only once it is smaller still.  Against its own distance every row is about 1 unless
-        it is about to depend on others, whatever the sizes and directions of those.
+        Where the rows of one closure differ much in norm, as those that hold a slender body do,
+        their common scale makes some of them small everywhere, and a pivot that vanishes is the
+        last one only once it is smaller still.  A row over its own usual distance is about 1 unless
+        it is close to dependent on the others.
         """
         scale = self.scale.copy()
         for i, distances in enumerate(np.array([self.distances(q) for q in samples]).T):
@@ -286,7 +302,7 @@ class ManifoldSampler:
         for restart in range(restarts):
             q = start
             for k in range(steps):
-                # Drives take no part: they lead along the closed configurations, wherever that is.
+                # The walk moves drives: every closed configuration counts, driven there or not.
                 _, rows = self.factorised(q)
                 if rows.rank == self.model.nv:
                     break
@@ -297,22 +313,6 @@ class ManifoldSampler:
                 if closed is not None:
                     q = closed
                     yield q
-
-
-log = logging.getLogger(__name__)
-
-RESTARTS = 10
-WALK_STEPS = 12
-STRUCTURAL_PIVOT = 1e-6
-"""A pivot (of scaled rows) above this counts as independent."""
-ZERO_ROW = 1e-9
-"""A scaled row that stays below this in every closed sample is zero."""
-BLUNT = 0.1
-"""A last structural pivot whose usual size is below this is told apart from zero too late."""
-BALANCING_SAMPLES = 12
-"""Closed configurations in which rows are measured against each other."""
-RANK_GAP = 1e3
-"""Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,10 +341,10 @@ class Structure:
     samples
         Number of closed configurations visited.
     notes
-        Sentences for the user, such as a weak gap between structural and redundant pivots.
+        Sentences for the user, such as one about structural and redundant pivots of similar size.
     eliminations
-        Rows that are taken off others, in this order, where rows of closures between the same
-        bodies are nearly parallel.
+        Rows that are subtracted from others, in this order, where rows of closures between the
+        same bodies are nearly parallel.
     """
 
     row_names: tuple[str, ...]
@@ -483,7 +483,7 @@ def analyse(mechanism: MechanismData) -> Structure:
     kept[walker.closed :] = True
     loop_rank = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     rank = int(samples.ranks().max())
-    if rank and np.median(samples.last_pivots(rank)) < BLUNT:
+    if rank and np.median(samples.last_pivots(rank)) < SMALL_REFERENCE_PIVOT:
         samples = _balanced(walker, samples, rank)
     sigma_ref = float(np.median(samples.last_pivots(rank))) if rank else 1.0
     if rank < loop_rank + len(mechanism.drives):

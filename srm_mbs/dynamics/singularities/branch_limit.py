@@ -2,18 +2,16 @@ r"""The constraint algebra on a branch, at and next to a singular configuration.
 
 On a branch the projector P and the vector z = E Gdot v, which make up the multiplier
 yhat = P M^-1 f + z, are smooth functions of the configuration, also where the closures are
-singular.  There, however, the direct solve errs by round-off over sigma^2.  So P and z are taken
+singular.  There, however, the direct solve errs by round-off over sigma^2.  So P and z are computed
 
 * at the singular configuration from the limit formula
 (:mod:`srm_mbs.dynamics.singularities.local_analysis`),
 * at regular configurations on both sides of it from the direct solve,
 
-all on one curve in the branch, and interpolated to the configuration that is asked for.  The
-curve, q (+) tau w (+) a normal part, is kinematic: no forces, and any w that leads away from the
-singular configurations.  With drives it is one of places (q, t), with P and z of those times, and
-what the rows ask of the velocity, P v - E s', is an affine function of it.
-
-Polynomial interpolation through given times.
+all on one curve in the branch, and interpolated to the requested configuration.  The curve,
+q (+) tau w (+) a normal part, is kinematic: no forces act, and w is any direction that leads away
+from the singular configurations.  With drives it is a curve of (q, t), with P and z of those times;
+the residual of the rates, P v - E s', is an affine function of v.
 """
 
 from __future__ import annotations
@@ -45,16 +43,21 @@ def lagrange_weights(nodes: FloatArray, t: float) -> FloatArray:
 
 NODES = np.array([-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0])
 CENTRE = 4
+"""Nodes of the curve, in spacings from its centre, and the index of the centre among them."""
 SPACINGS = (0.03, 0.015, 0.0075, 0.06)
 """Distances of the nodes, in units; the first that is accurate enough is used, else the best."""
 ACCURATE = 1e-11
+"""Estimated error of P at which no other spacing is tried."""
 CLOSING_ITERATIONS = 15
-CLOSED = 1e-12
-TELLS_THE_BRANCH = 5e-8
-"""Distance (units) from a singular configuration from which a configuration tells its branch:
+CONSTRAINT_TOLERANCE = 1e-12
+"""Largest closure error of a node, in row units."""
+STEP_ROUNDING = 1e-14
+"""Step of Newton's iteration (units) at which it ends."""
+BRANCH_RESOLUTION = 5e-8
+"""Distance (units) from a singular configuration above which a configuration determines its branch:
 there round-off over the distance is a twentieth of it."""
 NEAR = 1e-2
-"""Largest distance (units) of the asked configuration from the singular one."""
+"""Largest distance (units) of the requested configuration from the singular one."""
 
 
 class BranchLimit:
@@ -67,7 +70,7 @@ class BranchLimit:
     q
         A configuration on the branch, as the geometry takes it (:meth:`ClosureGeometry.at`).
     frame : (n, d)
-        Velocities in units, close to the branch's tangents, along which the curve goes straight.
+        Velocities in units, close to the branch's tangents, in which the curve is straight.
     tangent : (n, d)
         Tangent space of the branch at the centre, orthonormal, in units.
     direction : (n,)
@@ -128,10 +131,13 @@ class BranchLimit:
             right = np.concatenate([g, frame.T @ moved])
             step = -np.linalg.lstsq(rows, right, rcond=1e-10)[0]
             x, moved = geometry.move(x, step), moved + step
-            if np.abs(step).max() < 1e-14:
+            if np.abs(step).max() < STEP_ROUNDING:
                 break
         g, _ = geometry.closure(x)
-        if not (np.abs(g).max() < CLOSED and np.abs(moved).max() < 0.5 * np.abs(move).max()):
+        if not (
+            np.abs(g).max() < CONSTRAINT_TOLERANCE
+            and np.abs(moved).max() < 0.5 * np.abs(move).max()
+        ):
             return None
         return x
 
@@ -169,7 +175,7 @@ class BranchLimit:
         return out
 
     def off_branch(self, v: FloatArray) -> FloatArray:
-        """P v - E s' (nv,): what the velocity v (nv,) has besides one of the branch."""
+        """P v - E s' (nv,): the part of the velocity v (nv,) that leads off the branch."""
         return self._off(self._normal, v)
 
     def _bend(self, k: int, node: FloatArray, v: FloatArray) -> FloatArray:
@@ -196,8 +202,8 @@ class BranchLimit:
 
 
 def _with_time(tangent: FloatArray, nv: int) -> tuple[FloatArray, FloatArray]:
-    """The velocities (nv, k) of a tangent space (n, d) in which time stands still, and if there is
-    time one (nv, 1) in which it has unit rate."""
+    """The velocities (nv, k) of a tangent space (n, d) with t' = 0, and one with t' = 1: (nv, 1)
+    with drives, (nv, 0) without."""
     if len(tangent) == nv:
         return tangent, np.zeros((nv, 0))
     passing = tangent[nv]
@@ -210,7 +216,7 @@ def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray
     """The shortest velocity (n,) in the branch that leaves the singular configurations as u does.
 
     ``tangent`` (n, d) is the branch's tangent space, u (n,) a velocity in it, all in units.
-    What no closure notices, such as the motion of a free base, is left out.
+    Motions that no closure restricts, such as that of a free base, are left out.
     """
     null = singular.null
     normal = null - tangent @ (tangent.T @ null)
@@ -262,6 +268,6 @@ def branch_next_to(
     singular = analyse_singular(geometry, found, structural_rank)
     limit = branch_limit(singular, q, u)
     away = geometry.difference(found, q)
-    if limit is None and np.linalg.norm(away) > TELLS_THE_BRANCH:
+    if limit is None and np.linalg.norm(away) > BRANCH_RESOLUTION:
         limit = branch_limit(singular, q, away)
     return singular, limit

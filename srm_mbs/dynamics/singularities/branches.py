@@ -147,7 +147,7 @@ def branch_tangents(
         lead = direction[np.argmax(np.abs(direction) > 0.1 * np.abs(direction).max())]
         if driven:
             lead = direction[-1]
-            if abs(lead) < SAME:  # time stands still: no motion goes there
+            if abs(lead) < SAME:  # t' = 0: no motion has this direction
                 continue
         elif arriving is not None:
             lead = direction @ arriving

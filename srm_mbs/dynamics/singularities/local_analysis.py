@@ -11,9 +11,8 @@ Lie groups too, and D^3 g[v, v, v] means d/dtau (Gdot v) along q (+) tau v with 
 Permanent redundancies (rows that depend on each other everywhere) have left null vectors as well;
 their forms vanish on the velocities that keep the loops closed.
 
-Everything is in units (:mod:`srm_mbs.dynamics.constraints.geometry`) unless it says otherwise.
-What is called a configuration q (nq,) with rates (nv,) is with drives a place (q, t), (nq + 1,),
-with rates (nv + 1,): :mod:`srm_mbs.dynamics.constraints.geometry`.
+Quantities are in units (:mod:`srm_mbs.dynamics.constraints.geometry`) unless stated otherwise.
+With drives, a configuration q (nq,) with rates (nv,) means (q, t), (nq + 1,), with rates (nv + 1,).
 """
 
 from __future__ import annotations
@@ -172,7 +171,7 @@ def smallest_singular_value(
 
 @dataclass(frozen=True)
 class Participants:
-    """What loses rank at a singular configuration.
+    """The rows, loops and drives that lose rank at a singular configuration.
 
     Attributes
     ----------
@@ -258,8 +257,8 @@ class SingularConfiguration:
         """Left null vectors (rows, k) whose forms do not vanish: the singularity proper."""
         if self.left.shape[1] == self.nullity:  # no permanent redundancies
             return self.left
-        # As many values of the forms as there are forms tell which combinations vanish; the forms
-        # themselves have as many entries as there are pairs of velocities.
+        # As many values of the forms as there are forms determine which combinations vanish; the
+        # forms themselves have an entry for every pair of velocities.
         count = self.left.shape[1] + SPARE
         motions = self.null @ np.random.default_rng(0).standard_normal((self.null.shape[1], count))
         values = np.array([self.curvature(motion) for motion in motions.T]).T
@@ -360,7 +359,7 @@ class SingularConfiguration:
 def analyse_singular(
     geometry: ClosureGeometry, q: FloatArray, structural_rank: int
 ) -> SingularConfiguration:
-    """Null vectors at q (nq,), an exactly singular configuration; the rest when it is asked for."""
+    """Null vectors at q (nq,), an exactly singular configuration; more is computed on request."""
     left, singular, right = np.linalg.svd(geometry.normalised(q))
     rank = int(np.sum(singular > SINGULAR))
     return SingularConfiguration(geometry, q, structural_rank, rank, left[:, rank:], right[rank:].T)

@@ -9,8 +9,9 @@ only if the loop has no other joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -160,41 +161,22 @@ class NoTreeError(Exception):
         self.joint, self.problem, self.remedy = joint, problem, remedy
 
 
-def _neighbours(joints: Sequence[Joint]) -> dict[str, list[tuple[str, Joint]]]:
-    out: dict[str, list[tuple[str, Joint]]] = {}
+def _graph(joints: Sequence[Joint], root: str) -> Any:
+    """The joints as the edges of a networkx multigraph whose nodes are bodies, in their order."""
+    import networkx  # only files with graphs of joints need it
+
+    graph = networkx.MultiGraph()
+    graph.add_node(root)
     for joint in joints:
-        out.setdefault(joint.parent, []).append((joint.child, joint))
-        out.setdefault(joint.child, []).append((joint.parent, joint))
-    return out
+        graph.add_edge(joint.parent, joint.child, joint.name, joint=joint)
+    return graph
 
 
 def distances(joints: Sequence[Joint], root: str) -> dict[str, int]:
     """Number of joints between ``root`` and each body connected with it, nearest first."""
-    near = _neighbours(joints)
-    found, queue = {root: 0}, [root]
-    for body in queue:  # the queue grows on the way
-        for other, _ in near.get(body, ()):
-            if other not in found:
-                found[other] = found[body] + 1
-                queue.append(other)
-    return found
+    import networkx
 
-
-def _joiner() -> Callable[[Joint], bool]:
-    """A function that joins the bodies of a joint, and says whether they were apart."""
-    leader: dict[str, str] = {}
-
-    def find(body: str) -> str:
-        while (up := leader.setdefault(body, body)) != body:
-            leader[body] = body = leader[up]
-        return body
-
-    def join(joint: Joint) -> bool:
-        one, other = find(joint.parent), find(joint.child)
-        leader[other] = one
-        return one != other
-
-    return join
+    return dict(networkx.single_source_shortest_path_length(_graph(joints, root), root))
 
 
 def spanning_tree(joints: Sequence[Joint], root: str, cut: Sequence[str] = ()) -> SpanningTree:
@@ -206,7 +188,7 @@ def spanning_tree(joints: Sequence[Joint], root: str, cut: Sequence[str] = ()) -
     Parameters
     ----------
     joints
-        The graph's edges.
+        The graph's edges, with unique names.
     root
         The root body.
     cut
@@ -217,30 +199,31 @@ def spanning_tree(joints: Sequence[Joint], root: str, cut: Sequence[str] = ()) -
     NoTreeError
         If cutting ``cut`` does not leave a tree.
     """
+    import networkx
+
     depth = distances(joints, root)
 
     def cost(joint: Joint) -> tuple[bool, int, int]:
         where = depth[joint.parent] + depth[joint.child]
         return (not joint.kept, FREEDOM[joint.type], where)
 
-    join = _joiner()
     candidates = [joint for joint in joints if joint.name not in cut]
-    chosen = {joint.name for joint in sorted(candidates, key=cost) if join(joint)}
+    graph = _graph(candidates, root)
+    for rank, joint in enumerate(sorted(candidates, key=cost)):
+        graph.edges[joint.parent, joint.child, joint.name]["weight"] = rank
+    edges = networkx.minimum_spanning_edges(graph, data=False)
+    chosen = {name for _, _, name in edges}
     if cut:
         _check_cut(joints, candidates, chosen, cut, root)
-    tree = [joint for joint in joints if joint.name in chosen]
+    tree = _graph([joint for joint in joints if joint.name in chosen], root)
     order, turned = [], []
-    near, queue, seen = _neighbours(tree), [root], {root}
-    for body in queue:
-        for other, joint in near.get(body, ()):
-            if other in seen:
-                continue
-            seen.add(other)
-            queue.append(other)
-            if joint.parent != body:
-                joint = joint.reversed()
-                turned.append(joint.name)
-            order.append(joint)
+    for body, other in networkx.bfs_edges(tree, root):
+        (edge,) = tree[body][other].values()
+        joint = edge["joint"]
+        if joint.parent != body:
+            joint = joint.reversed()
+            turned.append(joint.name)
+        order.append(joint)
     return SpanningTree(
         tuple(order), tuple(turned), tuple(j for j in joints if j.name not in chosen)
     )
@@ -280,8 +263,12 @@ def _check_cut(
 
 def components(bodies: Mapping[str, Body], joints: Sequence[Joint]) -> Iterator[list[str]]:
     """Connected components, their bodies in the order of the file; ``world`` is the ground."""
+    import networkx
+
+    graph = _graph(joints, WORLD)
+    graph.add_nodes_from(bodies)
     left = dict.fromkeys((WORLD, *bodies))
     while left:
-        found = distances(joints, next(iter(left)))
+        found = networkx.node_connected_component(graph, next(iter(left)))
         yield [body for body in left if body in found]
         left = {body: None for body in left if body not in found}

@@ -21,9 +21,9 @@ from srm_mbs.integration.methods.thesis.halved_step import HalvedStep
 
 PLACEMENTS = ("automatic", "halved", "off")
 """How steps are placed around the singular configurations that sigma shows."""
-CLEARANCE = 0.05
+STAGE_CLEARANCE = 0.05
 """Smallest distance of a stage from a given time, as a fraction of the step."""
-AHEAD = 0.15
+CLEARANCE_AHEAD = 0.15
 """Smallest distance from the end of a step to a given time after it, as a fraction of the step;
 the next step could pass a nearer one only by being very short."""
 
@@ -63,7 +63,7 @@ class AvoidTimes(ControlWrapper):
         self._t_end, self._step = t_end, step
         self._times = np.sort(times)
         self._abscissae = np.unique(np.append(scheme.c[scheme.c > 0.0], 1.0))
-        self._centres = [centre for centre, half in scheme.gaps if half > 1.5 * CLEARANCE]
+        self._centres = [centre for centre, half in scheme.gaps if half > 1.5 * STAGE_CLEARANCE]
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where it would come too close to a given time."""
@@ -90,15 +90,15 @@ class AvoidTimes(ControlWrapper):
         if self._end_blocked(h, distances):
             return False
         gaps = np.abs(distances[:, None] / h - self._abscissae)
-        return bool(np.all(gaps >= CLEARANCE))
+        return bool(np.all(gaps >= STAGE_CLEARANCE))
 
     def _end_blocked(self, h: float, distances: FloatArray) -> bool:
         theta = distances / h
-        return bool(np.any((theta > 1.0 - CLEARANCE) & (theta < 1.0 + AHEAD)))
+        return bool(np.any((theta > 1.0 - STAGE_CLEARANCE) & (theta < 1.0 + CLEARANCE_AHEAD)))
 
     def _longest_clear(self, h: float, distances: FloatArray) -> float:
         """The longest clear step up to ``h`` that puts one of the times where it should be."""
-        near = distances[distances < (1.0 + AHEAD) * h]
+        near = distances[distances < (1.0 + CLEARANCE_AHEAD) * h]
         positions = np.array([*self._centres, 1.0 + self._centres[0]])
         candidates = np.sort((near[:, None] / positions).ravel())[::-1]
         # One that stops well before the first time is always clear.

@@ -99,7 +99,7 @@ class CompiledDenseOutput(DenseOutput):
 
         The state within it then follows from extra stages, which have no zone in the kernel.
         """
-        pieces = (self._steps.piece(step) for step in self._steps.zones)
+        pieces = (self._steps.smooth_interval(step) for step in self._steps.zones)
         return any(last - first < 2 for first, last in pieces)
 
     def _compile(self) -> Any:

@@ -39,21 +39,21 @@ def constants() -> Any:
     """``Constants`` of constants.hpp, each from the module of the reference that has it."""
     return _core.Constants(
         # Branch stages and zone.
-        monitored_below=near_singular.WATCHED,
-        near_steps=near_singular.NEAR,
-        far_steps=near_singular.FAR,
-        ambiguous_offset=near_singular.AMBIGUOUS,
-        held_tolerance=near_singular.HELD,
-        position_rounding=near_singular.ROUNDING,
-        usual_rounding=near_singular.USUAL,
-        crossing_sigma=near_singular.CROSSES,
-        lead_steps=near_singular.LEAD,
-        largest_rounding_floor=near_singular.MOST_FLOOR,
-        zone_largest=near_singular.ZONE_LARGEST,
-        count_uncertainty_above=near_singular.COUNT_UNCERTAINTY_ABOVE,
-        direct_hit=near_singular.HIT,
-        max_projections=near_singular.PROJECTIONS,
-        min_history=near_singular.FEWEST,
+        monitored_below=near_singular.WATCHED_SIGMA,
+        near_steps=near_singular.NEAR_STEPS,
+        far_steps=near_singular.FAR_STEPS,
+        ambiguous_offset=near_singular.AMBIGUOUS_DISTANCE,
+        held_tolerance=near_singular.HELD_ERROR,
+        position_rounding=near_singular.POSITION_ROUNDING,
+        usual_rounding=near_singular.USUAL_ROUNDING,
+        crossing_sigma=near_singular.CROSSING_SIGMA,
+        lead_steps=near_singular.FLOOR_STEPS,
+        largest_rounding_floor=near_singular.LARGEST_FLOOR,
+        zone_largest=near_singular.LARGEST_ZONE_SIGMA,
+        count_uncertainty_above=near_singular.UNCERTAINTY_SIGMA_CHANGE,
+        direct_hit=near_singular.DIRECT_HIT_SIGMA,
+        max_projections=near_singular.MAX_PROJECTIONS,
+        min_history=near_singular.MIN_PREDICTION_NODES,
         residual_interval=split_step.RESIDUAL_EVERY,
         # Step-size control.
         safety=step_size.SAFETY,
@@ -86,8 +86,8 @@ def constants() -> Any:
         open_residual=driver.RESIDUAL_EXAMINED,
         lost_residual=driver.LARGEST_RESIDUAL,
         search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
-        search_factor=breakpoints.CLOSER,
-        rounding_share=breakpoints.ALLOWED,
+        search_factor=breakpoints.REPEATED_SEARCH_SIGMA,
+        rounding_share=breakpoints.FIRST_STAGE_ERROR,
     )
 
 
@@ -240,11 +240,11 @@ def extension_struct(extension: DenseExtension) -> Any:
 def dense_constants() -> Any:
     """``DenseConstants`` of dense.hpp."""
     return _core.DenseConstants(
-        nodes=list(dense_output.NODES),
-        spacing=dense_output.SPACING,
-        close=dense_output.CLOSE,
-        probes=dense_output.PROBES,
-        slack=dense_output.SLACK,
+        nodes=list(dense_output.HERMITE_NODES),
+        spacing=dense_output.NODE_SPACING,
+        close=dense_output.CLOSE_SIGMA,
+        probes=dense_output.COMPARED_AT,
+        slack=dense_output.TIME_TOLERANCE,
     )
 
 

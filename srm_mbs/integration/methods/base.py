@@ -58,7 +58,7 @@ class ErrorNorm:
 
 @dataclass
 class IntegratorState:
-    """What a method carries from one accepted step to the next.
+    """Memory of a method between accepted steps.
 
     Attributes
     ----------

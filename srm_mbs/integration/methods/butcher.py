@@ -1,4 +1,4 @@
-"""What an explicit Runge-Kutta scheme is: validated, read-only data with its extensions.
+"""Explicit Runge-Kutta schemes: validated, read-only data with their extensions.
 
 A step of an s-stage scheme forms the rates K_0 ... K_{s-1} and the end state
 

@@ -10,12 +10,13 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
 
-STALE = 4.0
-"""A multiplier is predicted at most this many spans of the nodes beyond the last one."""
+LARGEST_EXTRAPOLATION = 4.0
+"""Longest extrapolation beyond the last node, over the time that the nodes span."""
 WINDOW = 9
 """Nodes of an interpolation between nodes on both sides."""
-POINTS = 5
-"""Nodes kept; a higher degree amplifies round-off, extrapolation over many steps is unstable."""
+KEPT_NODES = 5
+"""Nodes kept for extrapolation; a higher degree amplifies round-off, and extrapolation over many
+steps is unstable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,18 +60,18 @@ class MultiplierHistory:
     def extended(
         self, t: float, value: FloatArray, normals: FloatArray | None = None
     ) -> MultiplierHistory:
-        """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``POINTS`` nodes.
+        """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``KEPT_NODES`` nodes.
 
         Nodes ahead of ``t`` are dropped.
         """
-        if len(self.times) == POINTS and self.times[-1] < t:
+        if len(self.times) == KEPT_NODES and self.times[-1] < t:
             moved, kept = np.empty_like(self.times), np.empty_like(self.values)
             moved[:-1], moved[-1] = self.times[1:], t
             kept[:-1], kept[-1] = self.values[1:], value
             return MultiplierHistory(moved, kept, normals=normals)
         before = self.times < t
-        times = np.concatenate([self.times[before], [t]])[-POINTS:]
-        values = np.concatenate([self.values[before], value[None]])[-POINTS:]
+        times = np.concatenate([self.times[before], [t]])[-KEPT_NODES:]
+        values = np.concatenate([self.values[before], value[None]])[-KEPT_NODES:]
         return MultiplierHistory(times, values, normals=normals)
 
     def _around(self, t: float) -> slice:
@@ -88,7 +89,7 @@ class MultiplierHistory:
     def predict_near(self, t: float) -> FloatArray | None:
         """yhat (nv,) extrapolated to ``t``; None if that lies too far beyond the nodes."""
         span = float(self.times[-1] - self.times[0])
-        if span > 0.0 and t > max(self.times[-1] + STALE * span, self.known_until):
+        if span > 0.0 and t > max(self.times[-1] + LARGEST_EXTRAPOLATION * span, self.known_until):
             return None
         return self.predict(t)
 

@@ -1,7 +1,7 @@
-r"""Stages next to a singular configuration, evaluated on the branch of the motion.
+r"""Stages next to a singular configuration.
 
-A stage lies off the closure manifold by its own error (dq, dv).  Next to a singular configuration
-that error turns the null space of G, and the acceleration changes by
+**On the branch.**  A stage lies off the closure manifold by its own error (dq, dv).  Next to a
+singular configuration that error turns the null space of G, and the acceleration changes by
 
     2 w dv + w^2 dq,   w = |d sigma / dt| / sigma.
 
@@ -10,7 +10,9 @@ falls to the order of its stages.  Evaluated at its projection on the manifold (
 the factorisation of each evaluation) a stage sees the smooth field on the branch, and the scheme
 keeps its order.
 
-When the multiplier of a stage is predicted, because a singular configuration is too near.
+**In the zone.**  Rounding in a direct solve for the multiplier grows like 1/sigma^2.  Stages with
+sigma < sigma_z, where it exceeds the tolerance, take a predicted multiplier
+(:class:`~srm_mbs.dynamics.system.Zone`).
 """
 
 from __future__ import annotations
@@ -25,64 +27,60 @@ from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 
-ZONE_LARGEST = 1e-3
-"""Largest sigma_z: the zone starts here where rounding exceeds the tolerance, or there is none
-(fixed steps), and later otherwise
-(:meth:`~srm_mbs.integration.methods.near_singular.BranchStages.known_from`)."""
-COUNT_UNCERTAINTY_ABOVE = 5 * ZONE_LARGEST
-"""h * slope of sigma from which the uncertainty of the predicted multiplier counts as error;
-counting it always would trap the step-size control next to the singular configuration."""
-
-
-HIT = 1e-6
-"""sigma that is a direct hit, for which anything predicted is better."""
-FEWEST = 3
+LARGEST_ZONE_SIGMA = 1e-3
+"""Largest sigma_z: the zone begins here where rounding exceeds the tolerance, or there is none
+(fixed steps), and at a smaller sigma otherwise (:meth:`BranchStages.known_from`)."""
+UNCERTAINTY_SIGMA_CHANGE = 5 * LARGEST_ZONE_SIGMA
+"""Change of sigma over a step from which the uncertainty of the predicted multiplier counts as
+error; counting it always would trap the step-size control next to the singular configuration."""
+DIRECT_HIT_SIGMA = 1e-6
+"""sigma below which any prediction is better than the direct solve."""
+MIN_PREDICTION_NODES = 3
 """Nodes of the history from which a prediction is better than the direct solve."""
+WATCHED_SIGMA = 0.05
+"""sigma below which a step prepares for singular configurations."""
+NEAR_STEPS = 4.0
+"""Steps that start with sigma below NEAR_STEPS |d sigma / dt| h are next to a singular
+configuration; of sweeps, which keep their constraint errors for about eps, those with sigma below
+NEAR_STEPS |d sigma / dt| max(h, eps)."""
+FAR_STEPS = 8.0
+"""Distance from a singular configuration, in steps, from which a step prepares nothing for one."""
+MAX_PROJECTIONS = 4
+"""Newton steps of one stage; the error is squared each time."""
+AMBIGUOUS_DISTANCE = 0.1
+"""Distance of a stage from the branch, over sigma, above which it is not projected: Newton's method
+might lead to another branch."""
+HELD_ERROR = 0.1
+"""Error over the tolerance up to which a slow motion is held on its branch, not extrapolated."""
+POSITION_ROUNDING = 16.0 * np.finfo(float).eps
+"""Largest rounding of the positions (rad, scene diagonals)."""
+USUAL_ROUNDING = 1.0 / 32.0
+"""Usual rounding of the positions, over POSITION_ROUNDING: half a unit in the last place."""
+CROSSING_SIGMA = 0.5
+"""sigma at the ends of a step across a singular configuration, over its change of sigma."""
+FLOOR_STEPS = 100.0
+"""Distance before a singular configuration, in steps, from which steps are kept long enough for
+rounding."""
+LARGEST_FLOOR = 1e-7
+"""Largest relative error that is accepted as rounding: above, a run had better stop."""
 
 
 def zone_from(history: MultiplierHistory | None, threshold: float, end: float) -> Zone | None:
-    """The zone sigma < ``threshold`` of a step to the time ``end``.
+    """The zone sigma < ``threshold`` of a step to the time ``end`` (s).
 
-    None without nodes; only for direct hits while they are few.
+    None without nodes; for direct hits only while there are few nodes.
     """
     if history is None or not history.begun:
         return None
     known = history.known_below if end <= history.known_until else 0.0
-    if len(history.times) < FEWEST:
-        threshold = min(threshold, HIT)
+    if len(history.times) < MIN_PREDICTION_NODES:
+        threshold = min(threshold, DIRECT_HIT_SIGMA)
     return Zone(max(threshold, known), history.predict_near, history.normals)
-
-
-WATCHED = 0.05
-"""sigma below which, or within NEAR steps of which, a step looks out for singular
-configurations."""
-NEAR = 4.0
-"""Steps that start with sigma below NEAR |d sigma / dt| h are looked at; of sweeps, which keep
-their constraint errors for about eps, those below NEAR |d sigma / dt| max(h, eps)."""
-FAR = 8.0
-"""Steps from a singular configuration from which a step prepares nothing for one."""
-PROJECTIONS = 4
-"""Newton steps at most; the error squares each time."""
-AMBIGUOUS = 0.1
-"""A stage that lies off the branch by more than this fraction of sigma is evaluated where it is:
-Newton might lead to another branch."""
-HELD = 0.1
-"""Part of the tolerance up to which a slow motion is held on its branch, not extrapolated."""
-ROUNDING = 16.0 * np.finfo(float).eps
-"""Rounding of the positions, in units: at most."""
-USUAL = 1.0 / 32.0
-"""What it usually is, over ROUNDING: half a unit in the last place."""
-CROSSES = 0.5
-"""sigma at the ends of a step across a singular configuration, over its change."""
-LEAD = 100.0
-"""Steps before a singular configuration from which they are kept long enough for rounding."""
-MOST_FLOOR = 1e-7
-"""Relative error up to which rounding is taken for granted: above, a run had better stop."""
 
 
 @dataclass
 class BranchStages:
-    """Evaluates the stages of one step on their branch.
+    """The stages of one step next to a singular configuration, evaluated on their branch.
 
     Parameters
     ----------
@@ -91,7 +89,7 @@ class BranchStages:
     sigma_change
         |d sigma / dt| h, of the last steps.
     history
-        What the zone of the step predicts from; None for sweeps that need no zone.
+        The multipliers that the zone of the step predicts from; None for sweeps that need no zone.
     end
         End of the step (s).
 
@@ -101,14 +99,14 @@ class BranchStages:
         Whether the step is next to a singular configuration.
     zone
         The zone of the step.
-    excused
-        sigma below which a direct solve errs by more than the tolerance, if such are made because
-        predictions err by more; else 0.
+    inaccurate_below
+        sigma below which a direct solve errs by more than the tolerance, if such solves are made
+        because predictions err by more; else 0.
     floor : (n,)
-        Error that rounding leaves in a step of this length that crosses a singular configuration;
-        part of the weights.  It grows like 1/h^2.  Counted from before the configuration on, it
-        keeps the steps so long that their own errors are above it: shorter ones are no more
-        accurate, and get stuck.  0 away from singular configurations.
+        Error that rounding leaves in a step of this length across a singular configuration; part of
+        the weights.  It grows like 1/h^2.  Counted from before the configuration on, it keeps the
+        steps so long that their own errors are above it: shorter ones are no more accurate, and
+        would be rejected for ever.  0 away from singular configurations.
     projected
         Whether any stage was moved.
     """
@@ -123,7 +121,7 @@ class BranchStages:
     end: float
     near: bool = field(init=False)
     zone: Zone | None = field(init=False)
-    excused: float = field(init=False)
+    inaccurate_below: float = field(init=False)
     floor: FloatArray = field(init=False)
     projected: bool = field(default=False, init=False)
 
@@ -131,38 +129,38 @@ class BranchStages:
         self.floor = np.zeros_like(self.weights)
         # All stages of a step or none: a mixture of both loses the order.
         self.near = self.memory.sigma < self.reach()
-        threshold = ZONE_LARGEST
+        threshold = LARGEST_ZONE_SIGMA
         lingering = False
-        self.excused = 0.0
-        if self.memory.sigma < WATCHED + NEAR * self.sigma_change:
-            threshold = self.known_from(ZONE_LARGEST, 1.0)
-            lingering = threshold < ZONE_LARGEST and self.lingers(threshold)
-            # The zone is as wide as the tolerance asks for; how good its predictions and
-            # projections have to be follows from what can be had.
+        self.inaccurate_below = 0.0
+        if self.memory.sigma < WATCHED_SIGMA + NEAR_STEPS * self.sigma_change:
+            threshold = self.known_from(LARGEST_ZONE_SIGMA, 1.0)
+            lingering = threshold < LARGEST_ZONE_SIGMA and self.lingers(threshold)
+            # The tolerance alone determines the zone; its predictions and projections need to be
+            # as accurate as rounding allows.
             self.floor = self._floor()
             self.weights = self.weights + self.floor
             uncertain = self.uncertainty()
             if uncertain > 1.0 and not lingering:
                 # A prediction that errs by more than the tolerance is no better than a direct
                 # solve that does.
-                self.excused = threshold
-                threshold = self.known_from(ZONE_LARGEST, uncertain)
+                self.inaccurate_below = threshold
+                threshold = self.known_from(LARGEST_ZONE_SIGMA, uncertain)
         self.zone = zone_from(self.history, threshold, self.end)
         if self.zone is not None and lingering:
             self.zone = replace(self.zone, predict=lambda _: None)
 
     def reach(self) -> float:
         """sigma below which the step is next to a singular configuration."""
-        return NEAR * self.sigma_change if self.sigma_change > 0.0 else WATCHED
+        return NEAR_STEPS * self.sigma_change if self.sigma_change > 0.0 else WATCHED_SIGMA
 
     def __call__(
         self, terms: Terms, t: float, c: float, x: FloatArray
     ) -> tuple[Terms, FloatArray, FloatArray | None]:
-        """Terms at the projection of the stage ``x`` on its branch, the projected state, and what
-        was subtracted.
+        """Terms at the projection of the stage ``x`` on its branch, the projected state, and the
+        difference that was subtracted.
 
-        ``terms``, ``x`` and None where projecting would change nothing that counts: less than
-        ``norm.negligible`` of the tolerance, or than rounding.
+        ``terms``, ``x`` and None where the projection would change less than ``norm.negligible`` of
+        the tolerance, or than rounding.
 
         Parameters
         ----------
@@ -175,12 +173,12 @@ class BranchStages:
         if not (self.near and c > 0.0):
             return terms, x, moved
         change = max(self.sigma_change, abs(terms.sigma - self.memory.sigma) / c)
-        for _ in range(PROJECTIONS):
+        for _ in range(MAX_PROJECTIONS):
             sigma = terms.sigma
             if terms.rank_deficient or not sigma > 0.0:
                 break
             error = terms.correction()
-            if self.system.position_norm(error) > AMBIGUOUS * sigma:
+            if self.system.position_norm(error) > AMBIGUOUS_DISTANCE * sigma:
                 break
             effect = self.norm(self.effect_on_rates(error, sigma, change), self.weights)
             if effect <= self.norm.negligible:
@@ -204,13 +202,13 @@ class BranchStages:
         return out
 
     def rounding(self, sigma: float, change: float, projected: bool) -> FloatArray:
-        """What rounding at a stage with ``sigma`` does to h times the tangent rate (n,).
+        """Change (n,) of h times the tangent rate by rounding at a stage with ``sigma``.
 
         Next to a singular configuration it may exceed the tolerance, and more so the shorter the
-        step: an error estimate below it says nothing.  A projection knows positions to
-        ROUNDING / sigma.
+        step; an error estimate below it is meaningless.  A projection determines positions to
+        POSITION_ROUNDING / sigma.
         """
-        error = (ROUNDING / sigma if projected else ROUNDING) * self.norm.one
+        error = (POSITION_ROUNDING / sigma if projected else POSITION_ROUNDING) * self.norm.one
         part = self.system.multiplier_part
         if part.start:
             error[part] = change / (self.h * sigma) * error[: part.start]
@@ -218,24 +216,24 @@ class BranchStages:
 
     def _floor(self) -> FloatArray:
         change = self.sigma_change
-        near = min(WATCHED, LEAD * change)
+        near = min(WATCHED_SIGMA, FLOOR_STEPS * change)
         if not (self.memory.sigma < near and self.norm.negligible > 0.0):
             return np.zeros_like(self.weights)
-        noise = self.rounding(CROSSES * change, change, True)
-        return np.minimum(USUAL * noise, MOST_FLOOR * self.norm.one)
+        noise = self.rounding(CROSSING_SIGMA * change, change, True)
+        return np.minimum(USUAL_ROUNDING * noise, LARGEST_FLOOR * self.norm.one)
 
     def widened(
         self, weights: FloatArray, scheme: ButcherTableau, sigmas: FloatArray
     ) -> FloatArray:
-        """``weights`` (n,) and what rounding does to the error estimate of a step of ``scheme``
-        with ``sigmas`` (s + 1,) at its stages."""
+        """``weights`` (n,), increased by the effect of rounding on the error estimate of a step of
+        ``scheme`` with ``sigmas`` (s + 1,) at its stages."""
         weights = weights + self.floor
-        # Below the threshold of the zone nothing is solved for directly.  Where that lies lower
-        # than the tolerance asks for, shorter steps predict better: rounding is no excuse.
+        # Below the threshold of the zone nothing is solved for directly.  Where that is smaller
+        # than the tolerance requires, shorter steps predict better, and rounding does not count.
         least = 0.0 if self.zone is None else self.zone.threshold
         direct = min((sigma for sigma in sigmas[1:].tolist() if sigma >= least), default=np.inf)
-        lowest = max(direct, self.excused)
-        if scheme.error is None or not 0.0 < lowest < NEAR * self.sigma_change:
+        lowest = max(direct, self.inaccurate_below)
+        if scheme.error is None or not 0.0 < lowest < NEAR_STEPS * self.sigma_change:
             return weights
         noise = self.rounding(lowest, self.sigma_change, self.projected)
         wide: FloatArray = weights + np.abs(scheme.error).max() * noise
@@ -243,7 +241,7 @@ class BranchStages:
 
     def lingers(self, threshold: float) -> bool:
         """Whether the motion is so slow that holding it tangential to the normals of the last node,
-        at ``threshold``, errs by little of the tolerance: by |a| threshold + v^2."""
+        at ``threshold``, causes an error, |a| threshold + v^2, well below the tolerance."""
         part = self.system.multiplier_part
         if not part.start or self.memory.history is None or self.memory.history.normals is None:
             return False
@@ -251,12 +249,12 @@ class BranchStages:
         speed = self.system.position_norm(np.concatenate([v, a]))
         error = np.zeros_like(self.weights)
         error[part] = self.h * (threshold * np.abs(a) + speed * np.abs(v))
-        return self.norm(error, self.weights) < HELD
+        return self.norm(error, self.weights) < HELD_ERROR
 
     def uncertainty(self) -> float:
-        """How far the multiplier predicted for the end of the step may be off, over the tolerance;
-        0 where there are too few nodes to tell."""
-        if self.history is None or len(self.history.times) < FEWEST:
+        """Error of the multiplier predicted for the end of the step, over the tolerance; 0 where
+        there are too few nodes to estimate it."""
+        if self.history is None or len(self.history.times) < MIN_PREDICTION_NODES:
             return 0.0
         error = np.zeros_like(self.weights)
         error[self.system.multiplier_part] = self.h * self.history.uncertainty(self.end)
@@ -272,5 +270,5 @@ class BranchStages:
             return longest
         part = self.system.multiplier_part
         error = self.rounding(1.0, self.sigma_change, False)
-        error[part] += self.h * ROUNDING * np.abs(self.memory.rate[part])
+        error[part] += self.h * POSITION_ROUNDING * np.abs(self.memory.rate[part])
         return float(min(longest, np.sqrt(self.norm(error, self.weights) / allowed)))

@@ -9,8 +9,8 @@ and at the end point x^- = (q^-, v^-), with the same factorisation as the stage 
 
     q = q^- (+) (-theta E g),   v = v^- - theta P v^-,   theta = 1 - exp(-h / eps).
 
-The end stage serves as the next step's first stage with q' = corrected v, so that a step costs as
-many evaluations as the tableau has stages, and a few more next to singular configurations
+The end stage is the next step's first stage, with q' = corrected v, so that a step costs as many
+evaluations as the tableau has stages, and a few more next to singular configurations
 (:mod:`srm_mbs.integration.methods.near_singular`).
 """
 
@@ -26,9 +26,9 @@ from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepRes
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import (
-    COUNT_UNCERTAINTY_ABOVE,
-    FAR,
-    WATCHED,
+    FAR_STEPS,
+    UNCERTAINTY_SIGMA_CHANGE,
+    WATCHED_SIGMA,
     BranchStages,
 )
 
@@ -74,15 +74,16 @@ def split_step(
     sigma_change = h * memory.sigma_slope
     branch: BranchStages | None = None
     zone = None
-    if history is not None and start < WATCHED + FAR * sigma_change:
+    if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
         weights = norm.weights(memory.state_scale)
         branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
         zone = branch.zone
-    # Zeros, because each stage weighs all s rates: those still to come with 0.
+
+    # Stages.  Zeros, because each stage weighs all s rates: those still to come with 0.
     rates = np.zeros((s + 1, system.tangent_size))
     weighed = rates[:s]
-    all_sigmas = [start]
     rates[0] = memory.rate
+    all_sigmas = [start]
     deficient: list[tuple[int, int, bool]] = []
     for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
         delta = stage_weights.dot(weighed)
@@ -97,8 +98,10 @@ def split_step(
             deficient.append((j, terms.rank, terms.held))
     sigma = terms.sigma
     change = abs(sigma - start)
-    quiet = branch is None and sigma > WATCHED + FAR * change
+    quiet = branch is None and sigma > WATCHED_SIGMA + FAR_STEPS * change
     state_scale = system.state_scale(x)
+
+    # Correction at the end.
     multiplier = normals = None
     if history is None:
         correction = np.zeros(0)
@@ -109,20 +112,23 @@ def split_step(
             correction = theta * correction
         new_state = system.retract(x, -correction)
         end_rate = rate - system.rate_change(correction)
-        if not (quiet or terms.rank_deficient) and (branch is not None or sigma < WATCHED):
+        near = branch is not None or sigma < WATCHED_SIGMA
+        if near and not (quiet or terms.rank_deficient):
             multiplier = terms.multiplier()
-            if sigma < WATCHED:
+            if sigma < WATCHED_SIGMA:
                 normals = terms.normals()
                 normals = normals if normals.shape[1] else None
         if branch is not None and moved is not None:
             correction = correction + moved
+
+    # Error estimate.
     sigmas = np.array(all_sigmas)
     error_ratio = 0.0
     if scheme.error is not None:
         error = h * (scheme.error @ rates)
         weights = norm.weights(np.maximum(memory.state_scale, state_scale))
         if branch is not None and history is not None:
-            if deficient and sigma_change > COUNT_UNCERTAINTY_ABOVE:
+            if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:
                 error = np.abs(error)
                 for j, *_ in deficient:
                     if j < s:
@@ -130,6 +136,7 @@ def split_step(
                         error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
             weights = branch.widened(weights, scheme, sigmas)
         error_ratio = norm(error, weights)
+
     result = StepResult(
         t=t,
         h=h,
@@ -145,18 +152,14 @@ def split_step(
         multiplier=multiplier,
         state_scale=state_scale,
     )
-    steps = memory.steps
-    if (
-        (steps < RESIDUAL_EVERY or steps % RESIDUAL_EVERY == 0)
-        and history is not None
-        and theta == 1.0
-    ):
+    due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
+    if due and history is not None and theta == 1.0:
         result.constraint_residual = terms.constraint_residual()
     if quiet:
         middle, c = scheme.middle
         halfway = abs(all_sigmas[middle] - start) / c
         result.quiet = True
-        result.slope = (change if change > halfway else halfway) / h
+        result.slope = max(change, halfway) / h
         return result
     result.normals = normals
     if deficient:
@@ -169,7 +172,7 @@ def split_step(
 def split_resume(
     system: System, t: float, state: FloatArray, memory: IntegratorState
 ) -> IntegratorState:
-    """``memory`` behind a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
+    """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
     fresh = split_start(system, t, state)
     fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
     return fresh
@@ -186,7 +189,7 @@ def split_accept(memory: IntegratorState, result: StepResult) -> None:
 
 
 def history_after(history: MultiplierHistory, result: StepResult) -> MultiplierHistory:
-    """``history`` behind an accepted step."""
+    """``history`` after an accepted step."""
     if result.multiplier is not None:
         return history.extended(result.t + result.h, result.multiplier, result.normals)
     if result.zone is None and history.begun:

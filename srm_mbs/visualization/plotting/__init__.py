@@ -1,6 +1,6 @@
-"""Pictures of a run: ``solution.plot``.
+"""Plots of a run: ``solution.plot``.
 
-Imported when a picture is asked for, because matplotlib is slow to import.
+Imported on first use, because Matplotlib is slow to import.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ __all__ = ["FORMATS", "KINDS", "Kind", "check_options", "plot_dae", "plot_soluti
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of picture.
+    """A kind of plot.
 
     Attributes
     ----------
     draw
-        (solution, **options) -> figure.
+        Function (solution, **options) -> figure.
     options
         Names of its options.
     """
@@ -54,22 +54,21 @@ KINDS = {
     "phase": Kind(draw_phase, ("joints",)),
     "path": Kind(draw_path, ("points",)),
 }
-"""The kinds of picture, by name."""
-
+"""The kinds of plot of a run, by name."""
 
 DAE_KINDS = {"run": Kind(draw_dae_run), "state": Kind(draw_dae_state)}
-"""Those of a run of a DAE."""
+"""The kinds of plot of a run of a DAE, by name."""
 
 
 def check_options(
     kind: str, options: Iterable[str] = (), kinds: Mapping[str, Kind] = KINDS
 ) -> None:
-    """Refuse a kind of picture that there is not, or options that it has not.
+    """Refuse an unknown kind of plot, or options that it does not have.
 
     Raises
     ------
     InputError
-        Naming those that there are.
+        With the known kinds or options.
     """
     if kind not in kinds:
         raise InputError(
@@ -90,19 +89,19 @@ def check_options(
 def plot_solution(
     solution: SimulationResult, path: str | Path | None = None, kind: str = "run", **options: Any
 ) -> Figure:
-    """A picture of a run; see :meth:`srm_mbs.Solution.plot`."""
+    """Plot a run; see :meth:`srm_mbs.Solution.plot`."""
     check_options(kind, options)
     return _drawn(partial(KINDS[kind].draw, solution, **options), path)
 
 
 def plot_dae(solution: DaeResult, path: str | Path | None = None, kind: str = "run") -> Figure:
-    """A picture of a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
+    """Plot a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
     check_options(kind, kinds=DAE_KINDS)
     return _drawn(partial(DAE_KINDS[kind].draw, solution), path)
 
 
 def _drawn(draw: Callable[[], Figure], path: str | Path | None) -> Figure:
-    """The figure, saved if a path is given; its suffix is checked before."""
+    """The figure, saved if a path is given, whose suffix is checked first."""
     if path is None:
         return draw()
     check_suffix(Path(path))

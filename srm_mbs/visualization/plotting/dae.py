@@ -1,4 +1,4 @@
-"""Pictures of a run of a DAE, which has neither joints nor units."""
+"""Plots of a run of a DAE, which has neither joints nor units."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from srm_mbs._typing import FloatArray
 
-MOST_LINES = 4 * len(LINES)
-"""Lines of one kind that fit on a page."""
+MAX_LINES = 4 * len(LINES)
+"""Most lines of states, or of multipliers, on a page."""
 
 
 def draw_dae_run(solution: DaeResult) -> Figure:
@@ -42,7 +42,7 @@ def draw_dae_run(solution: DaeResult) -> Figure:
 
 
 def draw_dae_state(solution: DaeResult) -> Figure:
-    """States and multipliers over time, some lines to a panel."""
+    """States and multipliers over time, several lines in a panel."""
     ends = solution.steps.times[solution.steps.times < solution.span[1]]
     t = between(np.append(ends, solution.span[1]), solution.steps.count)
     x, y = solution(t)
@@ -50,9 +50,9 @@ def draw_dae_state(solution: DaeResult) -> Figure:
     left: list[str] = []
     for letter, values, title in (("x", x, "states"), ("y", y, "multipliers")):
         names = [f"{letter}[{i}]" for i in range(values.shape[1])]
-        left += names[MOST_LINES:]
-        for first in range(0, min(len(names), MOST_LINES), len(LINES)):
-            own = slice(first, min(first + len(LINES), MOST_LINES))
+        left += names[MAX_LINES:]
+        for first in range(0, min(len(names), MAX_LINES), len(LINES)):
+            own = slice(first, min(first + len(LINES), MAX_LINES))
             draws.append(partial(_lines, t=t, values=values[:, own], names=names[own], title=title))
     notes = [f"Left out: {some_of(left)}."] if left else []
     return time_panels(solution, draws, notes)

@@ -1,4 +1,4 @@
-"""The energy balance over time: energies, works, and what is left."""
+"""The energy balance over time: energies, works, and residual."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ if TYPE_CHECKING:
     from srm_mbs._typing import FloatArray
     from srm_mbs.simulation.energy_balance import EnergyBalance
 
-SMOOTH_UP_TO = 400
-"""Pieces from which steps are divided no further: works are integrated within each."""
+MAX_PIECES = 400
+"""Number of parts from which steps are divided no further: works are integrated in each part."""
 
 
 def draw_balance(solution: SimulationResult) -> Figure:
-    """Kinetic and potential energy, the work of all that acts, and the residual of the balance.
+    """Kinetic and potential energy, the work of all forces, and the residual of the balance.
 
-    The residual is drawn at ``solution.t``: between the steps it is that of the dense output.
+    The residual is drawn at ``solution.t``; between the steps it is that of the dense output.
 
     Raises
     ------
     InputError
         For a loaded run that had a controller.
     """
-    balance = read_smoothly(solution, SMOOTH_UP_TO).energy_balance
+    balance = read_smoothly(solution, MAX_PIECES).energy_balance
     draws: list[Draw] = [partial(_energies, solution=solution, balance=balance)]
-    # What is smaller than the error of the balance is rounding.
+    # Work below the error of the balance is rounding.
     error = np.nanmax(np.abs(finite(solution.energy_balance.residual)), initial=0.0)
     sizes = {n: np.nanmax(np.abs(finite(own)), initial=0.0) for n, own in balance.works.items()}
     works = {name: balance.works[name] for name, size in sizes.items() if size > error}
@@ -75,7 +75,7 @@ def _lines(
 
 
 def _energies(axes: Axes, solution: SimulationResult, balance: EnergyBalance) -> str:
-    # Where potential energy is zero is a convention.
+    # The zero of potential energy is a convention.
     potential = balance.potential - balance.potential[:1]
     total = balance.kinetic + potential
     lines = {"kinetic": balance.kinetic, "potential": potential, "sum": total}

@@ -1,8 +1,7 @@
-"""One look for all pictures: colours, line styles, axes, legends, and how figures are saved.
+"""Style of all figures, and figures of panels over one time axis.
 
-Matplotlib's object interface only: no pyplot, so no display and no global state.
-
-Figures of panels over one time axis, with titles, legends, marks and notes.
+Colours, line styles, axes, legends, marks and notes, and how figures are saved.  Only Matplotlib's
+object interface is used, not pyplot: no display and no global state.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinne
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from srm_mbs._typing import FloatArray
 
@@ -42,18 +40,18 @@ FORMATS = (".png", ".pdf", ".svg")
 """Suffixes under which a figure can be saved."""
 FEW_DECADES = 50.0
 """Below this ratio of its limits a logarithmic axis has ticks within the decades."""
-NARROWEST = 8.0
-"""Smallest ratio of the limits of such an axis, so that there are always ticks on it."""
+SMALLEST_LOG_RATIO = 8.0
+"""Smallest ratio of the limits of such an axis, so that it always has ticks."""
 LARGE_DOTS = 400
-"""Up to this many steps their dots are large."""
+"""Largest number of steps with large dots."""
 FEW_POINTS = 50
-"""Lines through fewer points have dots on them, without which a single one would be invisible."""
-ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
-"""First digits of the distance of ticks."""
+"""Lines through fewer points have markers, without which a single point would be invisible."""
+TICK_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+"""Leading digits of the distance of ticks."""
 PLAIN_POWERS = range(-2, 4)
-"""Powers of ten of values that are written in full on the ticks."""
-NARROW = 1e-6
-"""Smallest length of an axis over its values: ticks that differ in the seventh digit are noise."""
+"""Powers of ten whose values are written in full at the ticks."""
+SMALLEST_RELATIVE_RANGE = 1e-6
+"""Smallest range of an axis over its values: ticks that differ in the seventh digit are noise."""
 
 # Okabe and Ito's palette: distinct for the colour-blind, and of different lightness in print.
 BLACK, BLUE, VERMILION, GREY = "#000000", "#0072B2", "#D55E00", "#8C8C8C"
@@ -67,7 +65,7 @@ LINES: tuple[tuple[str, Any], ...] = (
     (ORANGE, (0, (9, 2))),
     (PURPLE, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2))),
 )
-"""Colours of lines with their dashes, by which they are told apart in grey print."""
+"""Colours of lines with their dashes, which distinguish them in grey print."""
 
 WIDTH = 7.0
 """Width of the figure (inch), within the text of an A4 or letter page."""
@@ -75,9 +73,23 @@ FONT_SIZE = 8.5
 RESOLUTION = 200
 """Dots per inch of a png."""
 TITLE_LINE = 92
-"""Characters on the line of a panel's title; a legend that does not fit stands beside the panel."""
+"""Characters on the line of a panel's title; longer legends are placed beside the
+panel."""
 NAME_WIDTH = 22
 """Characters of a line of a legend beside a panel."""
+MAX_FULL_LINES = 80
+"""Largest number of singular passages that are marked by full lines; more are marked by ticks."""
+NOTE_WIDTH = 122
+"""Characters of a line of notes below the panels."""
+MAX_LISTED_NAMES = 6
+"""Most names that a note lists of those that are left out."""
+MARKED: tuple[tuple[str, str, float, Any], ...] = (
+    ("singular passages (dashed)", BLACK, 0.5, (0, (4, 3))),
+    ("actions of events (dotted)", GREY, 0.9, (0, (1, 1.5))),
+)
+"""Vertical lines: their meaning in a note, colour, width and dashes."""
+Draw = Callable[["Axes"], str]
+"""Draws into a panel and returns its title."""
 
 
 def check_suffix(path: Path) -> None:
@@ -118,8 +130,8 @@ def prepare(axes: Axes, grid: str = "y", size: float = FONT_SIZE) -> None:
 
 
 def wrapped(name: str, width: int = NAME_WIDTH) -> str:
-    """``name`` in lines of at most ``width`` characters, broken behind spaces, or else behind "_",
-    "-", "." or "/", where there are any."""
+    """``name`` in lines of at most ``width`` characters, broken after spaces, or else after "_",
+    "-", "." or "/"."""
     lines, rest = [], name
     while len(rest) > width:
         cuts = (max(rest.rfind(mark, 0, width) for mark in marks) + 1 for marks in (" ", "_-./"))
@@ -130,15 +142,15 @@ def wrapped(name: str, width: int = NAME_WIDTH) -> str:
 
 
 def fits(axes: Axes, title: str, line: int = TITLE_LINE) -> bool:
-    """Whether the legend has room on the line of the panel's ``title``, of ``line`` characters."""
+    """Whether the legend fits on the line of the panel's ``title``, of ``line`` characters."""
     labels = axes.get_legend_handles_labels()[1]
-    # A "$" of a formula is not seen, nor is the command between it and its pair.
+    # A formula between "$" is shorter than its source.
     seen = sum(5 if "$" in label else len(label) for label in labels)
     return seen + 5 * len(labels) + len(title) <= line
 
 
 def legend(axes: Axes, *, beside: bool) -> None:
-    """A legend where there are no data: beside the panel, or above it, on the line of its title."""
+    """A legend outside the data: beside the panel, or above it, on the line of its title."""
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
@@ -154,7 +166,7 @@ def legend(axes: Axes, *, beside: bool) -> None:
 
 
 def line_styles(count: int) -> list[dict[str, Any]]:
-    """Colour and dashes of ``count`` lines of a panel; behind the sixth they begin again."""
+    """Colour and dashes of ``count`` lines of a panel; they repeat after the sixth."""
     styles = islice(cycle(LINES), count)
     return [{"color": c, "linestyle": dashes, "linewidth": 0.9} for c, dashes in styles]
 
@@ -165,13 +177,13 @@ def curve(count: int) -> dict[str, Any]:
 
 
 def dots(count: int) -> dict[str, Any]:
-    """Properties of one mark per step: smaller where there are many."""
+    """Properties of one marker per step: smaller if there are many."""
     size = 3.5 if count <= LARGE_DOTS else 2.0
     return {"linestyle": "none", "marker": ".", "markersize": size}
 
 
 def marks(colour: str, marker: str, size: float = 4.0) -> dict[str, Any]:
-    """Properties of marks that are not filled."""
+    """Properties of markers that are not filled."""
     return {
         "color": colour,
         "marker": marker,
@@ -183,13 +195,15 @@ def marks(colour: str, marker: str, size: float = 4.0) -> dict[str, Any]:
 
 
 def log_axis(axes: Axes) -> None:
-    """A logarithmic axis with labelled ticks, whatever the range of its data."""
+    """A logarithmic axis with labelled ticks for any range of its data."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     if high / low < FEW_DECADES:
-        if high / low < NARROWEST:
+        if high / low < SMALLEST_LOG_RATIO:
             middle = np.sqrt(low * high)
-            axes.set_ylim(middle / np.sqrt(NARROWEST), middle * np.sqrt(NARROWEST))
+            axes.set_ylim(
+                middle / np.sqrt(SMALLEST_LOG_RATIO), middle * np.sqrt(SMALLEST_LOG_RATIO)
+            )
         low, high = axes.get_ylim()
         subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10.0 else (1.0, 2.0, 5.0)
         axes.yaxis.set_major_locator(LogLocator(subs=subs))
@@ -213,28 +227,28 @@ def linear_axis(
 ) -> float:
     """Label and few ticks, written in full, of an axis for ``values``.
 
-    A power of ten goes into the label: matplotlib's own would lie on the panel's title.
+    The label includes a power of ten: that of Matplotlib would overlap the panel's title.
 
     Parameters
     ----------
     values
-        All that is drawn along this axis.
+        All values along this axis.
     name, unit
-        The label; a name that ends with a line break stands above the unit.
+        The label; a name that ends with a line break is placed above the unit.
     size
-        What is of ordinary size here.
+        Typical magnitude of the values.
     noise
-        Changes below this part of it are no motion, and drawn as constant; so are those below
-        :data:`NARROW` of the values.
+        Changes below this part of ``size`` are drawn as constant; so are those below
+        :data:`SMALLEST_RELATIVE_RANGE` of the values.
     axis
         ``x`` or ``y``.
     ticks
-        Intervals between ticks, at most.
+        Largest number of intervals between ticks.
 
     Returns
     -------
     float
-        The power of ten: divide by it what is drawn.
+        The power of ten by which the values must be divided.
     """
     known = [v[np.isfinite(v)] for v in values]
     low = min((float(v.min()) for v in known if v.size), default=0.0)
@@ -247,14 +261,14 @@ def linear_axis(
     power = 0 if power in PLAIN_POWERS else power
     factor = 10.0**power
     own = axes.yaxis if axis == "y" else axes.xaxis
-    own.set_major_locator(MaxNLocator(ticks, steps=ROUND))
+    own.set_major_locator(MaxNLocator(ticks, steps=TICK_STEPS))
     formatter = ScalarFormatter(useOffset=False)
     formatter.set_scientific(False)
     own.set_major_formatter(formatter)
     prefix = "" if power == 0 else rf"$10^{{{power}}}$ "
     measured = f"{prefix}{unit}".rstrip()
     own.set_label_text(f"{name}({measured})" if measured else name, fontsize=FONT_SIZE)
-    if high - low <= max(least, NARROW * largest):
+    if high - low <= max(least, SMALLEST_RELATIVE_RANGE * largest):
         half = max(0.1 * abs(0.5 * (low + high)), 0.0 if largest > size else least)
         if max(abs(low), abs(high)) <= least:
             half = size or 1.0
@@ -264,43 +278,28 @@ def linear_axis(
 
 
 def plain(name: str) -> str:
-    """A name of the user as it is: neither a formula, nor hidden from legends by its "_"."""
+    """A name of the user as literal text: neither a formula, nor hidden from legends by its "_"."""
     return f" {name}" if name.startswith("_") else name.replace("$", r"\$")
 
 
 def finite(values: FloatArray) -> FloatArray:
-    """Values with gaps where they are not finite: nothing is drawn there."""
+    """Values with nan where they are not finite: nothing is drawn there."""
     return np.where(np.isfinite(values), values, np.nan)
-
-
-FULL_LINES = 80
-"""More singular passages than this are marked by ticks: full lines would fill the panels."""
-NOTE_WIDTH = 122
-"""Characters of a line of notes below the panels."""
-SHOWN_NAMES = 6
-"""Names that a note lists of those that are left out."""
-MARKED: tuple[tuple[str, str, float, Any], ...] = (
-    ("singular passages (dashed)", BLACK, 0.5, (0, (4, 3))),
-    ("actions of events (dotted)", GREY, 0.9, (0, (1, 1.5))),
-)
-"""Vertical lines: their meaning in a note, colour, width and dashes."""
-Draw = Callable[["Axes"], str]
-"""Draws into a panel and returns its title."""
 
 
 def time_panels(
     solution: Run, draws: Sequence[Draw], notes: Sequence[str] = (), height: float = 1.65
 ) -> Figure:
-    """Panels below each other, each by one of ``draws``, of ``height`` (inch)."""
+    """Panels below each other, each of ``height`` (inch) and drawn by one of ``draws``."""
     figure = Figure(figsize=(WIDTH, 0.7 + height * len(draws)), layout="constrained")
     panels = list(figure.subplots(len(draws), sharex=True, squeeze=False)[:, 0])
-    # A state that runs away overflows in its drift and energy: the curves just end there.
+    # Drift and energy of a divergent state overflow: the curves end there.
     with np.errstate(over="ignore", invalid="ignore"):
         for letter, draw, axes in zip(string.ascii_lowercase, draws, panels):
             prepare(axes)
             title = draw(axes)
             axes.set_title(f"({letter}) {title}", loc="left", fontsize=FONT_SIZE + 0.5)
-    # All alike: one beside its panel makes all panels narrower.
+    # Legends are placed alike: one beside its panel makes all panels narrower.
     beside = not all(fits(axes, axes.get_title(loc="left")) for axes in panels)
     for axes in panels:
         legend(axes, beside=beside)
@@ -315,13 +314,13 @@ def time_axis(solution: Run, panels: Sequence[Axes]) -> None:
     start, end = solution.span
     margin = 0.01 * (end - start) or 1.0
     panels[-1].set_xlim(start - margin, end + margin)
-    panels[-1].xaxis.set_major_locator(MaxNLocator(10, steps=ROUND))
+    panels[-1].xaxis.set_major_locator(MaxNLocator(10, steps=TICK_STEPS))
     panels[-1].set_xlabel(f"time{seconds(solution)}", fontsize=FONT_SIZE)
 
 
 def finish(figure: Figure, solution: Run, notes: Sequence[str] = ()) -> None:
-    """The title of a figure, and what has to be said below its panels."""
-    # Names are the user's: a "$" in them is no formula.
+    """The title of a figure, and the notes below its panels."""
+    # A "$" in a name of the user is no formula.
     figure.suptitle(run_title(solution), fontsize=FONT_SIZE + 1.5, parse_math=False)
     if notes:
         text = "\n".join(line for note in notes for line in textwrap.wrap(note, NOTE_WIDTH))
@@ -329,7 +328,7 @@ def finish(figure: Figure, solution: Run, notes: Sequence[str] = ()) -> None:
 
 
 def run_title(solution: Run) -> str:
-    """Mechanism, method, tableau and tolerance; where the run ended if it failed."""
+    """Mechanism, method, tableau and tolerance; status and end time if the run failed."""
     settings, unit = solution.settings, " s" if seconds(solution) else ""
     name = solution.mechanism.name if isinstance(solution, SimulationResult) else "index-2 DAE"
     control = f"rtol = {settings.rtol:.3g}"
@@ -343,33 +342,31 @@ def run_title(solution: Run) -> str:
 
 
 def seconds(solution: Run) -> str:
-    """The unit of time behind a word; a DAE has none."""
+    """The unit of time after a word; a DAE has none."""
     return " (s)" if isinstance(solution, SimulationResult) else ""
 
 
 def some_of(names: Sequence[str]) -> str:
     """The first of ``names``, and how many more there are."""
-    shown = ", ".join(names[:SHOWN_NAMES])
-    more = len(names) - SHOWN_NAMES
+    shown = ", ".join(names[:MAX_LISTED_NAMES])
+    more = len(names) - MAX_LISTED_NAMES
     return shown if more <= 0 else f"{shown} and {more} more"
 
 
 def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
-    """A line through as many of the points as are seen, with gaps where they are not finite."""
+    """A line through the distinguishable points, with gaps where they are not finite."""
     values = finite(values)
     seen = thinned(t, values)
     axes.plot(t[seen], values[seen], **style)
 
 
 def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
-    """Mark singular passages, and where the actions of events changed something.
-
-    By thin vertical lines, or by ticks where they are many.
+    """Mark singular passages and actions of events by vertical lines, or by ticks if they are many.
 
     Parameters
     ----------
     labelled
-        Whether the legend says so; otherwise :func:`marks_note` does.
+        Whether the legend explains them; otherwise :func:`marks_note` does.
     """
     for times, label, (_, colour, width, dashes) in zip(
         (passages(solution), jumps(solution)), ("singular passage", "action of an event"), MARKED
@@ -378,7 +375,7 @@ def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
             axes.vlines(
                 times,
                 0.0,
-                1.0 if len(times) <= FULL_LINES else 0.06,
+                1.0 if len(times) <= MAX_FULL_LINES else 0.06,
                 transform=axes.get_xaxis_transform(),
                 color=colour,
                 linewidth=width,
@@ -388,7 +385,7 @@ def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
 
 
 def marks_note(solution: Run) -> list[str]:
-    """What the vertical lines are, as a note below the panels; none where there are none."""
-    there = (bool(passages(solution)), bool(jumps(solution)))
-    words = [words for shown, (words, *_) in zip(there, MARKED) if shown]
-    return [f"Vertical lines: {'; '.join(words)}."] if words else []
+    """A note below the panels that explains the vertical lines, if there are any."""
+    present = (bool(passages(solution)), bool(jumps(solution)))
+    meanings = [meaning for drawn, (meaning, *_) in zip(present, MARKED) if drawn]
+    return [f"Vertical lines: {'; '.join(meanings)}."] if meanings else []

@@ -1,8 +1,6 @@
-"""Joints as curves: what is drawn of a joint of one or several degrees of freedom.
+"""Positions and rates of joints over time, and phase portraits: rate over position.
 
-Phase portraits: the rate of a joint over its position.
-
-Positions and rates of joints over time.
+A joint of several degrees of freedom is drawn as :class:`Component` objects, one for each axis.
 """
 
 from __future__ import annotations
@@ -45,13 +43,24 @@ from srm_mbs.visualization.plotting.sampling import broken, read_smoothly
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from srm_mbs._typing import FloatArray
-
 XYZ = ("x", "y", "z")
-CERTAIN = 0.1
-"""Part of the tolerance of a run below which changes of its coordinates are drawn as none."""
-LOOSE = 1e-6
-"""The largest tolerance that is taken for this: of loose runs, small motions are seen as well."""
+NOISE_RATIO = 0.1
+"""Noise of the coordinates of a run, whose changes are drawn as constant, over its tolerance."""
+LARGEST_NOISE_TOLERANCE = 1e-6
+"""Largest tolerance for this noise, so that plots of loose runs show small motions."""
+MAX_ROWS = 8
+"""Most rows of panels on a page."""
+LABEL_WIDTH = 16
+SEVERAL_FREEDOMS_NOTE = (
+    "Joints of several degrees of freedom: rotations as vectors (axis times angle); rates in the "
+    "moving body's axes."
+)
+MAX_PORTRAITS = 6
+"""Most phase portraits that are drawn by default."""
+PORTRAIT_COLUMNS = 3
+NARROW_TICKS = 4
+"""Intervals between the ticks of a panel that shares its row."""
+MARKERS_NOTE = "Circles: start; squares: end"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +72,16 @@ class Component:
     joint
         Its name.
     what
-        What of it, or "" where it has only this.
+        For example ``rotation``; "" if the joint has one component.
     unit
-        Of the positions; the rates are per second.
+        Unit of the positions; that of the rates is per second.
     names
-        Of the curves; one "" where there is one only.
+        Names of the curves; one "" if there is one only.
     positions : (n, k), rates : (n, k)
-        Angles unwrapped, and rotations as vectors; rates linear or angular, in the axes of the
-        moving body where there are several.
+        Unwrapped angles, and rotation vectors; linear or angular rates, in the axes of the moving
+        body if there are several.
     sizes
-        What is of ordinary size for positions and rates.
+        Typical magnitude of positions and of rates.
     """
 
     joint: str
@@ -90,7 +99,7 @@ def chosen_joints(mechanism: Mechanism, joints: Sequence[str] | None) -> tuple[s
     Raises
     ------
     InputError
-        If one is not there, is named twice, or none is named.
+        If one does not exist or is named twice, or none is named.
     """
     if joints is None:
         return mechanism.joint_names
@@ -110,7 +119,7 @@ def checked_names(names: Any, element: str, remedy: str) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        About ``element`` if they are none, one is there twice, or they are no strings.
+        About ``element`` if there are none, one is named twice, or they are no strings.
     """
     single = isinstance(names, str)
     found = () if single or not isinstance(names, Sequence) else tuple(names)
@@ -123,7 +132,7 @@ def checked_names(names: Any, element: str, remedy: str) -> tuple[str, ...]:
 
 
 def components(run: SimulationResult, joint: str) -> Iterator[Component]:
-    """What is drawn of the joint, read at ``run.t``."""
+    """The components of a joint at the times ``run.t``."""
     mechanism = run.mechanism
     data = mechanism.joint(joint)
     units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
@@ -159,22 +168,22 @@ def components(run: SimulationResult, joint: str) -> Iterator[Component]:
 
 
 def noise(run: SimulationResult) -> float:
-    """Part of the ordinary size below which coordinates of ``run`` do not move."""
-    return CERTAIN * min(run.settings.rtol, LOOSE)
+    """Part of the typical magnitude below which changes of coordinates of ``run`` are noise."""
+    return NOISE_RATIO * min(run.settings.rtol, LARGEST_NOISE_TOLERANCE)
 
 
 def rotation_vectors(quaternions: FloatArray) -> FloatArray:
     """Rotation vectors (n, 3) rad of ``quaternions`` (n, 4) x, y, z, w along a motion.
 
-    Each is the one nearest to its predecessor of all that mean the same rotation, so that turns
-    count and no jump is seen where the angle passes pi.
+    Of all vectors of the same rotation, each is the closest one to its predecessor, so that angles
+    are unwrapped and do not jump at pi.
     """
     out = np.empty((len(quaternions), 3))
     last = np.zeros(3)
     for i, (x, y, z, w) in enumerate(quaternions):
         vector = pin.log3(pin.Quaternion(w, x, y, z).toRotationMatrix())
         angle = float(np.linalg.norm(vector))
-        # Of the identity, a whole turn about any axis means the same.
+        # The identity is a whole turn about any axis.
         axis = vector / angle if angle > 1e-9 else last / (np.linalg.norm(last) or 1.0)
         whole = np.round((last @ axis - angle) / (2.0 * np.pi))
         last = vector + 2.0 * np.pi * whole * axis
@@ -182,11 +191,71 @@ def rotation_vectors(quaternions: FloatArray) -> FloatArray:
     return out
 
 
-MOST_PORTRAITS = 6
-COLUMNS = 3
-NARROW_TICKS = 4
-"""Intervals between the ticks of a panel that shares its row."""
-MARKS = "Circles: start; squares: end"
+def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
+    """Position and rate of each joint over time.
+
+    Parameters
+    ----------
+    joints
+        Names of joints; by default all that fit on a page, and a note names the others.
+
+    Raises
+    ------
+    InputError
+        If there is no such joint.
+    """
+    names = chosen_joints(solution.mechanism, joints)
+    run = read_smoothly(solution)
+    rows: list[Component] = []
+    left: list[str] = []
+    for name in names:
+        own = list(components(run, name))
+        # Joints that are requested by name are always drawn.
+        if joints is None and (left or (rows and len(rows) + len(own) > MAX_ROWS)):
+            left.append(name)
+        else:
+            rows += own
+    figure = Figure(figsize=(WIDTH, 0.9 + 1.2 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
+    for row, pair in zip(rows, panels):
+        what = f"{row.what} " if row.what else ""
+        name = f"{plain(wrapped(row.joint, LABEL_WIDTH))}\n{what}"
+        for axes, values, label, unit, size in zip(
+            pair, (row.positions, row.rates), (name, ""), (row.unit, f"{row.unit}/s"), row.sizes
+        ):
+            _panel(axes, solution, run.t, values, row.names, size, (label, unit))
+    for axes, title in zip(panels[0], ("position", "rate")):
+        axes.set_title(title, loc="left", fontsize=FONT_SIZE + 0.5)
+    for axes in panels.flat:
+        legend(axes, beside=False)
+    for column in panels.T:
+        time_axis(solution, list(column))
+        figure.align_ylabels(list(column))
+    notes = marks_note(solution)
+    if any(len(row.names) > 1 for row in rows):
+        notes.append(SEVERAL_FREEDOMS_NOTE)
+    if left:
+        notes.append(
+            f"Left out: {some_of(left)}; joints=[...], or --joint, draws those that it names."
+        )
+    finish(figure, solution, notes)
+    return figure
+
+
+def _panel(
+    axes: Axes,
+    solution: SimulationResult,
+    t: FloatArray,
+    values: FloatArray,
+    names: tuple[str, ...],
+    size: float,
+    label: tuple[str, str],
+) -> None:
+    prepare(axes)
+    mark_times(axes, solution, labelled=False)
+    factor = linear_axis(axes, [values], *label, size=size, noise=noise(solution))
+    for name, own, style in zip(names, np.transpose(values), line_styles(len(names))):
+        draw_line(axes, t, own / factor, label=name or None, **style)
 
 
 def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
@@ -195,8 +264,8 @@ def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) 
     Parameters
     ----------
     joints
-        Names of joints; by default the first ones that have one degree of freedom, and a note
-        names the others.
+        Names of joints; by default the first :data:`MAX_PORTRAITS` with one degree of freedom, and
+        a note names the others.
 
     Raises
     ------
@@ -214,11 +283,11 @@ def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) 
                 element="joints",
                 remedy=f"Known: {', '.join(single)}" if single else 'Draw the kind "state"',
             )
-    shown = single if joints is not None else single[:MOST_PORTRAITS]
+    shown = single if joints is not None else single[:MAX_PORTRAITS]
     run, passages = read_smoothly(solution), None
     if solution.crossings:
         passages = solution.at([crossing.time for crossing in solution.crossings])
-    columns = min(COLUMNS, len(shown))
+    columns = min(PORTRAIT_COLUMNS, len(shown))
     rows = -(-len(shown) // columns)
     height = 2.1 if columns > 1 else 3.4
     figure = Figure(figsize=(WIDTH, 0.9 + height * rows), layout="constrained")
@@ -228,7 +297,7 @@ def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) 
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     left = [name for name in names if name not in shown]
-    notes = [MARKS + ("; plus signs: singular passages." if solution.crossings else ".")]
+    notes = [MARKERS_NOTE + ("; plus signs: singular passages." if solution.crossings else ".")]
     if left:
         notes.append(f"Left out: {some_of(left)}; joints=[...], or --joint, names others.")
     finish(figure, solution, notes)
@@ -259,79 +328,3 @@ def _portrait(
     for index, marker in ((0, "o"), (-1, "s")):
         axes.plot(position[index] / x, rate[index] / y, **marks(BLACK, marker, 5.5))
     axes.set_title(plain(name), loc="left", fontsize=FONT_SIZE + 0.5)
-
-
-MOST_ROWS = 8
-"""Rows of panels that fit on a page."""
-LABEL_WIDTH = 16
-SEVERAL = (
-    "Joints of several degrees of freedom: rotations as vectors (axis times angle); rates in the "
-    "moving body's axes."
-)
-
-
-def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
-    """Position and rate of each joint over time.
-
-    Parameters
-    ----------
-    joints
-        Names of joints; by default all, as far as they fit on a page, and a note names the others.
-
-    Raises
-    ------
-    InputError
-        If there is no such joint.
-    """
-    names = chosen_joints(solution.mechanism, joints)
-    run = read_smoothly(solution)
-    rows: list[Component] = []
-    left: list[str] = []
-    for name in names:
-        own = list(components(run, name))
-        # Those that were asked for by name are drawn however long the picture gets.
-        if joints is None and (left or (rows and len(rows) + len(own) > MOST_ROWS)):
-            left.append(name)
-        else:
-            rows += own
-    figure = Figure(figsize=(WIDTH, 0.9 + 1.2 * len(rows)), layout="constrained")
-    panels = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
-    for row, pair in zip(rows, panels):
-        what = f"{row.what} " if row.what else ""
-        name = f"{plain(wrapped(row.joint, LABEL_WIDTH))}\n{what}"
-        for axes, values, label, unit, size in zip(
-            pair, (row.positions, row.rates), (name, ""), (row.unit, f"{row.unit}/s"), row.sizes
-        ):
-            _panel(axes, solution, run.t, values, row.names, size, (label, unit))
-    for axes, title in zip(panels[0], ("position", "rate")):
-        axes.set_title(title, loc="left", fontsize=FONT_SIZE + 0.5)
-    for axes in panels.flat:
-        legend(axes, beside=False)
-    for column in panels.T:
-        time_axis(solution, list(column))
-        figure.align_ylabels(list(column))
-    notes = marks_note(solution)
-    if any(len(row.names) > 1 for row in rows):
-        notes.append(SEVERAL)
-    if left:
-        notes.append(
-            f"Left out: {some_of(left)}; joints=[...], or --joint, draws those that it names."
-        )
-    finish(figure, solution, notes)
-    return figure
-
-
-def _panel(
-    axes: Axes,
-    solution: SimulationResult,
-    t: FloatArray,
-    values: FloatArray,
-    names: tuple[str, ...],
-    size: float,
-    label: tuple[str, str],
-) -> None:
-    prepare(axes)
-    mark_times(axes, solution, labelled=False)
-    factor = linear_axis(axes, [values], *label, size=size, noise=noise(solution))
-    for name, own, style in zip(names, np.transpose(values), line_styles(len(names))):
-        draw_line(axes, t, own / factor, label=name or None, **style)

@@ -18,7 +18,7 @@ from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     FONT_SIZE,
     LINES,
-    ROUND,
+    TICK_STEPS,
     WIDTH,
     finish,
     legend,
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
     from srm_mbs._typing import BoolArray, FloatArray
 
-FLAT = 1e-6
-"""Extent, over the largest one, below which a coordinate does not change."""
-STILL = 1e-6
-"""The same over the size of the mechanism, below which a point does not move."""
+FLATNESS_TOLERANCE = 1e-6
+"""Extent of a coordinate, over the largest one, below which it is constant."""
+SMALLEST_PATH = 1e-6
+"""Extent of a path, over the size of the mechanism, below which a point does not move."""
 HEIGHTS = (2.4, 6.0)
-"""Least and largest height (inch) of a picture in a plane."""
+"""Smallest and largest height (inch) of a figure in a plane."""
 AXES = "xyz"
 VIEWS = ((0, 2, "from the front"), (1, 2, "from the right"), (0, 1, "from above"))
 Places = dict[str, tuple[int, pin.SE3]]
@@ -51,25 +51,24 @@ Places = dict[str, tuple[int, pin.SE3]]
 def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None) -> Figure:
     """Paths of points, with equal axes, their starts and ends marked.
 
-    In one picture if they lie in planes across an axis of the world, otherwise from three sides.
+    One view if they lie in planes normal to an axis of the world, otherwise three views.
 
     Parameters
     ----------
     points
         Points of links, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``; by default the
-        origins of joints and the points where closures take hold, as far as they move, or centres
-        of mass if none does.
+        origins of joints and anchors of closures that move, or centres of mass if none does.
 
     Raises
     ------
     InputError
-        If one of them is not there or lies on the ground, or none moves.
+        If one of them does not exist or lies on the ground, or none moves.
     """
     mechanism = solution.mechanism
     run = read_smoothly(solution)
     notes = []
     if points is None:
-        paths = _moving(solution, run)
+        paths = _default_paths(solution, run)
         if not paths:
             raise InputError(
                 "no joint, closure or centre of mass of the mechanism moves along a path",
@@ -87,7 +86,7 @@ def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None
         paths = _paths(run, {_name(point): place for point, place in zip(points, placed)})
     together = np.concatenate(list(paths.values()))
     extents = np.array([max(np.ptp(path[:, k]) for path in paths.values()) for k in range(3)])
-    flat = extents <= FLAT * max(extents.max(), STILL)
+    flat = extents <= FLATNESS_TOLERANCE * max(extents.max(), SMALLEST_PATH)
     if flat.all():
         raise InputError(
             f"none of the points moves from t = {run.t[0]:g} to {run.t[-1]:g} s",
@@ -117,7 +116,7 @@ def _paths(run: SimulationResult, places: Places) -> dict[str, FloatArray]:
     return paths
 
 
-def _moving(solution: SimulationResult, run: SimulationResult) -> dict[str, FloatArray]:
+def _default_paths(solution: SimulationResult, run: SimulationResult) -> dict[str, FloatArray]:
     """Paths of the origins of joints, of the anchors of closures, or of centres of mass."""
     mechanism = solution.mechanism
     model = mechanism.model
@@ -130,21 +129,21 @@ def _moving(solution: SimulationResult, run: SimulationResult) -> dict[str, Floa
             for joint, placement in ends[:1] if ends and ends[0][0] else ends[1:]:
                 places.setdefault(f"closure {loop.name}", (joint, placement))
     size = coordinate_units(mechanism, mechanism.q0, mechanism.v0).length
-    paths = _different(_paths(run, places), STILL * size)
+    paths = _different(_paths(run, places), SMALLEST_PATH * size)
     if paths:
         return paths
-    # One body that turns, or several about one point.
+    # One rotating body, or several about one point.
     centres = {}
     for name in mechanism.joint_names:
         inertia = model.inertias[model.getJointId(name)]
         if inertia.mass > 0.0:
             place = (model.getJointId(name), pin.SE3(np.eye(3), inertia.lever))
-            centres[f"centre of mass behind {name}"] = place
-    return _different(_paths(run, centres), STILL * size)
+            centres[f"centre of mass of the body at {name}"] = place
+    return _different(_paths(run, centres), SMALLEST_PATH * size)
 
 
 def _different(paths: dict[str, FloatArray], least: float) -> dict[str, FloatArray]:
-    """Those of the ``paths`` that are longer than ``least`` (m), each point once."""
+    """Those of the ``paths`` with an extent above ``least`` (m), each point once."""
     found: dict[str, FloatArray] = {}
     for name, path in paths.items():
         moves = bool(np.ptp(path, axis=0).max() > least)
@@ -187,7 +186,7 @@ def _view(
     for axis, k in (("x", x), ("y", y)):
         factor = linear_axis(axes, [together], f"{AXES[k]} ", "m", size=size, axis=axis)
     for number, ((name, path), style) in enumerate(zip(paths.items(), line_styles(len(paths)))):
-        # Dashes of several turns upon each other are a line: numbers tell them apart in grey.
+        # Dashes of overlapping turns merge to a line: numbers distinguish the paths in grey.
         label = plain(name) if len(paths) == 1 else f"{number + 1} {plain(name)}"
         axes.plot(path[:, x] / factor, path[:, y] / factor, label=label, **style)
         for index, marker in ((0, "o"), (-1, "s")):
@@ -205,4 +204,4 @@ def _view(
     axes.plot([], [], label="end", **marks("black", "s", 5.5))
     axes.set_aspect("equal", adjustable="datalim")
     for own in (axes.xaxis, axes.yaxis):
-        own.set_major_locator(MaxNLocator(6, steps=ROUND))
+        own.set_major_locator(MaxNLocator(6, steps=TICK_STEPS))

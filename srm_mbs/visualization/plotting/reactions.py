@@ -34,15 +34,16 @@ if TYPE_CHECKING:
     from srm_mbs._typing import FloatArray
     from srm_mbs.model.closures import LoopClosure
 
-SMOOTH_UP_TO = 1000
-"""Pieces from which steps are divided no further: each reaction is a solution of its own."""
-HIGH = 98.0
-"""Percentile of what is drawn from which peaks are judged."""
-PEAK = 6.0
-"""Values above this times the percentile are cut: at singular passages reactions have peaks."""
-ABOVE = 1.6
-"""Where the axis ends then, over the percentile."""
-MOST_PANELS = 8
+MAX_PIECES = 1000
+"""Number of parts from which steps are divided no further: each time needs a solution."""
+PERCENTILE = 98.0
+"""Percentile of the drawn values with which peaks are compared."""
+PEAK_RATIO = 6.0
+"""Values above this times the percentile are cut: reactions peak at singular passages."""
+AXIS_RATIO = 1.6
+"""End of an axis with cut peaks, over the percentile."""
+MAX_PANELS = 8
+"""Most panels of multipliers that are drawn by default."""
 
 Lines = Mapping[str, "FloatArray"]
 
@@ -55,15 +56,15 @@ def draw_reactions(
     Parameters
     ----------
     loops
-        Names of closures; by default those with the largest forces, as many as a panel takes, and
-        a note names the others.  Drives are drawn if none are named.
+        Names of closures; by default those with the largest forces that fit in a panel, and a note
+        names the others.  Drives are drawn if no closure is named.
     rows
         Draw the multipliers of the rows of each closure instead of the norms of force and moment.
 
     Raises
     ------
     InputError
-        If there is no such closure, nothing has a reaction, or the run was loaded and had a
+        If a closure does not exist, nothing has a reaction, or the run was loaded and had a
         controller.
     """
     found = {loop.name: loop for each in solution.segments for loop in each.mechanism.loops}
@@ -98,8 +99,8 @@ def draw_reactions(
 
 
 def _readable(solution: SimulationResult) -> SimulationResult:
-    """The run read smoothly; of one that failed, without the end if there are no forces there."""
-    run = read_smoothly(solution, SMOOTH_UP_TO)
+    """The run at smooth times; without the end of a failed run if there are no forces there."""
+    run = read_smoothly(solution, MAX_PIECES)
     try:
         _ = run.reactions
     except (ControllerError, EvaluationError) as error:
@@ -132,7 +133,7 @@ def _by_loop(
     moments = {name: np.linalg.norm(run.reactions[name][:, 3:], axis=1) for name in tied}
     left: list[str] = []
     if names is None and len(tied) > len(LINES):
-        large = {name: _high([forces[name]]) for name in tied}
+        large = {name: _percentile([forces[name]]) for name in tied}
         ordered = sorted(tied, key=lambda name: -large[name])
         left = [name for name in tied if name in ordered[len(LINES) :]]
         tied = [name for name in tied if name not in left]
@@ -160,7 +161,7 @@ def _by_loop(
 
 
 def _takes_moments(loop: LoopClosure) -> bool:
-    """Whether it has more than a force through the origin of b, but for the gap of the closure."""
+    """Whether its reaction has a moment about the origin of b, except that of the closure error."""
     return bool(len(loop.rows.alignments)) or 0 < len(loop.rows.directions) < 3
 
 
@@ -185,7 +186,7 @@ def _by_row(
             if lines:
                 title = f"multipliers of {plain(name)}"
                 panels.append(_panel(run, lines, "multiplier ", unit, title))
-        if names is None and (left or (draws and len(draws) + len(panels) > MOST_PANELS)):
+        if names is None and (left or (draws and len(draws) + len(panels) > MAX_PANELS)):
             left.append(name)
         else:
             draws += panels
@@ -213,8 +214,8 @@ def _panel(run: SimulationResult, lines: Lines, name: str, unit: str, title: str
 
 def _draw(axes: Axes, run: SimulationResult, lines: Lines, name: str, unit: str, title: str) -> str:
     mark_times(axes, run, labelled=False)
-    top = ABOVE * _high(list(lines.values()))
-    cut = _largest(lines) > PEAK / ABOVE * top > 0.0
+    top = AXIS_RATIO * _percentile(list(lines.values()))
+    cut = _largest(lines) > PEAK_RATIO / AXIS_RATIO * top > 0.0
     shown = [np.clip(values, -top, top) for values in lines.values()] if cut else lines.values()
     factor = linear_axis(axes, list(shown), name, unit, size=0.0)
     for (label, values), style in zip(lines.items(), line_styles(len(lines))):
@@ -226,10 +227,10 @@ def _draw(axes: Axes, run: SimulationResult, lines: Lines, name: str, unit: str,
     return title
 
 
-def _high(lines: Sequence[FloatArray]) -> float:
+def _percentile(lines: Sequence[FloatArray]) -> float:
     together = np.abs(np.concatenate(lines))
     together = together[np.isfinite(together)]
-    return float(np.percentile(together, HIGH)) if len(together) else 0.0
+    return float(np.percentile(together, PERCENTILE)) if len(together) else 0.0
 
 
 def _largest(lines: Lines) -> float:

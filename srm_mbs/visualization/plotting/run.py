@@ -1,7 +1,4 @@
-"""The run plot: drift, energy, sigma and step sizes over time.
-
-sigma and step sizes: panels of the run plot, and a figure in the style of the thesis.
-"""
+"""Drift, energy, sigma, step sizes and error estimates of a run over time."""
 
 from __future__ import annotations
 
@@ -42,8 +39,51 @@ if TYPE_CHECKING:
 
     from srm_mbs._typing import BoolArray, FloatArray
 
+SMALLEST_DRIFT = 1e-17
+"""Ordinate of a drift of exactly zero on the logarithmic axis."""
 SMALLEST_SIGMA = 1e-16
-"""sigma that is exactly zero is drawn here, since a logarithmic axis has no zero."""
+"""Ordinate of a sigma of exactly zero on the logarithmic axis."""
+
+
+def draw_run(solution: SimulationResult) -> Figure:
+    """Drift, energy, sigma and step sizes of a run over time, in panels with one time axis.
+
+    Drift and energy are drawn at ``solution.t``, sigma and step sizes at the steps.  Open chains
+    have no panels of drift and sigma.
+    """
+    energy: Draw = partial(_energy, solution=solution)
+    draws = [energy, step_panel(solution)]
+    if constrained(solution):
+        drift: Draw = partial(_drift, solution=solution)
+        draws = [drift, energy, sigma_panel(solution), step_panel(solution)]
+    return time_panels(solution, draws)
+
+
+def _drift(axes: Axes, solution: SimulationResult) -> str:
+    found = {part for each in solution.segments for part in row_dimensions(each.mechanism)}
+    parts = [part for part in ("m", "rad") if part in found]
+    units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
+    names = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
+    drift = np.maximum(finite(solution.drift), SMALLEST_DRIFT)
+    # Positions as dots: at rounding level a line would jump between a few values.
+    rate = {"color": VERMILION, **curve(len(solution.t))}
+    position = {"color": BLACK, "linestyle": "none", "marker": ".", "markersize": 2.0}
+    for column, style in ((1, rate), (0, position)):
+        label = f"{names[column]} ({units[column]})"
+        draw_line(axes, solution.t, drift[:, column], label=label, **style)
+    log_axis(axes)
+    axes.set_ylabel("drift", fontsize=FONT_SIZE)
+    floor = finite(solution.drift) < SMALLEST_DRIFT
+    return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
+
+
+def _energy(axes: Axes, solution: SimulationResult) -> str:
+    change = finite(solution.energy - solution.energy[:1])
+    factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
+    draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))
+    from_start = not len(solution.t) or solution.t[0] == solution.steps.times[0]
+    since = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
+    return f"total energy relative to {since}"
 
 
 def sigma_panel(solution: Run, *, log: bool = False) -> Draw:
@@ -52,12 +92,12 @@ def sigma_panel(solution: Run, *, log: bool = False) -> Draw:
 
 
 def step_panel(solution: Run, *, kinds: bool = False) -> Draw:
-    """Accepted steps, and those that did not stand.
+    """Accepted, rejected and redone steps.
 
     Parameters
     ----------
     kinds
-        Whether steps that were placed, in the zone or held on their branch have marks of their own.
+        Whether placed steps, those in the zone and those held on their branch have own markers.
     """
     return partial(_step_sizes, solution=solution, kinds=kinds)
 
@@ -74,7 +114,7 @@ def draw_sigma(solution: SimulationResult) -> Figure:
 def _sigma(axes: Axes, solution: Run, log: bool) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=not log)
-    # A line through every stage: a step leaps over a singular passage, its stages show the dip.
+    # A line through every stage: stages show the dip of sigma at a passage that steps jump over.
     abscissae = np.append(solution.scheme.c, 1.0)
     times = (steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]).ravel()
     sigmas = finite(steps.sigmas)
@@ -129,7 +169,7 @@ def _step_sizes(axes: Axes, solution: Run, kinds: bool) -> str:
 
 
 def _special(solution: Run) -> list[tuple[str, BoolArray, str, str, float]]:
-    """Which accepted steps were out of the ordinary, and their marks."""
+    """Placed, zone and held steps: (label, which steps, colour, marker, size)."""
     steps = solution.steps
     zone = np.isin(np.arange(steps.count), list(steps.zones))
     return [
@@ -157,53 +197,8 @@ def _errors(axes: Axes, solution: SimulationResult) -> str:
 def _ratios(
     axes: Axes, t: FloatArray, ratios: FloatArray, label: str, style: dict[str, object], colour: str
 ) -> None:
-    """Marks of positive ratios; a step without an error, or that could not be done, has none."""
+    """Markers of positive ratios; a step without error, or whose evaluation failed, has none."""
     known = np.isfinite(ratios) & (ratios > 0.0)
     seen = distinct(t[known], ratios[known], log=True)
     if len(seen):
         axes.plot(t[known][seen], ratios[known][seen], color=colour, label=label, **style)  # type: ignore[arg-type]
-
-
-SMALLEST_DRIFT = 1e-17
-"""Drift that is exactly zero is drawn here, since a logarithmic axis has no zero."""
-
-
-def draw_run(solution: SimulationResult) -> Figure:
-    """Drift, energy, sigma and step sizes of a run over time, in panels with one time axis.
-
-    Drift and energy are drawn at ``solution.t``, sigma and step sizes at the steps.  Without
-    loops there is neither drift nor sigma, and their panels are left out.
-    """
-    energy: Draw = partial(_energy, solution=solution)
-    draws = [energy, step_panel(solution)]
-    if constrained(solution):
-        drift: Draw = partial(_drift, solution=solution)
-        draws = [drift, energy, sigma_panel(solution), step_panel(solution)]
-    return time_panels(solution, draws)
-
-
-def _drift(axes: Axes, solution: SimulationResult) -> str:
-    found = {part for each in solution.segments for part in row_dimensions(each.mechanism)}
-    parts = [part for part in ("m", "rad") if part in found]
-    units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
-    names = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
-    drift = np.maximum(finite(solution.drift), SMALLEST_DRIFT)
-    # The positions as dots: at round-off a line would jump to and fro between a few values.
-    rate = {"color": VERMILION, **curve(len(solution.t))}
-    position = {"color": BLACK, "linestyle": "none", "marker": ".", "markersize": 2.0}
-    for column, style in ((1, rate), (0, position)):
-        label = f"{names[column]} ({units[column]})"
-        draw_line(axes, solution.t, drift[:, column], label=label, **style)
-    log_axis(axes)
-    axes.set_ylabel("drift", fontsize=FONT_SIZE)
-    floor = finite(solution.drift) < SMALLEST_DRIFT
-    return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
-
-
-def _energy(axes: Axes, solution: SimulationResult) -> str:
-    change = finite(solution.energy - solution.energy[:1])
-    factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
-    draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))
-    from_start = not len(solution.t) or solution.t[0] == solution.steps.times[0]
-    since = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
-    return f"total energy relative to {since}"

@@ -1,4 +1,4 @@
-"""Where a run is read for a picture, and how much of it a picture can show."""
+"""Sampling of a run for a plot: at which times, and which points a plot can distinguish."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.result import SimulationResult
 
-SMOOTH = 8
-"""Pieces of each step: between the ends of steps of high order curves bend."""
-LEAST = 240
-"""Pieces of a run of few steps."""
-MOST = 12_000
-"""Pieces from which steps are divided no further."""
-COLUMNS = 1600
-"""Columns of a picture: about twice as many as a page or a screen tells apart."""
-ROWS = 800
+PIECES_PER_STEP = 8
+"""Number of parts of each step: curves bend between the ends of steps of high order."""
+MIN_PIECES = 240
+"""Smallest number of parts of a run of few steps."""
+MAX_PIECES = 12_000
+"""Number of parts from which steps are divided no further."""
+COLUMNS, ROWS = 1600, 800
+"""Resolution of a plot: about twice as many as a page or a screen distinguishes."""
 
 
 Run = SimulationResult | DaeResult
 
 
 def passages(solution: Run) -> list[float]:
-    """Times (s) of the singular passages that were looked for; none of a DAE."""
+    """Times (s) of the singular passages; a DAE has none."""
     found = solution.crossings if isinstance(solution, SimulationResult) else ()
     return [crossing.time for crossing in found]
 
@@ -36,24 +35,25 @@ def jumps(solution: Run) -> list[float]:
 
 
 def constrained(solution: SimulationResult) -> bool:
-    """Whether there are closures or drives in any part of the run."""
+    """Whether any segment of the run has closures or drives."""
     return any(segment.mechanism.constrained for segment in solution.segments)
 
 
-def read_smoothly(solution: SimulationResult, most: int = MOST) -> SimulationResult:
-    """The run read so often that curves are smooth: at the ends of its steps, and between them.
+def read_smoothly(solution: SimulationResult, most: int = MAX_PIECES) -> SimulationResult:
+    """The run at the ends of its steps and between them, so that curves are smooth.
 
-    Its times increase.  Each action of an event has two, of which the first is the last number
-    before it: the states there are those before and after the jump.
+    The times increase.  Each action of an event has two: the preceding floating-point number, with
+    the state before the jump, and its own time, with the state after it.
 
     Parameters
     ----------
     most
-        Pieces from which steps are divided no further: fewer for what is slow to compute.
+        Number of parts from which steps are divided no further: smaller for quantities that are
+        slow to compute.
     """
     times = _times(solution, most)
     if np.array_equal(times, solution.t):
-        return solution  # which may have computed already what is asked of it
+        return solution  # keeps quantities that it has computed
     return solution.at(times)
 
 
@@ -72,9 +72,11 @@ def _times(solution: SimulationResult, most: int) -> FloatArray:
     return np.unique(np.concatenate(parts))
 
 
-def between(ends: FloatArray, steps: int, most: int = MOST) -> FloatArray:
-    """The ``ends`` (n,) of steps with times between them, in a run of so many ``steps``."""
-    pieces = max(1, min(max(SMOOTH, -(-LEAST // max(1, steps))), most // max(1, steps)))
+def between(ends: FloatArray, steps: int, most: int = MAX_PIECES) -> FloatArray:
+    """The ``ends`` (n,) of steps with times between them, in a run of ``steps`` steps."""
+    pieces = max(
+        1, min(max(PIECES_PER_STEP, -(-MIN_PIECES // max(1, steps))), most // max(1, steps))
+    )
     inside = np.arange(pieces) / pieces
     return np.append(ends[:-1, None] + np.diff(ends)[:, None] * inside, ends[-1])
 
@@ -88,10 +90,10 @@ def broken(
 
 
 def thinned(t: FloatArray, values: FloatArray) -> IndexArray:
-    """Indices of what is seen of a line through increasing ``t`` (n,) and ``values`` (n,).
+    """Indices of the points of a line, ``t`` (n,) and ``values`` (n,), that a plot distinguishes.
 
-    Of each column of the picture the first, last, lowest and highest point: no extreme is lost.
-    All indices if there are not many more.
+    The first, last, lowest and highest point of each column, so that no extreme is lost; all points
+    if there are not many more.
     """
     n = len(t)
     if n <= 4 * COLUMNS:
@@ -108,7 +110,7 @@ def thinned(t: FloatArray, values: FloatArray) -> IndexArray:
 
 
 def distinct(x: FloatArray, y: FloatArray, *, log: bool = False) -> IndexArray:
-    """Indices of marks at ``x``, ``y`` (n,) that do not lie upon each other in a picture.
+    """Indices of markers at ``x``, ``y`` (n,) that do not overlap in a plot.
 
     Parameters
     ----------

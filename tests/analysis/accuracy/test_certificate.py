@@ -11,13 +11,13 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.analysis.accuracy.assessment import Finding, error_findings
+from srm_mbs.analysis.accuracy.assessment import Assessment, assess_errors
 from srm_mbs.analysis.accuracy.error_estimate import Comparison, compare, observed_order, parted_at
 from tests.support.bundled import load
 from tests.support.references import observed, reference
 
 
-def finding(certificate: srm.Certificate, topic: str) -> Finding:
+def finding(certificate: srm.Certificate, topic: str) -> Assessment:
     return next(found for found in certificate.findings if found.topic == topic)
 
 
@@ -135,7 +135,7 @@ def falling(differences: tuple[float, ...], order: float | None) -> str:
     assert estimate is not None
     trials = [replace(estimate.trials[0], difference=d) for d in (*differences, None)]
     changed = replace(estimate, trials=tuple(trials), order=order, size=differences[0])
-    found = error_findings(run, changed)
+    found = assess_errors(run, changed)
     return next(one.grade for one in found if one.topic == "error over tolerance")
 
 
@@ -201,7 +201,7 @@ def test_a_second_run_on_another_branch_is_named() -> None:
     assert estimate is not None
     assert estimate.branch is None
     parted = replace(estimate, apart=1.3, branch=1.25)
-    (found, *_) = error_findings(run, parted)
+    (found, *_) = assess_errors(run, parted)
     assert found.grade == "poor"
     assert "at t = 1.25 s on different branches" in found.text
 

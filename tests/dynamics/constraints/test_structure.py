@@ -498,7 +498,7 @@ def test_row_scales_are_the_same_for_all_rows_of_one_kind_in_a_closure() -> None
 def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(structure, "BLUNT", 0.0)
+    monkeypatch.setattr(structure, "SMALL_REFERENCE_PIVOT", 0.0)
     mechanism = srm.load(name)
     model, units = mechanism.model, mechanism.structure.units
     rows = LoopKinematics(model, mechanism.loops)
@@ -530,7 +530,7 @@ def test_rows_are_balanced_where_the_last_pivot_would_be_small_everywhere(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = load(name).structure
-    monkeypatch.setattr(structure, "BLUNT", 0.0)
+    monkeypatch.setattr(structure, "SMALL_REFERENCE_PIVOT", 0.0)
     before = analyse(load(name))
     assert found.sigma_ref >= 0.1
     assert (before.sigma_ref < 0.1) == (name in BALANCED)

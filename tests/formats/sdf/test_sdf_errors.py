@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,78 +12,70 @@ from srm_mbs.formats.sdf import joints
 from srm_mbs.formats.sdf import links as sdf_links
 from srm_mbs.formats.sdf import reader as sdf_module
 from tests.support.sdf_files import four_bar, joint, link, sdf
+from tests.support.snapshots import check_messages, refused
 
 PENDULUM = sdf(link("arm", "0 0 1 0 0 0"), joint("hinge", "revolute", "world", "arm"))
 ARM = '<link name="arm">'
 LAST = "</model>"
 
 FAULTS = {
-    "no xml": ("</sdf>", "", "", "not well-formed XML"),
-    "version": ('version="1.9"', 'version="7"', "<sdf>", "SDF version '7' is not read"),
-    "no version": ('version="1.9"', "", "<sdf>", "SDF version '' is not read"),
-    "two models": ("</sdf>", '<world name="w"/></sdf>', "<sdf>", "one <model> or one <world>"),
-    "unknown element": (LAST, "<spring/></model>", "model 'robot'", "unknown element <spring>"),
-    "unknown in link": ("<inertial>", "<Pose/><inertial>", "link 'arm'", "unknown element <Pose>"),
-    "attribute": ('name="arm"', 'name="arm" weight="2"', "link 'arm'", "unknown attribute"),
-    "no name": (ARM, "<link>", "<link>", "it has no name"),
-    "reserved": (ARM, '<link name="world">', "<link>", "reserved"),
-    "twice": (LAST, link("arm") + LAST, "link 'arm'", "are called 'arm'"),
-    "pose": ("0 0 1 0 0 0", "0 0 1 0 0", "link 'arm'", "not 6 finite numbers"),
-    "pose nan": ("0 0 1 0 0 0", "0 0 1 0 0 nan", "link 'arm'", "not 6 finite numbers"),
-    "relative": ("<pose>0 0 1", '<pose relative_to="x">0 0 1', "link 'arm'", "no link.*'x'"),
-    "ring": ("<pose>", '<pose relative_to="hinge">', "joint 'hinge'", "relative to itself"),
-    "rotation": ("<pose>0 0 1", '<pose rotation_format="x">0 0 1', "link 'arm'", "rotation_format"),
-    "two poses": ("<inertial>", "<pose/><inertial>", "link 'arm'", "<pose> is given twice"),
-    "mass": ("<mass>1.0</mass>", "<mass>heavy</mass>", "link 'arm'", "<mass> is 'heavy'"),
-    "negative": ("<mass>1.0</mass>", "<mass>-1</mass>", "link 'arm'", "negative"),
-    "auto": ("<inertial>", '<inertial auto="true">', "link 'arm'", "inertial auto"),
-    "gravity": ("<inertial>", "<gravity>0</gravity><inertial>", "link 'arm'", "not simulated"),
-    "type": ('type="revolute"', 'type="hinge"', "joint 'hinge'", "there is no joint type 'hinge'"),
-    "parent": ("<parent>world", "<parent>wall", "joint 'hinge'", "no link.*'wall'"),
-    "no parent": ("<parent>world</parent>", "", "joint 'hinge'", "it has no <parent>"),
-    "self": ("<parent>world", "<parent>arm", "joint 'hinge'", "both 'arm'"),
-    "no axis": ("<axis><xyz>0 1 0</xyz></axis>", "", "joint 'hinge'", "it has no <axis>"),
-    "zero axis": ("0 1 0</xyz>", "0 0 0</xyz>", "joint 'hinge'", "the axis is zero"),
-    "older": ("<xyz>", "<use_parent_model_frame>1</use_parent_model_frame><xyz>", "hinge",
-              "does not exist in SDF 1.9"),
-    "expressed": ("<xyz>", '<xyz expressed_in="x">', "joint 'hinge'", "no link.*'x'"),
-    "initial": ("<xyz>", "<initial_position>1</initial_position><xyz>", "hinge", "Pose the links"),
-    "damping": ("<xyz>", "<dynamics><damping>-1</damping></dynamics><xyz>", "hinge", "negative"),
-    "limits": ("<xyz>", "<limit><lower>2</lower><upper>1</upper></limit><xyz>", "hinge", "above"),
-    "screw": (LAST, link("n") + joint("s", "screw", "arm", "n") + LAST, "joint 's'", "pitch"),
+    "no xml": ("</sdf>", ""),
+    "version": ('version="1.9"', 'version="7"'),
+    "no version": ('version="1.9"', ""),
+    "two models": ("</sdf>", '<world name="w"/></sdf>'),
+    "unknown element": (LAST, "<spring/></model>"),
+    "unknown in link": ("<inertial>", "<Pose/><inertial>"),
+    "attribute": ('name="arm"', 'name="arm" weight="2"'),
+    "no name": (ARM, "<link>"),
+    "reserved": (ARM, '<link name="world">'),
+    "twice": (LAST, link("arm") + LAST),
+    "pose": ("0 0 1 0 0 0", "0 0 1 0 0"),
+    "pose nan": ("0 0 1 0 0 0", "0 0 1 0 0 nan"),
+    "relative": ("<pose>0 0 1", '<pose relative_to="x">0 0 1'),
+    "ring": ("<pose>", '<pose relative_to="hinge">'),
+    "rotation": ("<pose>0 0 1", '<pose rotation_format="x">0 0 1'),
+    "two poses": ("<inertial>", "<pose/><inertial>"),
+    "mass": ("<mass>1.0</mass>", "<mass>heavy</mass>"),
+    "negative": ("<mass>1.0</mass>", "<mass>-1</mass>"),
+    "auto": ("<inertial>", '<inertial auto="true">'),
+    "gravity": ("<inertial>", "<gravity>0</gravity><inertial>"),
+    "type": ('type="revolute"', 'type="hinge"'),
+    "parent": ("<parent>world", "<parent>wall"),
+    "no parent": ("<parent>world</parent>", ""),
+    "self": ("<parent>world", "<parent>arm"),
+    "no axis": ("<axis><xyz>0 1 0</xyz></axis>", ""),
+    "zero axis": ("0 1 0</xyz>", "0 0 0</xyz>"),
+    "older": ("<xyz>", "<use_parent_model_frame>1</use_parent_model_frame><xyz>"),
+    "expressed": ("<xyz>", '<xyz expressed_in="x">'),
+    "initial": ("<xyz>", "<initial_position>1</initial_position><xyz>"),
+    "damping": ("<xyz>", "<dynamics><damping>-1</damping></dynamics><xyz>"),
+    "limits": ("<xyz>", "<limit><lower>2</lower><upper>1</upper></limit><xyz>"),
+    "screw": (LAST, link("n") + joint("s", "screw", "arm", "n") + LAST),
     "thread": (LAST, link("n") + joint("s", "screw", "arm", "n",
-               "<thread_pitch>0</thread_pitch>") + LAST, "joint 's'", "<thread_pitch> is zero"),
+               "<thread_pitch>0</thread_pitch>") + LAST),
     "parallel": (LAST, link("n") + joint("u", "universal", "arm", "n",
-                 "<axis2><xyz>0 -2 0</xyz></axis2>") + LAST, "joint 'u'", "parallel"),
-    "one axis": (LAST, link("n") + joint("u", "universal", "arm", "n") + LAST, "'u'", "<axis2>"),
-    "gear body": (LAST, link("n") + joint("g", "gearbox", "arm", "n") + LAST, "'g'",
-                  "gearbox_reference_body"),
+                 "<axis2><xyz>0 -2 0</xyz></axis2>") + LAST),
+    "one axis": (LAST, link("n") + joint("u", "universal", "arm", "n") + LAST),
+    "gear body": (LAST, link("n") + joint("g", "gearbox", "arm", "n") + LAST),
     "gear hinge": (LAST, link("n") + joint("h", "revolute", "arm", "n") + joint(
         "g", "gearbox", "arm", "n", "<axis2><xyz>0 1 0</xyz></axis2><gearbox_reference_body>n"
-        "</gearbox_reference_body>") + LAST, "joint 'g'", "no revolute joint about its axis"),
-    "mimic": ("<xyz>", '<mimic joint="x" axis="axis"/><xyz>', "'hinge'", "prismatic joint 'x'"),
-    "include": (LAST, "<include><uri>model://nowhere</uri></include></model>", "<include>",
-                "no such model beside"),
-    "far": (LAST, "<include><uri>https://a.b/c</uri></include></model>", "<include>",
-            "from this machine only"),
-    "merge": (LAST, '<include merge="true"><uri>a</uri></include></model>', "<include>", "merge"),
-    "canonical": ('name="robot"', 'name="robot" canonical_link="x"', "model", "no link 'x'"),
-    "placement": ('name="robot"', 'name="robot" placement_frame="arm"', "model", "placement_frame"),
+        "</gearbox_reference_body>") + LAST),
+    "mimic": ("<xyz>", '<mimic joint="x" axis="axis"/><xyz>'),
+    "include": (LAST, "<include><uri>model://nowhere</uri></include></model>"),
+    "far": (LAST, "<include><uri>https://a.b/c</uri></include></model>"),
+    "merge": (LAST, '<include merge="true"><uri>a</uri></include></model>'),
+    "canonical": ('name="robot"', 'name="robot" canonical_link="x"'),
+    "placement": ('name="robot"', 'name="robot" placement_frame="arm"'),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_named_with_its_place(name: str, tmp_path: Path) -> None:
-    old, new, element, problem = FAULTS[name]
-    assert old in PENDULUM
-    path = tmp_path / "faulty.sdf"
-    path.write_text(PENDULUM.replace(old, new, 1))
-    with pytest.raises(srm.InputError, match=problem) as caught:
-        srm.load(path)
-    error = caught.value
-    assert error.file == str(path)
-    assert element in (error.element or "")
-    assert error.remedy
+def test_a_fault_is_named_with_its_place(tmp_path: Path) -> None:
+    path, messages = tmp_path / "faulty.sdf", {}
+    for name, (old, new) in FAULTS.items():
+        assert old in PENDULUM
+        path.write_text(PENDULUM.replace(old, new, 1))
+        messages[name] = refused(partial(srm.load, path), tmp_path)
+    check_messages("sdf", messages)
 
 
 def test_an_element_of_another_tool_is_refused_if_it_acts(tmp_path: Path) -> None:

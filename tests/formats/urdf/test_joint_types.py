@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from srm_mbs.integration.kernel import backend
 from tests.formats.test_loading import mass_matrix, placement
 from tests.integration.kernel.test_kernel import agree
 from tests.support.lockstep import compare
+from tests.support.snapshots import check_messages, refused
 
 PITCH = 0.3  # m per turn
 AXIS, AXIS2 = (2.0, 1.0, 2.0), (0.0, -3.0, 4.0)
@@ -222,45 +224,20 @@ def test_a_saved_run_on_these_joints_is_read_again(tmp_path: Path) -> None:
 
 
 FAULTS = {
-    "no second axis": ("cardan", '<axis xyz="1 0 0"/>', ("'cardan'", "needs <axis2>", "Add it")),
-    "axes in line": (
-        "cardan",
-        '<axis xyz="1 2 0"/><axis2 xyz="-2 -4 0"/>',
-        ("'cardan'", "parallel"),
-    ),
-    "a zero second axis": (
-        "cardan",
-        '<axis xyz="1 2 0"/><axis2 xyz="0 0 0"/>',
-        ("'cardan'", "axis is zero"),
-    ),
-    "a second axis of two numbers": (
-        "cardan",
-        '<axis2 xyz="0 1"/>',
-        ("'cardan'", "axis2", "3 finite numbers"),
-    ),
-    "no pitch": ("thread", '<axis xyz="1 0 0"/>', ("'thread'", "needs <thread_pitch>", "Add it")),
-    "a pitch of zero": (
-        "thread",
-        '<thread_pitch value="0"/>',
-        ("'thread'", "pitch is zero", "revolute"),
-    ),
-    "a pitch on a hinge": (
-        "hinge",
-        OWN["hinge"] + '<thread_pitch value="1"/>',
-        ("'hinge'", "no <thread_pitch>", "Remove it"),
-    ),
-    "negative friction": (
-        "swivel",
-        '<dynamics friction="-1"/>',
-        ("'swivel'", "negative"),
-    ),
+    "no second axis": ("cardan", '<axis xyz="1 0 0"/>'),
+    "axes in line": ("cardan", '<axis xyz="1 2 0"/><axis2 xyz="-2 -4 0"/>'),
+    "a zero second axis": ("cardan", '<axis xyz="1 2 0"/><axis2 xyz="0 0 0"/>'),
+    "a second axis of two numbers": ("cardan", '<axis2 xyz="0 1"/>'),
+    "no pitch": ("thread", '<axis xyz="1 0 0"/>'),
+    "a pitch of zero": ("thread", '<thread_pitch value="0"/>'),
+    "a pitch on a hinge": ("hinge", OWN["hinge"] + '<thread_pitch value="1"/>'),
+    "negative friction": ("swivel", '<dynamics friction="-1"/>'),
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_faulty_joint_of_these_types_is_named(fault: str, tmp_path: Path) -> None:
-    joint, own, needles = FAULTS[fault]
-    with pytest.raises(srm.InputError) as caught:
-        load(tmp_path, urdf(OWN | {joint: own}))
-    for needle in ("joints.urdf", *needles):
-        assert needle in str(caught.value)
+def test_a_faulty_joint_of_these_types_is_named(tmp_path: Path) -> None:
+    messages = {}
+    for fault, (joint, own) in FAULTS.items():
+        text = urdf(OWN | {joint: own})
+        messages[fault] = refused(partial(load, tmp_path, text), tmp_path)
+    check_messages("joint_types", messages)

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.control.prescribed_times import AHEAD, CLEARANCE, AvoidTimes
+from srm_mbs.integration.control.prescribed_times import (
+    CLEARANCE_AHEAD,
+    STAGE_CLEARANCE,
+    AvoidTimes,
+)
 from srm_mbs.integration.control.step_size import FixedStep
 from srm_mbs.integration.methods.base import IntegratorState
 from tests.support.bundled import load
@@ -46,7 +50,9 @@ def test_no_stage_comes_near_a_given_time(
         slider_crank, 10.0, tableau=tableau, rtol=rtol, placement=placement, singular_times=PASSAGES
     )
     assert solution.success
-    assert clearance(solution.steps.times, solution.scheme, PASSAGES) >= CLEARANCE * (1 - 1e-6)
+    assert clearance(solution.steps.times, solution.scheme, PASSAGES) >= STAGE_CLEARANCE * (
+        1 - 1e-6
+    )
     assert off_branch(solution) < 1e-9
     assert solution.stats.zone_steps == 0
 
@@ -75,7 +81,7 @@ def test_fixed_steps_are_split_at_given_times_and_return_to_the_grid(tableau: st
     on_it = np.isin(grid.round(9), [0.1, 0.35])  # these grid points are themselves to be avoided
     assert apart[~on_it].max() < 1e-12
     assert (apart[on_it] > 1e-4).all()
-    assert clearance(solution.t, solution.scheme, times) >= CLEARANCE * (1 - 1e-6)
+    assert clearance(solution.t, solution.scheme, times) >= STAGE_CLEARANCE * (1 - 1e-6)
     assert solution.stats.placements > 0
     assert solution.stats.replaced == 0
 
@@ -84,7 +90,7 @@ def test_times_on_an_open_chain_are_avoided_as_well() -> None:
     """A force that jumps at known times is no singular configuration, but wants the same."""
     times = np.array([0.3, 0.6])
     solution = srm.simulate(load("pendulum_chain"), 1.0, singular_times=times)
-    assert clearance(solution.t, solution.scheme, times) >= CLEARANCE * (1 - 1e-6)
+    assert clearance(solution.t, solution.scheme, times) >= STAGE_CLEARANCE * (1 - 1e-6)
 
 
 @pytest.mark.parametrize("tableau", ["trap", "tvd32", "erk4", "dopr54", "dop853"])
@@ -109,11 +115,11 @@ def test_any_times_are_avoided_with_few_steps(tableau: str) -> None:
             t.append(proposal.t_new)
             assert len(t) < 400
         nodes = np.array(t)
-        assert clearance(nodes, scheme, times) >= CLEARANCE * (1 - 1e-6)
+        assert clearance(nodes, scheme, times) >= STAGE_CLEARANCE * (1 - 1e-6)
         # where a step ends, the next one still has room to pass the time
         ahead = times[:, None] - nodes[1:]
         steps = np.broadcast_to(np.diff(nodes), ahead.shape)
-        assert (ahead[ahead > 0.0] >= AHEAD * steps[ahead > 0.0] * (1 - 1e-9)).all()
+        assert (ahead[ahead > 0.0] >= CLEARANCE_AHEAD * steps[ahead > 0.0] * (1 - 1e-9)).all()
 
 
 @pytest.mark.parametrize(

@@ -178,8 +178,8 @@ def test_a_mechanism_that_turns_in_many_short_steps_is_reported(
 ) -> None:
     """Stages evaluated where they are, and constraint errors that pile up uncounted: sweeps off
     the closures turn at the passage."""
-    monkeypatch.setattr("srm_mbs.integration.methods.near_singular.NEAR", 0.0)
-    monkeypatch.setattr("srm_mbs.integration.methods.thesis.sweep.NEAR", 0.0)
+    monkeypatch.setattr("srm_mbs.integration.methods.near_singular.NEAR_STEPS", 0.0)
+    monkeypatch.setattr("srm_mbs.integration.methods.thesis.sweep.NEAR_STEPS", 0.0)
     monkeypatch.setattr("srm_mbs.integration.methods.thesis.iterated_sweeps.SETTLING_RATIO", 0.0)
     monkeypatch.setattr(
         "srm_mbs.integration.methods.thesis.iterated_sweeps.may_be_taken_over", lambda *_: False

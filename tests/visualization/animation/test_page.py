@@ -601,9 +601,8 @@ def test_names_do_not_end_the_script_of_a_page() -> None:
 
 def test_what_the_page_is_made_of_is_package_data() -> None:
     folder = Path(srm.__file__).parent / "visualization/animation/web"
-    assert {"page.html.j2", "notebook.html.j2", "page.js"} <= {
-        file.name for file in folder.iterdir()
-    }
+    names = {file.name for file in folder.iterdir()}
+    assert {"page.html.j2", "notebook.html.j2", "page.js"} <= names
 
 
 @pytest.mark.browser

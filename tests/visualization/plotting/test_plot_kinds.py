@@ -79,9 +79,9 @@ def test_every_kind_of_every_bundled_mechanism_is_drawn_without_warnings(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # What is asked here depends neither on the number of panels nor on that of the points.
-    monkeypatch.setattr(sampling, "LEAST", 16)
-    monkeypatch.setattr(state, "MOST_ROWS", 2)
-    monkeypatch.setattr(phase, "MOST_PORTRAITS", 1)
+    monkeypatch.setattr(sampling, "MIN_PIECES", 16)
+    monkeypatch.setattr(state, "MAX_ROWS", 2)
+    monkeypatch.setattr(phase, "MAX_PORTRAITS", 1)
     solution = srm.simulate(load(name), 0.01)
     for kind in KINDS:
         if kind == "reactions" and not solution.mechanism.constrained:
@@ -359,8 +359,8 @@ def test_peaks_beside_singular_passages_are_cut_and_said(monkeypatch: pytest.Mon
     figure = srm.simulate(load("slider_crank"), 10.0).plot(kind="reactions")
     assert "cut" not in titles(figure)[0]
     monkeypatch.setattr(Solution, "reactions", property(lambda _: peaked))
-    monkeypatch.setattr(sampling, "SMOOTH", 1)
-    monkeypatch.setattr(sampling, "LEAST", 1)
+    monkeypatch.setattr(sampling, "PIECES_PER_STEP", 1)
+    monkeypatch.setattr(sampling, "MIN_PIECES", 1)
     figure = solution.plot(kind="reactions")
     force = np.linalg.norm(peaked["pin"][:, :3], axis=1)
     assert titles(figure)[0].endswith(f"peaks to {force.max():.2g} N are cut")
@@ -482,7 +482,7 @@ def test_paths_by_default_are_those_of_different_points_that_move(let_go: Soluti
     assert [text.get_text() for text in axes.texts] == ["1", "2"]  # for print in grey
     pendulum = srm.simulate(load("simple_pendulum"), 0.5)
     (axes,) = pendulum.plot(kind="path").axes
-    assert legend(axes)[0].replace("\n", " ") == "centre of mass behind pendulum"
+    assert legend(axes)[0].replace("\n", " ") == "centre of mass of the body at pendulum"
 
 
 def test_a_run_in_which_no_named_point_moves_has_no_picture_of_paths() -> None:

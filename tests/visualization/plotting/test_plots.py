@@ -134,7 +134,7 @@ def test_many_singular_passages_are_ticks_instead_of_full_lines(
 ) -> None:
     (lines,) = slider_crank.plot().axes[3].collections
     assert lines.get_segments()[0][1, 1] == 1.0
-    monkeypatch.setattr(panels, "FULL_LINES", 1)
+    monkeypatch.setattr(panels, "MAX_FULL_LINES", 1)
     (ticks,) = slider_crank.plot().axes[3].collections
     assert ticks.get_segments()[0][1, 1] < 0.1
 

@@ -50,13 +50,12 @@ from srm_mbs.integration.methods.base import ErrorNorm, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import (
-    AMBIGUOUS,
-    COUNT_UNCERTAINTY_ABOVE,
-    NEAR,
-    WATCHED,
+    AMBIGUOUS_DISTANCE,
+    NEAR_STEPS,
+    UNCERTAINTY_SIGMA_CHANGE,
+    WATCHED_SIGMA,
 )
 from srm_mbs.integration.methods.split_step import history_after, split_step
-from srm_mbs.integration.methods.thesis.messages import drift, restarts, takeovers
 from srm_mbs.integration.methods.thesis.regularisation import (
     Regularisation,
     parse_eps,
@@ -89,6 +88,8 @@ above the tolerance would stay there."""
 SETTLING_RATIO = 0.5
 """h/eps below which a constraint error is counted as it settles.  Above, schemes do not damp like
 exp(-h/eps), and what they leave would count however short the step."""
+REPORTED_DRIFT = 10.0
+"""Constraint error of the last sweep, over the tolerance, from which a message reports it."""
 _NO_RANK = int(np.iinfo(np.int64).max)
 """Rank of a first stage that was evaluated in the step before."""
 
@@ -104,7 +105,7 @@ def unresolved(stages: SweepStages) -> bool:
     """Whether a singular configuration is near that a step like that of ``stages`` cannot cross
     within the tolerance, because of rounding."""
     change = stages.sigma_change
-    if not (stages.memory.sigma < WATCHED and change > 0.0):
+    if not (stages.memory.sigma < WATCHED_SIGMA and change > 0.0):
         return False
     noise = stages.rounding(PLACED_STAGE_SIGMA * change, change, True)
     return stages.norm(noise, stages.weights) > 1.0
@@ -143,7 +144,7 @@ def split_takeover(
         memory = replace(memory, rate=terms.rate().copy(), sigma=terms.sigma)
     inner = replace(memory, history=history, sweeps=())
     result = split_step(system, scheme, t, h, state, inner, norm, 1.0)
-    near = float(result.sigmas[-1]) < WATCHED
+    near = float(result.sigmas[-1]) < WATCHED_SIGMA
     multiplier = node.multiplier if result.multiplier is None else result.multiplier
     kept: MultiplierHistory | None = history_after(history, result)
     rates = _with_extra_stages(system, scheme, state, result)
@@ -232,7 +233,7 @@ class IteratedSweeps:
         if self._exact and system.has_constraints:
             history = MultiplierHistory.begin(t, terms.multiplier())
         node = SweepNode(state, multiplier, None, 0.0, history)
-        if memory.sigma < WATCHED and may_be_taken_over(system, self.scheme, norm):
+        if memory.sigma < WATCHED_SIGMA and may_be_taken_over(system, self.scheme, norm):
             node = replace(node, history=first_history(terms, t, node), taken_over=True)
         memory.sweeps = (node,) * (self.iterations if self.own_history else 1)
         return memory
@@ -313,7 +314,7 @@ class IteratedSweeps:
         weights = norm.weights(np.maximum(memory.state_scale, state_scale))
         weights = stages.widened(weights, scheme, last.sigmas)
         error = h * np.abs(scheme.error @ last.rates[: s + 1])
-        if history is not None and stages.sigma_change > COUNT_UNCERTAINTY_ABOVE:
+        if history is not None and stages.sigma_change > UNCERTAINTY_SIGMA_CHANGE:
             for j in last.rank_deficient:
                 if j < s:
                     uncertainty = history.uncertainty(t + scheme.c[j] * h)
@@ -346,7 +347,7 @@ class IteratedSweeps:
         """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`.
 
         Multipliers of corrector sweeps follow from positions and velocities alone, (2.6), and do
-        not jump; own histories go on.
+        not jump; own histories continue.
         """
         fresh = self.start(system, t, state, norm)
         fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
@@ -479,7 +480,7 @@ class IteratedSweeps:
         if not (self.own_history and self.first is First.ZERO and system.carries_yhat):
             return memory, False
         off = max(node.closure_distance for node in memory.sweeps)
-        if not off > AMBIGUOUS * max(0.0, memory.sigma - NEAR * change):
+        if not off > AMBIGUOUS_DISTANCE * max(0.0, memory.sigma - NEAR_STEPS * change):
             return memory, False
         last = memory.sweeps[-1]
         node = replace(last, rate=None, first_multiplier=last.multiplier)
@@ -521,6 +522,42 @@ class IteratedSweeps:
             else f" with h/eps = {h / eps:.3g}; use a larger eps, fewer sweeps or a smaller step"
         )
         raise EvaluationError(f"the sweeps leave the constraints{reason}")
+
+
+def drift(steps: Sequence[SweepResult], norm: ErrorNorm) -> str:
+    """A sentence about a last sweep whose constraint error exceeds the tolerance."""
+    worst = max(steps, key=lambda step: step.drift_ratio, default=None)
+    if norm.negligible == 0.0 or worst is None or not worst.drift_ratio > REPORTED_DRIFT:
+        return ""
+    return (
+        f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times the "
+        f"tolerance (at t = {worst.t + worst.h:.6g} s), which no step-size control mends: sweeps "
+        "are accurate to a power of eps. Use restarted sweeps (restart=True, carry=True), a "
+        "smaller eps, or PSRM."
+    )
+
+
+def takeovers(steps: Sequence[SweepResult]) -> str:
+    """A sentence about the steps that the split form made (split takeover)."""
+    times = [step.t for step in steps if step.taken_over]
+    if not times:
+        return ""
+    return (
+        f" {len(times)} steps next to singular configurations, the first at t = {times[0]:.6g} s, "
+        "are of the split PSRM: rounding would have exceeded the tolerance in sweeps."
+    )
+
+
+def restarts(steps: Sequence[SweepResult]) -> str:
+    """A sentence about sweeps with own histories that were restarted."""
+    times = [step.t for step in steps if step.restarted]
+    if not times:
+        return ""
+    return (
+        f" The sweeps gave up their own histories in {len(times)} steps, first at "
+        f"t = {times[0]:.6g} s: sigma was falling, they were too far off the constraints to tell "
+        "the branch if a singular configuration came, and started again from the accepted state."
+    )
 
 
 def psrm_sweeps(

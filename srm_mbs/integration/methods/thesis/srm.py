@@ -70,10 +70,10 @@ class SRM:
         Explicit schemes need h/eps below their real stability limit.
     restart
         False: every sweep keeps its own trajectory for the whole run, as in the thesis; but next
-        to singular configurations, where the first sweeps are too far off the closures to tell the
-        branch, all start again from the accepted state, y_0 being its multiplier.  True:
-        every step starts all sweeps from the accepted state of the last one.  With step-size
-        control use True.
+        to singular configurations, where the first sweeps are too far off the closures to determine
+        the branch, all start again from the accepted state, y_0 being its multiplier.  True: every
+        step starts all sweeps from the accepted state of the last one.  With step-size control use
+        True.
     carry
         With ``restart``: yhat_0 of a step is the last sweep's multiplier at its start instead of
         0, which would put an initial layer into every step.  Needs m <= 3: more sweeps amplify

@@ -19,7 +19,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
-from srm_mbs.integration.methods.near_singular import NEAR, WATCHED, BranchStages
+from srm_mbs.integration.methods.near_singular import NEAR_STEPS, WATCHED_SIGMA, BranchStages
 
 Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
 """(terms, node) -> tangent rate and multiplier there; the equation that a sweep integrates."""
@@ -171,7 +171,7 @@ class SweepStages(BranchStages):
         multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
         """
         spans = max(1.0, self.memory_span / self.h)
-        return NEAR * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED
+        return NEAR_STEPS * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED_SIGMA
 
     def rotation_drift(self, off: FloatArray, sigma: float) -> FloatArray:
         """Largest change (n,) over the step of the distance ``off`` (n,) of a sweep from the

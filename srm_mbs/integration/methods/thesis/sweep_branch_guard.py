@@ -20,7 +20,7 @@ from srm_mbs.integration.control.branch_guard import (
 )
 from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
 from srm_mbs.integration.methods.base import Method, StepResult
-from srm_mbs.integration.methods.near_singular import AMBIGUOUS
+from srm_mbs.integration.methods.near_singular import AMBIGUOUS_DISTANCE
 from srm_mbs.integration.methods.thesis.sweep import SweepResult
 
 DEPARTED = 10.0
@@ -57,7 +57,7 @@ class AmbiguousPassages:
         if passage is None and distance == 0.0:
             return
         lowest = float(result.sigmas.min())
-        ambiguous = distance > AMBIGUOUS * lowest
+        ambiguous = distance > AMBIGUOUS_DISTANCE * lowest
         if passage is None:
             if ambiguous:
                 rate = result.rates[0].copy()

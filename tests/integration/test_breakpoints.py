@@ -161,7 +161,7 @@ def test_every_attempt_between_breakpoints_is_repeated(
         breakpoints=times,
     )
     assert found.entered == len(times)
-    assert found.verdicts == []
+    assert found.decisions == []
     assert found.h < 1e-13
     assert found.state < 1e-13
     assert found.near < 2e-12

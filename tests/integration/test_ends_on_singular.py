@@ -122,7 +122,7 @@ def test_the_kernel_prepares_for_such_an_end_as_the_reference_does(
 ) -> None:
     comparison = compare(load(name), first_passage(name) + beside, rtol=1e-8)
     assert comparison.arrivals == 1
-    assert not comparison.verdicts
+    assert not comparison.decisions
     assert comparison.h < 1e-9
     assert comparison.near < 1e-10
 

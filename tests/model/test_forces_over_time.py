@@ -95,7 +95,7 @@ def test_both_backends_make_the_same_steps_with_forces_over_time() -> None:
         srm.LimitSpring("y", 50.0, 2.0, lower=-0.05, upper=0.05),
     )
     comparison = compare(replace(bead(), forces=forces), 1.5, rtol=1e-8)
-    assert comparison.verdicts == []
+    assert comparison.decisions == []
     assert max(comparison.h, comparison.state) < 1e-12
 
 

@@ -1,7 +1,7 @@
-"""Both backends side by side: every attempt of the reference is repeated by the kernel.
+"""Both backends side by side: the kernel repeats every attempt of the reference.
 
-The kernel starts each attempt from where the reference stands, so that rounding cannot add up:
-what is compared is one proposal, one step and one verdict at a time.
+The kernel starts each attempt from the state of the reference, so that rounding does not add up:
+one proposal, one step and one decision are compared at a time.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class Comparison:
         Largest condition number of M.
     near
         States of steps next to singular configurations, where rounding is magnified.
-    verdicts
-        (t, reference, kernel) where the two decided differently.
+    decisions
+        (t, decision of the reference, decision of the kernel) where these differ.
     attempts, zones, replaced
         How many attempts there were, how many used the zone, how many were redone.
     entered
@@ -99,7 +99,7 @@ class Comparison:
     sigma: float = 0.0
     correction: float = 0.0
     error: float = 0.0
-    verdicts: list[tuple[float, Any, Any]] = field(default_factory=list)
+    decisions: list[tuple[float, Any, Any]] = field(default_factory=list)
     attempts: int = 0
     zones: int = 0
     replaced: int = 0
@@ -169,7 +169,7 @@ def compare(
             out.rates = max(out.rates, float(np.max(np.abs(change) / (np.abs(memory.rate) + one))))
         limit = min(max_step, system.step_limit(x))
         # Before the reference proposes: its proposal writes the slope into the memory.
-        stop, twin_verdict = run.attempt_from(t, x, memory, control_state(control))
+        stop, compiled_decision = run.attempt_from(t, x, memory, control_state(control))
         proposal = control.propose(t, limit, memory)
         assert proposal.singular_arrival == (stop == ARRIVAL)
         if proposal.singular_arrival:
@@ -180,16 +180,16 @@ def compare(
             result = method.step(system, t, proposal.h, x, memory, norm)
         except EvaluationError:
             result = None
-        verdict = control.decide(proposal, result)
+        decision = control.decide(proposal, result)
         out.attempts += 1
         out.h = max(out.h, abs(run.h - proposal.h) / proposal.h)
-        if verdict is not twin_verdict:
-            out.verdicts.append((t, verdict, twin_verdict))
+        if decision is not compiled_decision:
+            out.decisions.append((t, decision, compiled_decision))
         if result is not None:
-            twin_result = run.last()
+            compiled_result = run.last()
             size = np.maximum(one, memory.state_scale)
             rates = np.abs(result.rates).max(axis=0)
-            change = system.difference(result.state, twin_result.state)
+            change = system.difference(result.state, compiled_result.state)
             # Next to a singular configuration the algebra magnifies rounding by 1 / sigma^2.
             lowest = min(1.0, float(result.sigmas.min()))
             scale = np.maximum(size, proposal.h * rates) / lowest**2
@@ -205,27 +205,27 @@ def compare(
                 out.near = max(out.near, moved)
             out.rates = max(
                 out.rates,
-                float(np.max(np.abs(twin_result.rates - result.rates).max(0) / (rates + one)))
+                float(np.max(np.abs(compiled_result.rates - result.rates).max(0) / (rates + one)))
                 * lowest**2,
             )
             if np.isfinite(result.sigmas).all():
-                change = np.abs(twin_result.sigmas - result.sigmas)
+                change = np.abs(compiled_result.sigmas - result.sigmas)
                 out.sigma = max(out.sigma, float(change.max()) * lowest)
             if result.correction.size:
-                change = np.abs(twin_result.correction - result.correction)
+                change = np.abs(compiled_result.correction - result.correction)
                 out.correction = max(out.correction, float(np.max(change / scale)))
             # An error estimate is a difference of rates: its rounding is theirs.
             rounding = norm(proposal.h * rates, norm.weights(memory.state_scale))
-            change = abs(twin_result.error_ratio - result.error_ratio)
+            change = abs(compiled_result.error_ratio - result.error_ratio)
             bound = (rounding + result.error_ratio) / lowest**2
             out.error = max(out.error, float(change / bound))
             out.zones += result.zone is not None
-            assert (result.zone is None) == (twin_result.zone is None)
-            assert result.rank == twin_result.rank
-            assert result.held == twin_result.held
-            assert result.quiet == twin_result.quiet
-        out.replaced += verdict is StepDecision.REPLACED
-        if verdict is StepDecision.ACCEPTED and result is not None:
+            assert (result.zone is None) == (compiled_result.zone is None)
+            assert result.rank == compiled_result.rank
+            assert result.held == compiled_result.held
+            assert result.quiet == compiled_result.quiet
+        out.replaced += decision is StepDecision.REPLACED
+        if decision is StepDecision.ACCEPTED and result is not None:
             method.accept(memory, result)
             t, x = proposal.t_new, result.state
     return out

@@ -1,4 +1,4 @@
-"""Dense output on the compiled kernel, of the runs that it made."""
+"""Dense output of the runs of the compiled kernel, evaluated by it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 def dense_output(
     system: ClosedSystem | OpenSystem, scheme: ButcherTableau, steps: StepData, made_by: str
 ) -> DenseOutput:
-    """Dense output of a run, on the kernel where that made the run and is at hand.
+    """Dense output of a run, on the kernel if it made the run and is available.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def dense_output(
 
 
 class CompiledDenseOutput(DenseOutput):
-    """Dense output on the kernel, of the runs that it made.
+    """Dense output of a run of the kernel, evaluated by it.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class CompiledDenseOutput(DenseOutput):
         self._compiled: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Where it is copied to there may be no kernel.
+        # A copy may be loaded where there is no kernel.
         return dense_output, (self._mechanism_system, self._scheme, self._steps, "kernel")
 
     def __call__(self, t: FloatArray) -> FloatArray:
@@ -79,7 +79,7 @@ class CompiledDenseOutput(DenseOutput):
             with workspace(self._mechanism_system) as kernel_system:
                 return self._states(kernel_system, t)
         except ArithmeticError:
-            return super().__call__(t)  # which says why
+            return super().__call__(t)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
@@ -95,8 +95,10 @@ class CompiledDenseOutput(DenseOutput):
 
     @cached_property
     def _lone_zones(self) -> bool:
-        """Whether a step with a zone has a breakpoint on both sides: the kernel's extra stages have
-        no zone."""
+        """Whether a step with a zone has a breakpoint at both ends.
+
+        The state within it then follows from extra stages, which have no zone in the kernel.
+        """
         pieces = (self._steps.smooth_interval(step) for step in self._steps.zones)
         return any(last - first < 2 for first, last in pieces)
 

@@ -16,14 +16,14 @@ import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError
 from srm_mbs.integration.kernel import backend as kernel
-from srm_mbs.integration.kernel import system as twins
+from srm_mbs.integration.kernel import system as kernel_systems
 from tests.support.mechanisms import along_x, rod
 
 pytestmark = pytest.mark.skipif(kernel.core is None, reason="needs the compiled kernel")
 
 
 def idle(mechanism: srm.Mechanism) -> list[Any]:
-    return list(twins.idle_workspaces(mechanism))
+    return list(kernel_systems.idle_workspaces(mechanism))
 
 
 def run(mechanism: srm.Mechanism, **options: Any) -> srm.Solution:
@@ -69,15 +69,18 @@ def test_runs_at_the_same_time_do_not_share() -> None:
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(lambda _: run(mechanism), range(40)):
             assert np.array_equal(found.steps.states, expected.steps.states)
-    assert 1 <= len(idle(mechanism)) <= twins.KEPT
+    assert 1 <= len(idle(mechanism)) <= kernel_systems.KEPT
 
 
 def test_no_more_than_a_few_are_kept() -> None:
     system = make_system(fresh())
     with ExitStack() as stack:
-        borrowed = [stack.enter_context(twins.workspace(system)) for _ in range(2 * twins.KEPT)]
-        assert len(set(map(id, borrowed))) == 2 * twins.KEPT
-    assert len(idle(system.mechanism)) == twins.KEPT
+        borrowed = [
+            stack.enter_context(kernel_systems.workspace(system))
+            for _ in range(2 * kernel_systems.KEPT)
+        ]
+        assert len(set(map(id, borrowed))) == 2 * kernel_systems.KEPT
+    assert len(idle(system.mechanism)) == kernel_systems.KEPT
 
 
 def test_pickles_and_copies_carry_none() -> None:
@@ -90,7 +93,7 @@ def test_pickles_and_copies_carry_none() -> None:
 
 def test_large_mechanisms_keep_none() -> None:
     model = pin.Model()
-    for i in range(twins.LARGEST_KEPT + 1):
+    for i in range(kernel_systems.LARGEST_KEPT + 1):
         model.addJoint(i, pin.JointModelRY(), along_x(0.1), f"j{i}")
         model.appendBodyToJoint(i + 1, rod(), pin.SE3.Identity())
     mechanism = srm.Mechanism(model)
@@ -111,7 +114,7 @@ def test_workspaces_in_which_functions_of_the_user_or_drives_act_are_not_kept() 
     drive = srm.Drive(srm.Sine(0.1, omega=3.0), mechanism.joint_names[0])
     driven = srm.Mechanism(mechanism.model, drives=(drive,))
     assert driven.drives
-    assert not twins.shared(make_system(driven))
+    assert not kernel_systems.shared(make_system(driven))
 
 
 def test_a_run_that_raises_does_not_spoil_the_next() -> None:
@@ -131,13 +134,13 @@ def test_a_run_that_raises_does_not_spoil_the_next() -> None:
 def test_forces_held_in_one_run_do_not_act_in_the_next() -> None:
     mechanism = fresh()
     system = make_system(mechanism)
-    with twins.workspace(system) as kernel_system:
+    with kernel_systems.workspace(system) as kernel_system:
         state = np.concatenate([mechanism.q0, mechanism.v0])
         free = kernel_system.terms(0.0, state)["rate"]
         kernel_system.hold(0.0, np.full(7, 1.0), True)
         kernel_system.between(5.0, 6.0)
         assert not np.array_equal(kernel_system.terms(0.0, state)["rate"], free)
-    with twins.workspace(system) as again:
+    with kernel_systems.workspace(system) as again:
         assert again is kernel_system
         assert again.evaluations == 0
         assert np.array_equal(again.terms(0.0, state)["rate"], free)

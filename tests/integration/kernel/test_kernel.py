@@ -1,4 +1,4 @@
-"""The compiled kernel is the twin of the Python reference: attempt by attempt, and whole runs."""
+"""The compiled kernel agrees with the Python reference: attempt by attempt, and whole runs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def agree(found: Comparison, thin: bool = False) -> None:
     """
     assert found.attempts >= 10
     assert found.h < 1e-13
-    assert found.verdicts == []
+    assert found.decisions == []
     assert found.energy < 2e-14
     assert found.state < (np.finfo(float).eps * found.condition if thin else 1e-13)
     assert found.near < 2e-12

@@ -67,7 +67,7 @@ def islands(lengths: tuple[float, ...]) -> srm.Mechanism:
     return mechanism.with_state(start.q, start.v)
 
 
-def twins(mechanism: srm.Mechanism) -> tuple[ClosedSystem, Any, Any]:
+def dense_and_sparse(mechanism: srm.Mechanism) -> tuple[ClosedSystem, Any, Any]:
     """The reference, and the kernel with the dense and with the sparse algebra."""
     system = ClosedSystem(mechanism)
     dense, sparse = (
@@ -143,7 +143,7 @@ def reference_terms(system: ClosedSystem, x: np.ndarray) -> dict[str, Any]:
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_its_terms_are_those_of_the_dense_algebra_and_of_the_reference(name: str) -> None:
     mechanism = MECHANISMS[name]()
-    system, dense, sparse = twins(mechanism)
+    system, dense, sparse = dense_and_sparse(mechanism)
     for x in states(mechanism, 25):
         found = sparse.terms(0.0, x)
         alike(found, dense.terms(0.0, x))
@@ -153,7 +153,7 @@ def test_its_terms_are_those_of_the_dense_algebra_and_of_the_reference(name: str
 @pytest.mark.parametrize("n", [3, 10, 40, 100])
 def test_its_terms_are_the_dense_ones_up_to_the_singularity_of_a_chain(n: int) -> None:
     mechanism = srm.n_four_bar(n)
-    system, dense, sparse = twins(mechanism)
+    system, dense, sparse = dense_and_sparse(mechanism)
     for angle in (1.5, 0.8, 0.3, 1e-2, 1e-4, 1e-6):
         x = flat(mechanism, angle)
         found = sparse.terms(0.0, x)
@@ -165,7 +165,7 @@ def test_its_terms_are_the_dense_ones_up_to_the_singularity_of_a_chain(n: int) -
 def test_it_drops_the_pivots_that_the_dense_algebra_drops(n: int) -> None:
     """In the zone, on the singularity itself, and with some of the loops singular only."""
     mechanism = srm.n_four_bar(n)
-    system, dense, sparse = twins(mechanism)
+    system, dense, sparse = dense_and_sparse(mechanism)
     ranks = set()
     zeros = np.zeros(system.nv)
     for angle in (1e-2, 1e-5, 0.0):
@@ -220,20 +220,20 @@ def test_steps_through_the_zone_of_a_chain_are_repeated_with_it(n: int, t_end: f
     crossing = srm.simulate(mechanism, t_end, rtol=1e-10, backend=backend).crossings[0].time
     found = compare(mechanism, t_end, rtol=1e-6, step=crossing / 64.0, placement="off")
     assert found.zones > 0
-    assert found.verdicts == []
+    assert found.decisions == []
     assert found.near < 2e-12
 
 
 @pytest.mark.usefixtures("forced")
 def test_a_start_on_a_singular_configuration_is_repeated_with_it() -> None:
     found = compare(floating_slider_crank(), 0.5, rtol=1e-7)
-    assert found.verdicts == []
+    assert found.decisions == []
     assert found.near < 2e-12
 
 
 def test_islands_do_not_change_each_other_by_a_bit() -> None:
     mechanism = islands((1.0, 1.3, 1.1))
-    _, _, sparse = twins(mechanism)
+    _, _, sparse = dense_and_sparse(mechanism)
     rng = np.random.default_rng(3)
     x = states(mechanism, 3)[2]
     alone = sparse.terms(0.0, x)
@@ -248,10 +248,10 @@ def test_islands_do_not_change_each_other_by_a_bit() -> None:
 def test_each_island_moves_as_it_does_alone() -> None:
     lengths = (1.0, 1.3)
     mechanism = islands(lengths)
-    _, _, sparse = twins(mechanism)
+    _, _, sparse = dense_and_sparse(mechanism)
     together = sparse.terms(0.0, np.r_[mechanism.q0, np.ones(6)])
     for k, length in enumerate(lengths):
-        _, dense, _ = twins(islands((length,)))
+        _, dense, _ = dense_and_sparse(islands((length,)))
         rate = dense.terms(0.0, np.r_[mechanism.q0[3 * k : 3 * k + 3], np.ones(3)])["rate"][3:]
         assert np.abs(together["rate"][6 + 3 * k : 9 + 3 * k] - rate).max() < 1e-11
 
@@ -259,7 +259,7 @@ def test_each_island_moves_as_it_does_alone() -> None:
 @pytest.mark.parametrize("n", [10, 40])
 def test_an_evaluation_leaves_nothing_behind_for_the_next(n: int) -> None:
     mechanism = srm.n_four_bar(n)
-    _, _, sparse = twins(mechanism)
+    _, _, sparse = dense_and_sparse(mechanism)
     x = flat(mechanism, 0.7)
     first = sparse.terms(0.0, x)
     for other in (*states(mechanism, 5), flat(mechanism, 0.0)):
@@ -310,7 +310,7 @@ def test_sigma_falls_with_the_distance_to_the_singularity_of_a_long_chain(n: int
 
 def test_forty_loops_take_the_steps_of_the_reference() -> None:
     found = compare(srm.n_four_bar(40), 0.8, rtol=1e-6)
-    assert found.verdicts == []
+    assert found.decisions == []
     assert found.near < 2e-12
 
 

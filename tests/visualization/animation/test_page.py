@@ -327,7 +327,7 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
     with opened(browser, (tmp_path / "page.html").as_uri()) as page:
         for t in (0.0, 0.515625, 1.0):
             springs, ends = (
-                [s for s, _ in overlays.springs_of(solution)],
+                [s for s, _ in overlays.active_springs(solution)],
                 ends_in(page, "spring_", t),
             )
             assert len(ends) == len(springs) == 6

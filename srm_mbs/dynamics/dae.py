@@ -25,10 +25,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr
+from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_columns, whiten
 from srm_mbs.dynamics.system import Terms, Zone
 from srm_mbs.errors import CallbackError, EvaluationError, InputError
 from srm_mbs.model.dae import SemiExplicitDAE
@@ -85,8 +84,8 @@ class ObliqueProjection:
         ny = self.size
         if not (np.isfinite(G).all() and np.isfinite(B).all()):
             raise EvaluationError("G or B is not finite")
-        packed, order, tau, g_pivots = pivoted_qr(np.asfortranarray((G / self.rows[:, None]).T))
-        packed_b, _, tau_b, b_pivots = pivoted_qr(np.asfortranarray(B / self.columns))
+        packed, order, tau, g_pivots = pivoted_qr((G / self.rows[:, None]).T)
+        packed_b, _, tau_b, b_pivots = pivoted_qr(B / self.columns)
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold)
         rank = ny
         while rank and not (
@@ -97,8 +96,8 @@ class ObliqueProjection:
         self.rank, self.rank_deficient = rank, rank < ny
         self.order = order[:rank]
         self.R = packed[:rank, :rank]
-        self.Q_G = lapack.dorgqr(packed[:, :rank], tau[:rank])[0] if rank else packed[:, :0]
-        self.Q_B = lapack.dorgqr(packed_b[:, :rank], tau_b[:rank])[0] if rank else packed_b[:, :0]
+        self.Q_G = q_columns(packed, tau, rank)
+        self.Q_B = q_columns(packed_b, tau_b, rank)
         left, cosines, right = np.linalg.svd(self.Q_G.T @ self.Q_B)
         cosine = float(cosines[-1]) if rank else 1.0
         if cosine < PIVOT_ZERO:
@@ -114,8 +113,7 @@ class ObliqueProjection:
         if self.rank == 0:
             return np.zeros(self.Q_B.shape[0])
         scaled = (residual / self.rows)[self.order]
-        z = lapack.dtrtrs(self.R, scaled, lower=0, trans=1)[0]
-        lifted: FloatArray = self.Q_B @ (self.inverse @ z)
+        lifted: FloatArray = self.Q_B @ (self.inverse @ whiten(self.R, scaled))
         return lifted
 
     def project(self, w: FloatArray) -> FloatArray:

@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.linalg import blas
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
-from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection, unwhiten
+from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import (
     GRAPH_ORDER_ABOVE,
@@ -39,8 +38,6 @@ from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.dynamics.system import SingularityAnalysis, Terms, Zone
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.mechanism import per_model, per_start
-
-_largest = blas.idamax
 
 
 class OpenTerms:
@@ -124,12 +121,7 @@ class ClosedTerms:
 
     def rate(self) -> FloatArray:
         p = self._p
-        nv = self.v.size
-        white = p.white_multiplier if self.predicted is None else self._white_multiplier()
-        out = np.empty(2 * nv)
-        out[:nv] = self.v
-        out[nv:] = unwhiten(p.U, p.white_force - white)
-        return out
+        return np.concatenate([self.v, p.unwhiten(p.white_force - self._white_multiplier())])
 
     def multiplier(self) -> FloatArray:
         return self._p.unwhiten(self._white_multiplier())
@@ -149,27 +141,19 @@ class ClosedTerms:
         )
 
     def constraint_residual(self) -> float:
-        residuals = self._loops.g * self._residual_scale
-        return abs(float(residuals.item(_largest(residuals))))
+        return float(np.abs(self._loops.g * self._residual_scale).max())
 
     def correction(self) -> FloatArray:
         p = self._p
-        nv = self.v.size
-        right = np.empty((nv, 2), order="F")
-        right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = self._white_rates(self.v)
-        return p.unwhiten(right).ravel(order="F")
+        position = p.normal(self._loops.g[p.order])
+        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self.v))])
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         p = self._p
-        nv = self.v.size
-        right = np.empty((nv, 3), order="F")
-        right[:, 0] = p.normal(self._loops.g[p.order])
-        right[:, 1] = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
-        right[:, 2] = p.white_force - right[:, 1]
-        back = p.unwhiten(right)
-        rate = np.concatenate([self.v - back[:, 0] / eps, back[:, 2]])
-        return rate, back[:, 1]
+        position = p.unwhiten(p.normal(self._loops.g[p.order]))
+        white = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
+        rate = np.concatenate([self.v - position / eps, p.unwhiten(p.white_force - white)])
+        return rate, p.unwhiten(white)
 
 
 _NO_ROWS = np.zeros(0)
@@ -315,9 +299,8 @@ class Mechanics(Manifold):
 
 
 _WORLD = pin.Convention.WORLD
-_sum_of_sizes = blas.dasum
 _OVERFLOW = 1e100
-"""Sum of |x_i| of a state above which products of its rates may overflow."""
+"""Largest |x_i| of a state above which products of its rates may overflow."""
 
 
 class OpenSystem(Mechanics):
@@ -483,7 +466,7 @@ class ClosedSystem(Mechanics):
         """
         self.evaluations += 1
         # First, because LAPACK may factorise numbers that are not finite without reporting it.
-        if not _sum_of_sizes(state) < _OVERFLOW:
+        if not np.abs(state).max() < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
         t = min(max(t, self._first), self._last)
         model, data, nq = self.model, self.data, self.nq

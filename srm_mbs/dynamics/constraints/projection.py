@@ -6,9 +6,12 @@ With M = L L^T and W = L^{-1} G^T a column-pivoted QR, W Pi = Q R, gives (docs/n
     yhat = E gamma,                      gamma = W^T (L^{-1} f) + Gdot v.
 
 Householder reflections (LAPACK geqp3) keep Q orthogonal to round-off, so that no
-reorthogonalisation is needed.  Truncating or damping small pivots would delete the weak
-direction next to a singular configuration; pivots are dropped for redundancy only, or in the
-zone, where a prediction takes their place.
+reorthogonalisation is needed.  Truncating or damping small pivots would delete the weak direction
+next to a singular configuration; pivots are dropped for redundancy only, or in the zone, where a
+prediction takes their place.
+
+LAPACK is called directly: the checks of ``scipy.linalg.qr`` and ``solve_triangular`` take 10 to
+30 us each, as long as a whole stage of a small mechanism.
 
 The next pivot is the column of the largest remaining norm.  With many loops the search follows
 their graph instead (:func:`swept_qr`): the fill-in of a pivot then stays next to it, so that the
@@ -19,20 +22,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from scipy.linalg import blas, lapack
+from scipy.linalg import lapack
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import EvaluationError
-
-# With positional arguments, because a keyword costs as much as the algebra of a small stage:
-# dtrtrs(triangle, right, lower, trans, unitdiag, lda, overwrite), dgeqp3(W, lwork, overwrite),
-# dgemv(alpha, a, x, beta, y, offset and increment of x and y, trans).
-_dgemv = blas.dgemv
-_dpotrf, _dtrtrs = lapack.dpotrf, lapack.dtrtrs
-_dgeqp3, _dorgqr = lapack.dgeqp3, lapack.dorgqr
 
 PIVOT_ZERO = 1e-13
 """Pivots (of scaled rows) below this are zero."""
@@ -46,7 +41,7 @@ def cholesky(M: FloatArray) -> FloatArray:
     EvaluationError
         If M is not positive definite or not finite.
     """
-    U, info = _dpotrf(M)  # lower=0
+    U, info = lapack.dpotrf(M)
     if info != 0:
         raise EvaluationError(
             "the mass matrix is not positive definite or not finite "
@@ -56,19 +51,29 @@ def cholesky(M: FloatArray) -> FloatArray:
 
 
 def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
-    """L^-1 right = U^-T right."""
-    return _dtrtrs(U, right, 0, 1)[0]  # type: ignore[no-any-return]
+    """L^-1 right = U^-T right, for ``right`` (n,) or (n, k)."""
+    return lapack.dtrtrs(U, right, trans=1)[0]  # type: ignore[no-any-return]
 
 
 def unwhiten(U: FloatArray, right: FloatArray) -> FloatArray:
-    """L^-T right = U^-1 right."""
-    return _dtrtrs(U, right)[0]  # type: ignore[no-any-return]
+    """L^-T right = U^-1 right, for ``right`` (n,) or (n, k)."""
+    return lapack.dtrtrs(U, right)[0]  # type: ignore[no-any-return]
 
 
-def pivoted_qr(W: FloatArray) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
-    """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (k,)."""
-    packed, permutation, tau, _, _ = _dgeqp3(W)
-    return packed, permutation - 1, tau, np.abs(packed.diagonal())
+def pivoted_qr(W: FloatArray) -> tuple[FloatArray, IndexArray, FloatArray, FloatArray]:
+    """Column-pivoted QR of W (nv, m): packed factor, permutation (m,), tau, |R_kk| (k,).
+
+    The packed factor has R above and on its diagonal, the reflections of Q below it.
+    """
+    packed, permutation, tau, _, _ = lapack.dgeqp3(W)
+    return packed, permutation - 1, tau, np.abs(packed.diagonal())  # LAPACK counts from 1
+
+
+def q_columns(packed: FloatArray, tau: FloatArray, rank: int) -> FloatArray:
+    """The first ``rank`` columns of Q (nv, rank) from :func:`pivoted_qr`."""
+    if rank == 0:
+        return packed[:, :0]
+    return lapack.dorgqr(packed[:, :rank], tau[:rank])[0]  # type: ignore[no-any-return]
 
 
 PIVOT_SHARE = 0.01
@@ -86,7 +91,7 @@ ABOVE = 1.0 + 1e-12
 
 def swept_qr(
     W: FloatArray, order: Sequence[int], rank: int, floor: float
-) -> tuple[FloatArray, Any, FloatArray, FloatArray]:
+) -> tuple[FloatArray, IndexArray, FloatArray, FloatArray]:
     """As :func:`pivoted_qr`, with pivots along ``order`` (m,).
 
     The next pivot is the largest in a window that moves along the order, so that neighbouring
@@ -188,22 +193,6 @@ class Projection:
         self.rank = rank
         self.rank_deficient = False
         self.held: FloatArray | None = None
-        self._allocate(0, 0)
-
-    def _allocate(self, m: int, nv: int) -> None:
-        """Workspace of :meth:`factor` for m rows: (G, f) and gamma."""
-        self._right = np.empty((m + 1, nv))
-        self._rows, self._force = self._right[:m], self._right[m]
-        self._white = self._right.T
-        self._W = self._white[:, :m]
-        self._permuted = np.zeros(m + 1)
-        self._gamma = self._permuted[1:]
-
-    @property
-    def order(self) -> IndexArray:
-        """The rows in use (rank,), in the order of their pivots."""
-        order: IndexArray = self._permutation - 1
-        return order
 
     def factor(
         self,
@@ -219,44 +208,30 @@ class Projection:
         structural pivots.
         """
         self.factorisations += 1
-        m, nv = G.shape
-        if self._right.shape != (m + 1, nv):
-            self._allocate(m, nv)
-        U = self.U = cholesky(M)
-        self._rows[:] = G
-        self._force[:] = f
-        # Both overwrite their argument: from here on _force is L^-1 f, and _W first W, then its QR.
-        _dtrtrs(U, self._white, 0, 1, 0, nv, 1)
-        force = self.white_force = self._force
-        self._gamma[:] = _dgemv(1.0, self._W, force, 1.0, bias, 0, 1, 0, 1, 1)  # W^T force + bias
+        self.U = cholesky(M)
+        W = whiten(self.U, G.T)
         structural = self.structural_rank
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
         if self._graph_order:
-            packed, permutation, tau, pivots = swept_qr(
-                self._W, self._graph_order, structural, floor
-            )
-            permutation = permutation + 1
-            self._pivots = pivots
-            pivot = float(pivots[:structural].min())
+            packed, permutation, tau, pivots = swept_qr(W, self._graph_order, structural, floor)
         else:
-            packed, permutation, tau, _, _ = _dgeqp3(self._W, 3 * m + 3, 1)
-            pivot = abs(packed.item(structural - 1, structural - 1))
-        self.sigma = pivot / self.sigma_ref
+            packed, permutation, tau, pivots = pivoted_qr(W)
+        self._pivots = pivots[:structural]
+        self.sigma = float(self._pivots.min()) / self.sigma_ref
         if not self.sigma >= 0.0:
             raise EvaluationError("the mass matrix or the closures are not finite")
         rank = structural
-        while rank > 0 and not abs(packed.item(rank - 1, rank - 1)) >= floor:
+        while rank > 0 and pivots[rank - 1] < floor:
             rank -= 1
         self.rank = rank
         self.rank_deficient = rank < structural
-        if rank < m:
-            packed, permutation, tau = packed[:, :rank], permutation[:rank], tau[:rank]
-        self._permutation = permutation
-        self.R = packed
-        self.Q: FloatArray = _dorgqr(packed, tau)[0] if rank else packed
+        self.order: IndexArray = permutation[:rank]
+        self.R = packed[:rank, :rank]
+        self.Q = q_columns(packed, tau, rank)
         self.held = None
-        # LAPACK counts rows from 1, and so does _permuted.
-        self.white_multiplier = self.normal(self._permuted.take(permutation))
+        self.white_force = whiten(self.U, f)
+        gamma = W.T.dot(self.white_force) + bias
+        self.white_multiplier = self.normal(gamma[self.order])
 
     def hold(self, normals: FloatArray) -> None:
         """Keep the motion tangential to the last of ``normals`` (nv, k), which replace the dropped
@@ -275,14 +250,13 @@ class Projection:
         if not self._graph_order:
             return self.unwhiten(self.Q)
         falling = np.argsort(-self._pivots[: self.rank], kind="stable")
-        return self.unwhiten(np.asfortranarray(self.Q[:, falling]))
+        return self.unwhiten(self.Q[:, falling])
 
     def normal(self, right: FloatArray) -> FloatArray:
         """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
         if self.rank == 0:
             return np.zeros(self.U.shape[0])
-        out: FloatArray = self.Q.dot(_dtrtrs(self.R, right, 0, 1)[0])
-        return out
+        return self.Q.dot(whiten(self.R, right))  # type: ignore[no-any-return]
 
     def unwhiten(self, right: FloatArray) -> FloatArray:
         """L^-T right."""
@@ -291,7 +265,7 @@ class Projection:
     def white_project(self, w: FloatArray) -> FloatArray:
         """Q Q^T L^T w (nv,), held normals included."""
         white = self.U.dot(w)
-        out: FloatArray = self.Q.dot(white.dot(self.Q))
+        out: FloatArray = self.Q.dot(self.Q.T.dot(white))
         return out if self.held is None else out + self.held @ (self.held.T @ white)
 
     def project(self, w: FloatArray) -> FloatArray:

@@ -78,7 +78,7 @@ def _multipliers(
         pin.crba(model, data, q[i], pin.Convention.WORLD)
         rows.update(data, q[i], with_bias=False)
         U = cholesky(data.M)
-        W = whiten(U, np.asfortranarray((rows.G / scale[:, None]).T))
+        W = whiten(U, (rows.G / scale[:, None]).T)
         left, singular, right = np.linalg.svd(W, full_matrices=False)
         k = terms.rank
         yield i, ((left[:, :k].T @ (U @ yhat)) / singular[:k]) @ right[:k] / scale, data

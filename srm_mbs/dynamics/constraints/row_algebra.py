@@ -209,7 +209,7 @@ class DenseAlgebra:
     def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
         """See :class:`RowAlgebra`."""
         self._U = None if M is None else cholesky(M)
-        W = np.asfortranarray(G.T) if self._U is None else whiten(self._U, np.asfortranarray(G.T))
+        W = G.T if self._U is None else whiten(self._U, G.T)
         self.row_squares = (W * W).sum(axis=0)
         if not np.isfinite(self.row_squares).all():
             raise EvaluationError("the closures are not finite")
@@ -227,14 +227,13 @@ class DenseAlgebra:
         """Q x or Q^T x for x (nv, k), with the reflections of the rows in use."""
         if self.rank == 0:
             return x
-        # dormqr(side, trans, reflections, tau, x, size of its workspace)
         out: FloatArray = lapack.dormqr(
-            "L",
-            "T" if transposed else "N",
-            self._packed[:, : self.rank],
-            self._tau[: self.rank],
-            np.asfortranarray(x),
-            64 * x.shape[1],
+            side="L",
+            trans="T" if transposed else "N",
+            a=self._packed[:, : self.rank],
+            tau=self._tau[: self.rank],
+            c=x,
+            lwork=64 * x.shape[1],
         )[0]
         return out
 

@@ -15,12 +15,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
-from scipy.linalg import lapack
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.newton import newton
-from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, cholesky, unwhiten, whiten
+from srm_mbs.dynamics.constraints.projection import (
+    PIVOT_ZERO,
+    cholesky,
+    pivoted_qr,
+    unwhiten,
+    whiten,
+)
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
@@ -232,7 +237,7 @@ class ManifoldSampler:
             W = np.concatenate([white[:, rows] for white in parts])
             size = np.linalg.norm(W, axis=0)
             basis: list[int] = []
-            for k in (lapack.dgeqp3(W)[1] - 1).tolist():
+            for k in pivoted_qr(W)[1].tolist():
                 shares = np.linalg.lstsq(W[:, basis], W[:, k], rcond=None)[0]
                 left = W[:, k] - W[:, basis] @ shares
                 length = np.linalg.norm(left)

@@ -146,9 +146,9 @@ class BranchLimit:
         rank, nv = self._centre.structural_rank, len(self._unit)
         G = self._geometry.normalised(q)[:, :nv]
         U = cholesky(self._geometry.mass())
-        X, size, Yt = np.linalg.svd(whiten(U, np.asfortranarray(G.T)), full_matrices=False)
+        X, size, Yt = np.linalg.svd(whiten(U, G.T), full_matrices=False)
         inner = (Yt[:rank] @ right) / size[:rank, None]
-        return unwhiten(U, np.asfortranarray(X[:, :rank] @ inner))
+        return unwhiten(U, X[:, :rank] @ inner)
 
     def _normal_part(self, k: int, node: FloatArray) -> FloatArray:
         """[P, -E s'] (nv, n) at node k, in units: P alone without drives."""

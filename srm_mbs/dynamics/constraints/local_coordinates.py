@@ -27,7 +27,7 @@ from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, THIRD_ORDER
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of a point of the chart, in row units."""
 RANK_TOLERANCE = 1e-10
-"""Relative singular value below which a direction does not move the closures."""
+"""Singular value, over the usual norm of G, below which a direction does not move the closures."""
 ITERATIONS = 20
 
 
@@ -53,10 +53,18 @@ class ChartPoint:
 
     @cached_property
     def velocities(self) -> FloatArray:
-        """V (nv, k): velocities on the closures with L V = 1."""
+        """V (nv, k): velocities on the closures with L V = 1.
+
+        Where the closures lose rank, the directions that are lost keep their part of the basis.
+        """
         chart = self.chart
+        cut = RANK_TOLERANCE * float(np.linalg.norm(chart.geometry.row_size))
         G = chart.geometry.closure(self.q)[1]
-        back = np.linalg.lstsq(G @ chart.complement, G @ chart.basis, rcond=RANK_TOLERANCE)[0]
+        moves = G @ chart.complement
+        size = float(np.linalg.norm(moves))
+        if size <= cut:
+            return chart.basis
+        back = np.linalg.lstsq(moves, G @ chart.basis, rcond=cut / size)[0]
         out: FloatArray = chart.basis - chart.complement @ back
         return out
 

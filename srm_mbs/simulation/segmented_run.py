@@ -329,8 +329,6 @@ def _check_chatter(times: list[float], span: float, name: str) -> None:
 def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
     """Whether ``x`` is on the closures to rounding.  Moving it onto them would gain nothing, and
     next to a singular configuration take it off its branch by that rounding over sigma."""
-    if not isinstance(system, ClosedSystem):
-        return True
     g, c = system.residuals(x, t)
     speed = 1.0 + float(np.abs(x[system.nq :]).max())
     return bool((np.abs(g) < ON).all() and (np.abs(c) < ON * speed).all())

@@ -40,7 +40,7 @@ class Event:
     terminal
         Whether it ends the run, or after how many occurrences.
     action
-        (t, q, v) -> what goes on from there, called at each occurrence that does not end the run:
+        (t, q, v) -> how the run continues, called at each occurrence that does not end the run:
         None if nothing changes, a consistent (q, v), or a :class:`Switch`.  The state that it gets
         is on the closures.
 

@@ -44,7 +44,7 @@ def state(model: pin.Model, angle: float) -> tuple[FloatArray, FloatArray]:
 
 
 def least(call: Callable[[int], Any], repeats: int) -> float:
-    """Least CPU microseconds of one of the calls that ``call`` makes as often as it is told."""
+    """Least CPU time (us) of one call; ``call`` takes the number of repetitions."""
     start = time.thread_time()
     call(1)
     count = max(1, int(SECONDS / max(time.thread_time() - start, 1e-7)))
@@ -57,7 +57,7 @@ def least(call: Callable[[int], Any], repeats: int) -> float:
 
 
 def pinocchio(model: pin.Model, n: int, q: FloatArray, v: FloatArray) -> Callable[[int], None]:
-    """``pin.constraintDynamics`` with a point constraint per loop, as often as it is told."""
+    """``pin.constraintDynamics`` with a point constraint per loop, for a number of repetitions."""
     tip = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
     point, local = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
     constraints, stored = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()

@@ -244,7 +244,7 @@ def simulate(
     progress
         True for a progress bar (on a terminal only), or a callable (t, h, state).
     backend
-        ``"python"``, the readable reference; ``"kernel"``, its compiled twin, which is many times
+        ``"python"``, the readable reference; ``"kernel"``, the compiled kernel, which is many times
         faster and has the split PSRM with automatic placement or none; ``"auto"``, the kernel
         wherever it can be used (:func:`srm_mbs.backend`).
     raise_on_failure

@@ -2,7 +2,7 @@
 
     python -m tools.method_tables
 
-Run from a checkout after the benchmark was recorded anew.
+Run from a checkout after the benchmark was recorded again.
 """
 
 from __future__ import annotations

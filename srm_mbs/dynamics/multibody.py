@@ -319,6 +319,10 @@ class OpenSystem(Mechanics):
         """0: there is no closure."""
         return 0.0
 
+    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Two empty arrays: there is no closure."""
+        return np.zeros(0), np.zeros(0)
+
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """v' = aba(q, v, tau); see :class:`~srm_mbs.dynamics.system.System`."""
         self.evaluations += 1

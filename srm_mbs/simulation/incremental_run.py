@@ -41,7 +41,7 @@ class _IncrementalRun:
     Attributes
     ----------
     t, state
-        Where it stands.
+        Current time (s) and state (nq + nv,).
     """
 
     t: float

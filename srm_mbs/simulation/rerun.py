@@ -13,7 +13,7 @@ from srm_mbs.simulation.segmented_result import RESULTS
 from srm_mbs.simulation.segmented_run import run
 
 BEYOND = 0.1
-"""How much longer a second run of one that failed may be: it tells whether that one goes on."""
+"""Extension of the rerun of a failed run, as a part of its length: the rerun may get further."""
 
 
 def unsupported_reason(solution: SimulationResult) -> str:

@@ -40,7 +40,7 @@ class Event:
     terminal
         Whether it ends the run, or after how many occurrences.
     action
-        (t, q, v) -> what goes on from there, called at each occurrence that does not end the run:
+        (t, q, v) -> how the run continues, called at each occurrence that does not end the run:
         None if nothing changes, a consistent (q, v), or a :class:`Switch`.  The state that it gets
         is on the closures.
 
@@ -329,8 +329,6 @@ def _check_chatter(times: list[float], span: float, name: str) -> None:
 def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
     """Whether ``x`` is on the closures to rounding.  Moving it onto them would gain nothing, and
     next to a singular configuration take it off its branch by that rounding over sigma."""
-    if not isinstance(system, ClosedSystem):
-        return True
     g, c = system.residuals(x, t)
     speed = 1.0 + float(np.abs(x[system.nq :]).max())
     return bool((np.abs(g) < ON).all() and (np.abs(c) < ON * speed).all())

@@ -202,7 +202,7 @@ class Simulator:
             self._begin(*self._begins, force, dt)
         run = self._run
         try:
-            # Those at the ends count, too: what acts just before and behind them differs.
+            # Breakpoints at the ends count, too: forces just before and just after them differ.
             beside = NEAR * (abs(t) + dt)
             kinks = self._mechanism.breakpoints(t - beside, end + beside)
             if len(kinks):

@@ -184,7 +184,7 @@ def test_without_logging_set_up_nothing_is_said(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", QUIET],
         cwd=tmp_path,
-        # A kernel of other sources would, rightly, be told of.
+        # A kernel of other sources would issue a warning, rightly.
         env={"PYTHONPATH": str(PACKAGE.parent), "SRM_MBS_BACKEND": "python"},
         capture_output=True,
         text=True,
@@ -302,9 +302,9 @@ def test_the_list_of_commands_shows_whole_sentences() -> None:
 
 
 def test_verbose_shows_the_log_and_without_it_nothing_of_it_is_seen() -> None:
-    told = CliRunner().invoke(app, ["-v", "simulate", "slider_crank", "--t-end", "2"]).stderr
-    assert "info: slider_crank: from t = 0 to 2 s with PSRM dop853, rtol 1e-08" in told
-    assert "debug: slider_crank: singular configuration of pin passed at t = " in told
+    logged = CliRunner().invoke(app, ["-v", "simulate", "slider_crank", "--t-end", "2"]).stderr
+    assert "info: slider_crank: from t = 0 to 2 s with PSRM dop853, rtol 1e-08" in logged
+    assert "debug: slider_crank: singular configuration of pin passed at t = " in logged
     quiet = CliRunner().invoke(app, ["simulate", "slider_crank", "--t-end", "2"])
     assert quiet.stderr == ""
 

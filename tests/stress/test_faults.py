@@ -162,7 +162,7 @@ def test_a_torque_of_noise_ends_the_run_instead_of_crawling(
     check_partial(solution)
 
 
-# --- what cannot move as told -------------------------------------------------------------------
+# --- motions that are impossible ------------------------------------------------------------------
 # Drives do not exist yet: a torque and a closure take their place.
 
 

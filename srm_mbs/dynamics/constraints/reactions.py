@@ -65,7 +65,7 @@ def _multipliers(
 ) -> Iterator[tuple[int, FloatArray, pin.Data]]:
     """Number of the state, lam (rows,) of all rows, unscaled, and data with the placements; nothing
     for a mechanism without closures."""
-    if not isinstance(system, ClosedSystem):
+    if not system.has_constraints:
         return
     mechanism = system.mechanism
     model = mechanism.model

@@ -63,7 +63,7 @@ ZERO_ROW = 1e-9
 """A scaled row that stays below this in every closed sample is zero."""
 SMALL_REFERENCE_PIVOT = 0.1
 """A last structural pivot with a median below this is close to zero everywhere: rows are
-eliminated and scaled anew."""
+eliminated and scaled again."""
 BALANCING_SAMPLES = 12
 """Closed configurations in which rows are measured against each other."""
 RANK_GAP = 1e3

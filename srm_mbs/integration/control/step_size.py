@@ -85,7 +85,7 @@ class StepSizeControl(Protocol):
     def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """A step ends on ``end`` (s): a breakpoint, or the end of the run.
 
-        With ``grid`` fixed steps are counted anew; others have none.
+        With ``grid`` fixed steps count from its start; other controls have none.
         """
 
 

@@ -70,7 +70,7 @@ def test_bricards_linkage_moves_although_the_count_says_it_cannot() -> None:
     G = geometry.normalised(mechanism.q0)
     for i, name in enumerate(mechanism.structure.row_names):
         others = np.linalg.matrix_rank(np.delete(G, i, axis=0), tol=1e-9)
-        # Where the others do what this row does, it cannot be told what it carries.
+        # Where the others do what this row does, the load that it carries is undetermined.
         if others == 4:
             assert name in found.indeterminate_rows
 

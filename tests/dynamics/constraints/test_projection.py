@@ -195,13 +195,13 @@ def combination(kind: str, m: int, rng: np.random.Generator) -> FloatArray:
     }[kind]
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["rank known", "rank found"])
+@pytest.mark.parametrize("rank_known", [True, False], ids=["rank known", "rank found"])
 @pytest.mark.parametrize("kind", ["duplicated", "negated", "combined", "zero", "all of these"])
-def test_redundant_rows_change_neither_rank_nor_multiplier(kind: str, told: bool) -> None:
+def test_redundant_rows_change_neither_rank_nor_multiplier(kind: str, rank_known: bool) -> None:
     """Known from the load-time analysis, or found because their pivots are rounding."""
     plain = Problem(9, 4)
     problem = plain.dependent(combination(kind, 4, plain.rng))
-    structural = 4 if told else min(9, len(problem.G))
+    structural = 4 if rank_known else min(9, len(problem.G))
     p = problem.factor(structural)
     assert p.rank == 4
     assert p.rank_deficient == (structural > 4)

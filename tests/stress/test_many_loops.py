@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import lapack
 
 import srm_mbs as srm
-from srm_mbs.dynamics.constraints import projection, row_algebra
+from srm_mbs.dynamics.constraints import row_algebra
 from srm_mbs.integration.kernel import backend
 from tests.support import reduced
 
@@ -76,7 +76,6 @@ def test_loading_many_loops_factorises_nothing_that_is_large_and_dense(
         watch(np.linalg, name)
     for name in ("dgeqp3", "dgesdd"):
         watch(lapack, name)
-    monkeypatch.setattr(projection, "_dgeqp3", lapack.dgeqp3)
     assert srm.n_four_bar(160).degrees_of_freedom == 1
     monkeypatch.setattr(row_algebra, "ARPACK_ABOVE", 2)
     with pytest.raises(AssertionError, match="of "):

@@ -8,10 +8,10 @@ cannot go on returns a partial :class:`~srm_mbs.Solution` and raises
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
@@ -147,7 +147,7 @@ class SrmWarning(UserWarning):
 
 def warn(message: str) -> None:
     """Issue a :class:`SrmWarning` that points at the first caller outside the package."""
-    package = str(Path(__file__).parent)
+    package = os.path.dirname(__file__)
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
         level, frame = level + 1, frame.f_back

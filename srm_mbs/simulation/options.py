@@ -147,9 +147,8 @@ class RunOptions:
 
         Results keep these, so that they hold neither progress functions nor further arrays.
         """
-        given = RunOptions(self.t_end)
         kept = {name: getattr(self, name) for name in REPEATED}
-        return replace(given, **kept, lost=self.lost)
+        return RunOptions(self.t_end, **kept, lost=self.lost)
 
 
 REPEATED = (

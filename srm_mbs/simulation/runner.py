@@ -138,7 +138,6 @@ def run_segment(mechanism: Mechanism, options: RunOptions, result_type: type[Res
     log_start(mechanism.name, options, problem.norm, by)
     record, wrappers, kernel_system = integrate_problem(problem)
     result = assemble_result(problem, record, wrappers, kernel_system, result_type)
-    result.request = options.repeatable()
     result.message += bifurcation_sentences(result)
     log_end(mechanism.name, result)
     return result

@@ -260,7 +260,9 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
             for i, event in enumerate(prepared)
         ]
         try:
-            part = run_segment(mechanism, replace(here, events=events), types.plain)
+            asked = replace(here, events=events)
+            part = run_segment(mechanism, asked, types.plain)
+            part.request = asked.repeatable()
         except InputError as error:
             if not parts:
                 raise

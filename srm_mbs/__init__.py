@@ -8,8 +8,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from srm_mbs.errors import __version__ as __version__
-
 if TYPE_CHECKING:
     from srm_mbs.analysis.accuracy.certificate import Certificate, certify
     from srm_mbs.analysis.assembly_modes import AssemblyMode, assembly_modes
@@ -27,6 +25,7 @@ if TYPE_CHECKING:
         SimulationError,
         SrmError,
         SrmWarning,
+        __version__ as __version__,
     )
     from srm_mbs.formats.convert import convert
     from srm_mbs.formats.load import bundled_models, load, n_four_bar
@@ -63,6 +62,7 @@ if TYPE_CHECKING:
     from srm_mbs.visualization.animation.live import LiveView
 
 _HOME = {
+    "__version__": "errors",
     "AnalysisError": "errors",
     "Anchor": "model.anchors",
     "Assembly": "assembly.assemble",

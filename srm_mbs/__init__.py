@@ -25,6 +25,8 @@ if TYPE_CHECKING:
         SimulationError,
         SrmError,
         SrmWarning,
+    )
+    from srm_mbs.errors import (
         __version__ as __version__,
     )
     from srm_mbs.formats.convert import convert

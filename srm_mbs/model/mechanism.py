@@ -8,6 +8,7 @@ you.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import update_wrapper
@@ -101,15 +102,16 @@ Owner = TypeVar("Owner", bound=ResultOwner, contravariant=True)
 Result = TypeVar("Result")
 
 
-class _Memoised(Generic[Owner, Result]):
+class _Memoised(ABC, Generic[Owner, Result]):
     """A function of a mechanism whose result is kept with the mechanism; nothing may change it."""
 
     def __init__(self, function: Callable[[Owner], Result]) -> None:
         self._function = function
         update_wrapper(self, function)
 
+    @abstractmethod
     def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
-        raise NotImplementedError
+        """The store of the mechanism that the result belongs to."""
 
     def __call__(self, mechanism: Owner) -> Result:
         results = self._results(mechanism)

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <stdexcept>
 
 #include "linear.hpp"
@@ -15,7 +16,10 @@ void Extension::check() const {
     expect_size("extra_A", extra_A.size(), extra_c.size() * width);
 }
 
-void DenseConstants::check() const { expect_size("nodes", nodes.size(), 3); }
+void DenseConstants::check() const {
+    expect_size("nodes", nodes.size(), 3);
+    expect_within("nodes", nodes, 2, std::numeric_limits<int>::max());
+}
 
 DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double> abscissae,
                          DenseConstants constants, StepArrays steps)
@@ -33,6 +37,17 @@ DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double
       weights_(extension_.n_rates),
       whole_(extension_.n_rates),
       whole_count_(std::min<int>(extension_.n_rates, steps_.width)) {
+    if (steps_.count < 1) throw std::invalid_argument("there are no steps");
+    if (abscissae_.empty()) throw std::invalid_argument("there are no abscissae");
+    // Every step has its rates or as many as the extra stages complete.
+    if (steps_.width != extension_.n_rates &&
+        steps_.width != extension_.n_rates - extension_.extra_stages())
+        throw std::invalid_argument("StepArrays.rates has another number of rates");
+    long before = 0;
+    for (const long step : steps_.breaks) {
+        expect_within("StepArrays.breaks", step, before + 1, steps_.count);
+        before = step;
+    }
     weights(1.0, whole_.data());
 }
 
@@ -100,7 +115,7 @@ void DenseOutput::weights(double theta, double* out) const {
 
 const std::vector<double>& DenseOutput::extra_rates(System& system, long step, double h) {
     std::vector<double>& kept = extra_[step];
-    if (!kept.empty() || extension_.extra_stages() == 0) return kept;
+    if (!kept.empty() || steps_.width == extension_.n_rates) return kept;
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     std::vector<double> rate(n_);

@@ -6,6 +6,7 @@
 namespace srm {
 
 void MultiplierHistory::check() const {
+    expect_within("nv", nv, 0, std::numeric_limits<int>::max());
     const std::size_t width = static_cast<std::size_t>(nv);
     expect_size("values", values.size(), times.size() * width);
     if (nv > 0) expect_size("normals", normals.size(), normals.size() / width * width);

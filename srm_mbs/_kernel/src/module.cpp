@@ -15,6 +15,7 @@
 #include "constants.hpp"
 #include "dense.hpp"
 #include "errors.hpp"
+#include "interpreter.hpp"
 #include "linear.hpp"
 #include "model.hpp"
 #include "run.hpp"
@@ -120,12 +121,10 @@ struct PySystem {
                 call_controller(t, q, v, tau);
             };
         system = std::make_unique<System>(found, data, std::move(act));
-        if (static_cast<int>(data.position_of.size()) != system->nv)
-            throw nb::value_error("SystemData.position_of has not nv numbers");
     }
 
     void call_controller(double t, const double* q, const double* v, double* tau) const {
-        nb::gil_scoped_acquire held;
+        const WithLock held;
         const int nq = system->nq, nv = system->nv;
         const nb::object out = controller(t, owned_array(std::vector<double>(q, q + nq)),
                                           owned_array(std::vector<double>(v, v + nv)));
@@ -157,6 +156,9 @@ struct PySystem {
 
     double first_step(double t, const Array& state, const IntegratorState& memory,
                       const ErrorNorm& norm, double span, int order, const Constants& constants) {
+        for (const std::size_t found : {memory.rate.size(), norm.atol.size()})
+            if (found != static_cast<std::size_t>(2 * system->nv))
+                throw nb::value_error("the memory or the norm has not 2 nv numbers");
         return initial_step(*system, norm, t, vector_of(state, state_size(), "state"),
                             memory.rate.data(), memory.state_scale.data(), span, order, constants);
     }
@@ -165,7 +167,7 @@ struct PySystem {
     void repeat(double t, const Array& state, long repeats) {
         std::vector<double> rate(2 * system->nv);
         const double* x = vector_of(state, state_size(), "state");
-        nb::gil_scoped_release released;
+        const WithoutLock released;
         for (long i = 0; i < repeats; ++i) {
             system->evaluate(t, x, System::ZoneView{});
             system->rate(rate.data());
@@ -175,7 +177,7 @@ struct PySystem {
     // The same of its pass over the tree, which is Pinocchio's part.
     void repeat_tree(const Array& state, long repeats) {
         const double* x = vector_of(state, state_size(), "state");
-        nb::gil_scoped_release released;
+        const WithoutLock released;
         for (long i = 0; i < repeats; ++i) system->tree_terms(x);
     }
 
@@ -271,7 +273,7 @@ struct PyRun {
     }
 
     int advance(long steps, double seconds) {
-        nb::gil_scoped_release released;
+        const WithoutLock released;
         return static_cast<int>(run->advance(steps, seconds));
     }
 
@@ -299,7 +301,7 @@ struct PyRun {
                 forces_jump = true;
             }
         }
-        nb::gil_scoped_release released;
+        const WithoutLock released;
         return static_cast<int>(run->go_on(end, first, last, forces_jump, grid, seconds));
     }
 
@@ -447,7 +449,9 @@ void bind_run(nb::module_& m) {
         .def("totals", &PyRun::totals)
         .def("take_records", &PyRun::take_records)
         .def("time_before", [](const PyRun& r, long steps) {
-            return r.run->records.times[r.run->records.count() - steps];
+            const long count = r.run->records.count();
+            if (steps < 1 || steps > count) throw nb::index_error();
+            return r.run->records.times[static_cast<std::size_t>(count - steps)];
         })
         .def_prop_ro("t", [](const PyRun& r) { return r.run->t(); })
         .def_prop_ro("h", [](const PyRun& r) { return r.run->last_h(); })
@@ -565,6 +569,7 @@ NB_MODULE(_core, m) {
     });
     m.def("lean_data",
           [](nb::object model) { return nb::steal(lean_data(pinocchio_model_in(model))); });
+    sleep_at_exit();
     bind_structs(m);
     bind_algebra(m);
     bind_system(m);

@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "errors.hpp"
+#include "interpreter.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -18,7 +19,10 @@ constexpr long clock_every = 16;
 void SmoothIntervals::check() const {
     expect_size("first", first.size(), ends.size());
     expect_size("last", last.size(), ends.size());
-    expect_size("given", given.size() + 1, ends.size());
+    if (ends.empty()) throw std::invalid_argument("ends is empty");
+    expect_size("given", given.size(), ends.size() - 1);
+    if (!std::is_sorted(ends.begin(), ends.end()))
+        throw std::invalid_argument("ends do not increase");
 }
 
 void StepRecords::append(const StepResult& r, double t_new, int placement) {
@@ -238,6 +242,7 @@ Stop Run::advance(long steps, double seconds) {
     const long last = steps > 0 ? records.count() + steps : std::numeric_limits<long>::max();
     StepDecision decision;
     for (long attempted = 1;; ++attempted) {
+        sleep_if_ending();
         if (at_breakpoint()) {
             if (intervals_.given[interval_]) return Stop::breakpoint;
             try {

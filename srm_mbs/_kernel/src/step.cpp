@@ -10,6 +10,8 @@ namespace srm {
 
 void ButcherTableau::check() const {
     const std::size_t s = b.size();
+    if (s == 0) throw std::invalid_argument("b is empty");
+    if (gap_centres.empty()) throw std::invalid_argument("gap_centres is empty");
     expect_size("A", A.size(), s * s);
     expect_size("c", c.size(), s);
     if (!error.empty()) expect_size("error", error.size(), s + 1);

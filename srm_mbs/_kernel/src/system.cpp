@@ -66,18 +66,120 @@ void JointRow::check() const {
 
 void SystemData::check() const {
     const std::size_t nv = position_of.size();
+    expect_within("rows", rows, 0, std::numeric_limits<int>::max());
     expect_size("unit", unit.size(), nv);
     if (!damping.empty()) expect_size("damping", damping.size(), nv);
     if (!friction.empty()) expect_size("friction", friction.size(), nv);
     expect_size("residual_scale", residual_scale.size(), static_cast<std::size_t>(rows));
-    if (!order.empty()) expect_size("order", order.size(), static_cast<std::size_t>(rows));
+    expect_finite("residual_scale", residual_scale);
+    expect_finite("unit", unit);
+    if (order.empty()) return;
+    expect_size("order", order.size(), static_cast<std::size_t>(rows));
+    expect_within("order", order, 0, rows - 1);
+    std::vector<int> sorted(order);
+    std::sort(sorted.begin(), sorted.end());
+    if (std::adjacent_find(sorted.begin(), sorted.end()) != sorted.end())
+        throw std::invalid_argument("order has a row twice");
+    expect_within("pivot_window", pivot_window, 1, std::numeric_limits<int>::max());
 }
+
+namespace {
+
+// Refuses a model whose indices do not belong together: Pinocchio's algorithms do not look.
+const pinocchio::Model& checked_model(const pinocchio::Model& model) {
+    const long joints = model.njoints;
+    const auto count = static_cast<std::size_t>(joints);
+    if (joints < 1 || model.nq < 0 || model.nv < 0)
+        throw std::invalid_argument("model has a negative size");
+    const auto expect_count = [&](const char* field, std::size_t found) {
+        expect_size((std::string("model.") + field).c_str(), found, count);
+    };
+    expect_count("joints", model.joints.size());
+    expect_count("parents", model.parents.size());
+    expect_count("jointPlacements", model.jointPlacements.size());
+    expect_count("inertias", model.inertias.size());
+    expect_count("idx_qs", model.idx_qs.size());
+    expect_count("idx_vs", model.idx_vs.size());
+    expect_count("nqs", model.nqs.size());
+    expect_count("nvs", model.nvs.size());
+    expect_size("model.armature", static_cast<std::size_t>(model.armature.size()),
+                static_cast<std::size_t>(model.nv));
+    for (std::size_t i = 1; i < count; ++i) {
+        const auto& joint = model.joints[i];
+        expect_within("model.parents", static_cast<long>(model.parents[i]), 0,
+                      static_cast<long>(i) - 1);
+        if (model.idx_qs[i] != joint.idx_q() || model.idx_vs[i] != joint.idx_v() ||
+            model.nqs[i] != joint.nq() || model.nvs[i] != joint.nv())
+            throw std::invalid_argument("model.joints has other indices than the model");
+        expect_within("model.nqs", joint.nq(), 0, model.nq);
+        expect_within("model.nvs", joint.nv(), 0, model.nv);
+        expect_within("model.idx_qs", joint.idx_q(), 0, model.nq - joint.nq());
+        expect_within("model.idx_vs", joint.idx_v(), 0, model.nv - joint.nv());
+    }
+    return model;
+}
+
+// Refuses rows, joints and columns that the model does not have.
+void check_indices(const SystemData& data, const pinocchio::Model& model) {
+    const long nq = model.nq, nv = model.nv, rows = data.rows, joints = model.njoints;
+    expect_size("SystemData.position_of", data.position_of.size(), static_cast<std::size_t>(nv));
+    expect_within("SystemData.position_of", data.position_of, -1, nq - 1);
+    expect_within("SystemData.structural_rank", data.structural_rank, 0, std::min(rows, nv));
+    if (!(data.sigma_ref > 0.0) || !std::isfinite(data.sigma_ref))
+        throw std::invalid_argument("SystemData.sigma_ref is not positive");
+    for (const ClosureRows& closure : data.closures) {
+        expect_within("ClosureRows.joint_a", closure.joint_a, 0, joints - 1);
+        expect_within("ClosureRows.joint_b", closure.joint_b, 0, joints - 1);
+        expect_within("ClosureRows.first_row", closure.first_row, 0,
+                      rows - static_cast<long>(closure.count()));
+        expect_within("ClosureRows.columns", closure.columns, 0, nv - 1);
+    }
+    for (const JointRow& row : data.joint_rows) {
+        expect_within("JointRow.row", row.row, 0, rows - 1);
+        expect_within("JointRow.in_q", row.in_q, 0, nq - 1);
+        expect_within("JointRow.in_v", row.in_v, 0, nv - 1);
+    }
+    for (const Elimination& elimination : data.eliminations) {
+        expect_within("Elimination.row", elimination.row, 0, rows - 1);
+        expect_within("Elimination.other", elimination.other, 0, rows - 1);
+        expect_within("Elimination.columns", elimination.columns, 0, nv - 1);
+    }
+    for (const DrivenRow& drive : data.drives) {
+        expect_within("DrivenRow.row", drive.row, 0, rows - 1);
+        expect_within("DrivenRow.in_v", drive.in_v, -1, nv - 1);
+        if (drive.in_v >= 0)
+            expect_within("DrivenRow.in_q", drive.in_q, 0, nq - 1 - (drive.wraps ? 1 : 0));
+    }
+    for (const ForceElement& force : data.forces) {
+        for (const Anchor* anchor : {&force.a, &force.b})
+            expect_within("Anchor.joint", anchor->joint, 0, joints - 1);
+        expect_within("ForceElement.columns", force.columns, 0, nv - 1);
+        const bool torque = force.kind == ForceKind::joint_torque;
+        const long last = torque ? static_cast<long>(force.numbers.size()) : 1;
+        const bool on_joint = torque || force.kind == ForceKind::torsion_spring ||
+                              force.kind == ForceKind::limit_spring;
+        if (!on_joint) continue;
+        expect_within("ForceElement.in_v", force.in_v, 0, nv - last);
+        if (!torque) expect_within("ForceElement.in_q", force.in_q, 0, nq - 1);
+    }
+    for (const GroupJoint& joint : data.groups) {
+        const bool free = joint.group == Group::se3;
+        expect_within("GroupJoint.group", static_cast<long>(joint.group), 0, 2);
+        expect_within("GroupJoint.size", joint.size, free ? 6 : 3, free ? 6 : 3);
+        expect_within("GroupJoint.start", joint.start, 0, nv - joint.size);
+        expect_within("GroupJoint.position", joint.position, 0, nq - joint.size - 1);
+    }
+    expect_within("SystemData.wrapped_angles", data.wrapped_angles, 0, nv - 1);
+}
+
+}  // namespace
 
 System::System(const void* model, SystemData data, Controller controller)
     : data_(std::move(data)),
       controller_(std::move(controller)),
       work_(std::make_unique<pinocchio_model::Workspace>(
-          *static_cast<const pinocchio::Model*>(model))) {
+          checked_model(*static_cast<const pinocchio::Model*>(model)))) {
+    check_indices(data_, work_->model);
     nq = work_->model.nq;
     nv = work_->model.nv;
     closed_ = data_.structural_rank > 0;
@@ -244,6 +346,11 @@ void System::hold(double t, const double* force, bool keep) {
 
 void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
                    std::vector<double> damping, std::vector<double> friction) {
+    const auto components = static_cast<std::size_t>(nv);
+    expect_size("unit", unit.size(), components);
+    expect_size("residual_scale", residual_scale.size(), static_cast<std::size_t>(data_.rows));
+    if (!damping.empty()) expect_size("damping", damping.size(), components);
+    if (!friction.empty()) expect_size("friction", friction.size(), components);
     data_.unit = std::move(unit);
     data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);

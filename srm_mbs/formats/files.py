@@ -1,0 +1,170 @@
+"""Files of strangers read within bounds, and files written whole or not at all.
+
+Every text and binary file that a user names is read here, and every file that the package writes is
+written here.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from srm_mbs.errors import InputError
+
+LARGEST_FILE = 64 * 10**6
+"""Bytes of a file that is read, unless the caller allows more."""
+LONGEST_SUFFIX = 12
+"""Characters of a suffix that the name of a temporary file keeps: programs choose formats by it."""
+
+# Without O_NONBLOCK, opening a pipe waits for somebody to write; O_BINARY is of Windows.
+_READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def open_regular(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> IO[bytes]:
+    """``path`` opened for reading in binary mode.
+
+    Parameters
+    ----------
+    largest
+        Size (bytes) of a file that is not refused.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened, is a directory, device, pipe or socket, or is larger.
+    """
+    name = os.fspath(path)
+    try:
+        opened = os.open(
+            name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        )
+    except FileNotFoundError as error:
+        raise InputError("there is no such file", file=name, remedy="Check the path") from error
+    except OSError as error:
+        raise InputError(
+            f"it cannot be read: {error.strerror}",
+            file=name,
+            remedy="Give the path of a readable file",
+        ) from error
+    except ValueError as error:  # a null character
+        raise InputError(
+            f"it is not a file name: {error}", file=repr(name), remedy="Correct the path"
+        ) from error
+    status = os.fstat(opened)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(opened)
+        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        raise InputError(f"it is {kind}", file=name, remedy="Give a file")
+    if status.st_size > largest:
+        os.close(opened)
+        raise InputError(
+            f"it has {status.st_size / 1e6:.0f} MB, more than {largest / 1e6:.0f} MB",
+            file=name,
+            remedy="Give a smaller file",
+        )
+    return os.fdopen(opened, "rb")
+
+
+def read_bytes(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> bytes:
+    """The content of the regular file ``path``; raises :class:`InputError` as
+    :func:`open_regular` does."""
+    with open_regular(path, largest) as file:
+        content = file.read(largest + 1)
+    if len(content) > largest:  # it grows, or its file system does not tell its size
+        raise InputError(
+            f"it has more than {largest / 1e6:.0f} MB",
+            file=os.fspath(path),
+            remedy="Give a smaller file",
+        )
+    return content
+
+
+def read_text(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> str:
+    """The UTF-8 text of the regular file ``path``, without a byte order mark, with ``\\n`` at the
+    ends of lines.
+
+    Raises
+    ------
+    InputError
+        As :func:`open_regular`, or if the content is not UTF-8.
+    """
+    content = read_bytes(path, largest)
+    try:
+        text = content.decode("utf-8-sig")  # Windows editors mark it
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"it is not UTF-8 text: {error.reason} at byte {error.start}",
+            file=os.fspath(path),
+            remedy="Save it as UTF-8",
+        ) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path in the folder of ``path``, with its suffix; the file written there takes
+    the place of ``path`` at the end of a ``with`` block that raises nothing.
+
+    Until then ``path`` is what it was, whatever interrupts the program.  A device or a pipe is
+    written to as it is.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; it names ``path``.
+    """
+    target = Path(os.path.realpath(path))  # a link stays a link
+    if target.exists() and not target.is_file():
+        yield target
+        return
+    suffix = target.suffix if len(target.suffix) <= LONGEST_SUFFIX else ""
+    temporary = target.with_name(f".srm-{secrets.token_hex(8)}{suffix}")
+    try:
+        yield temporary
+        _finish(temporary, target)
+    except OSError as error:
+        raise _about(error, path, temporary) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _finish(temporary: Path, target: Path) -> None:
+    """Put the written file onto the disk, then in the place of ``target``."""
+    with suppress(OSError):  # a new file has the mode that open() gives it
+        temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+    with temporary.open("rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, target)
+    if os.name == "posix":
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # not every file system can
+                os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _about(error: OSError, path: str | os.PathLike[str], temporary: Path) -> OSError:
+    """``error``, naming ``path`` in place of the temporary file."""
+    if error.errno is None or error.filename not in (None, str(temporary), temporary):
+        return error
+    return OSError(error.errno, error.strerror or os.strerror(error.errno), os.fspath(path))
+
+
+@contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """A binary file that becomes ``path`` at the end; see :func:`whole_file`."""
+    with whole_file(path) as temporary, temporary.open("wb") as file:
+        yield file
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write ``text`` as UTF-8; see :func:`whole_file`."""
+    with writing(path) as file:
+        file.write(text.encode("utf-8"))

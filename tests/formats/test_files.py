@@ -1,0 +1,125 @@
+"""Reading within bounds, writing whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.formats.files import open_regular, read_bytes, read_text, whole_file, write_text
+
+posix = pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
+
+
+@posix
+@pytest.mark.timeout(10)
+def test_a_pipe_is_refused_without_waiting_for_a_writer(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+
+    with pytest.raises(srm.InputError, match="no regular file"):
+        read_bytes(tmp_path / "pipe")
+
+
+@posix
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev/null"])
+def test_a_device_is_refused(path: str) -> None:
+    with pytest.raises(srm.InputError, match="no regular file"):
+        read_bytes(path)
+
+
+def test_a_folder_a_missing_file_and_a_bad_name_are_refused_by_name(tmp_path: Path) -> None:
+    for path, says in [(tmp_path, "directory"), (tmp_path / "no", "no such"), ("a\0b", "name")]:
+        with pytest.raises(srm.InputError, match=says) as caught:
+            open_regular(path)
+        assert caught.value.file
+        assert caught.value.remedy
+
+
+def test_a_file_above_the_largest_size_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    with path.open("wb") as file:
+        file.truncate(10**12)  # of which nothing is on the disk
+
+    with pytest.raises(srm.InputError, match="more than 64 MB"):
+        read_bytes(path)
+
+
+def test_text_has_neither_a_mark_nor_ends_of_lines_of_another_system(tmp_path: Path) -> None:
+    path = tmp_path / "text"
+    path.write_bytes(b"\xef\xbb\xbfone\r\ntwo\rthree\n")
+
+    assert read_text(path) == "one\ntwo\nthree\n"
+
+
+def test_what_is_no_text_is_refused_without_showing_it(tmp_path: Path) -> None:
+    path = tmp_path / "text"
+    path.write_bytes(b"secret \xff")
+
+    with pytest.raises(srm.InputError, match="not UTF-8 text") as caught:
+        read_text(path)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+
+    def fail() -> None:
+        with whole_file(path) as temporary:
+            temporary.write_text("half of the new")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["file.txt"]
+
+
+def test_a_write_replaces_the_file_and_keeps_its_mode(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    path.chmod(0o640)
+
+    write_text(path, "new")
+
+    assert path.read_text() == "new"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert os.listdir(tmp_path) == ["file.txt"]
+
+
+def test_the_temporary_file_has_the_suffix_that_programs_choose_formats_by(tmp_path: Path) -> None:
+    with whole_file(tmp_path / "film.mp4") as temporary:
+        assert temporary.suffix == ".mp4"
+        assert temporary.parent == tmp_path
+        temporary.write_bytes(b"film")
+
+    assert (tmp_path / "film.mp4").read_bytes() == b"film"
+
+
+@posix
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+
+    write_text(tmp_path / "link", "new")
+
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real").read_text() == "new"
+
+
+@posix
+def test_a_device_is_written_to_as_it_is() -> None:
+    write_text("/dev/null", "text")
+
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_a_folder_that_is_not_there_is_named_by_the_path_given(tmp_path: Path) -> None:
+    path = tmp_path / "no folder" / "file.txt"
+
+    with pytest.raises(OSError, match=r"no folder.file\.txt"):
+        write_text(path, "text")

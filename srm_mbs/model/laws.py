@@ -80,10 +80,6 @@ class Curve:
         }
 
 
-ALL_TIMES = (-math.inf, math.inf)
-"""s."""
-
-
 @runtime_checkable
 class Law(Protocol):
     """A law over time."""
@@ -102,7 +98,7 @@ class Law(Protocol):
     @property
     def span(self) -> tuple[float, float]:
         """First and last time (s) for which it is defined; all times by default."""
-        return ALL_TIMES
+        return (-math.inf, math.inf)
 
 
 def _fault(law: Law, problem: str, remedy: str) -> InputError:

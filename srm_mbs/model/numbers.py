@@ -30,27 +30,29 @@ def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> Fl
         array: FloatArray = given.astype(float)
     except (TypeError, ValueError, OverflowError):
         return None
-    if shape is not None and array.shape != shape:
-        fits = len(shape) == array.ndim and all(
-            length in (None, actual) for length, actual in zip(shape, array.shape)
-        )
-        if not fits:
-            return None
-    return array if np.isfinite(array).all() else None
+    fits = shape is None or (
+        len(shape) == array.ndim
+        and all(length in (None, actual) for length, actual in zip(shape, array.shape))
+    )
+    return array if fits and np.isfinite(array).all() else None
 
 
-def finite_numbers(values: Any, count: int, name: str, remedy: str) -> tuple[float, ...]:
+def finite_numbers(
+    values: Any, count: int, name: str, remedy: str, element: str | None = None
+) -> tuple[float, ...]:
     """``values`` as a tuple of ``count`` finite floats.
 
     Raises
     ------
     InputError
-        About the element ``name``, with that ``remedy``, if they are anything else.
+        About ``element``, by default ``name``, with that ``remedy``, if they are anything else.
     """
     array = finite_array(values, (count,))
     if array is None:
         raise InputError(
-            f"{name} must be {count} finite numbers, not {values!r}", element=name, remedy=remedy
+            f"{name} must be {count} finite numbers, not {values!r}",
+            element=element or name,
+            remedy=remedy,
         )
     return tuple(array.tolist())
 

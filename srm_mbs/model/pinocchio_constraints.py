@@ -9,7 +9,7 @@ Pinocchio has two closures: the point (3 rows) and the frame (6 rows), each in a
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -96,12 +96,12 @@ def closures_from_pinocchio(model: pin.Model, constraint_models: Any) -> tuple[L
     for k, constraint in enumerate(models):
         closure = _closure(model, constraint, f"constraint_models[{k}]")
         if any(closure.name == other.name for other in closures):
-            closure = _closure(model, constraint, f"constraint_models[{k}]", f"_{k}")
+            closure = replace(closure, name=f"{closure.name}_{k}")
         closures.append(closure)
     return tuple(closures)
 
 
-def _closure(model: pin.Model, constraint: Any, place: str, suffix: str = "") -> LoopClosure:
+def _closure(model: pin.Model, constraint: Any, place: str) -> LoopClosure:
     if isinstance(constraint, pin.ConstraintModel):
         constraint = constraint.extract()
     kind = _ANCHORS.get(type(constraint))
@@ -120,8 +120,7 @@ def _closure(model: pin.Model, constraint: Any, place: str, suffix: str = "") ->
     if two[0] == 0:  # the world is b
         one, two = two, one
     a, b = _anchor(model, *two, place), _anchor(model, *one, place)
-    name = str(getattr(constraint, "name", "") or "") or f"{kind}_{a.where}_{b.where}"
-    return LoopClosure(kind, a, b, name=name + suffix)
+    return LoopClosure(kind, a, b, name=str(getattr(constraint, "name", "") or ""))
 
 
 def _fault(problem: str, place: str) -> InputError:
@@ -134,9 +133,9 @@ def _anchor(model: pin.Model, joint: int, placement: pin.SE3, place: str) -> Anc
     where: dict[str, str] = {"link": WORLD}
     inside = placement
     if joint:
-        name, found = _frame_of(model, joint, place)
-        where = {"link" if found.type == pin.FrameType.BODY else "frame": name}
-        inside = found.placement.actInv(placement)
+        frame = _frame_of(model, joint, place)
+        where = {"link" if frame.type == pin.FrameType.BODY else "frame": frame.name}
+        inside = frame.placement.actInv(placement)
     return Anchor(
         **where,
         xyz=tuple(inside.translation.tolist()),
@@ -144,16 +143,14 @@ def _anchor(model: pin.Model, joint: int, placement: pin.SE3, place: str) -> Anc
     )
 
 
-def _frame_of(model: pin.Model, joint: int, place: str) -> tuple[str, pin.Frame]:
+def _frame_of(model: pin.Model, joint: int, place: str) -> pin.Frame:
     """A frame on a joint that can be named: a link, or one whose name is no other's."""
     own = [frame for frame in model.frames if frame.parentJoint == joint]
-    for frame in own:
-        if frame.type == pin.FrameType.BODY:
-            return frame.name, frame
     names = [frame.name for frame in model.frames]
+    own.sort(key=lambda frame: frame.type != pin.FrameType.BODY)  # links come first
     for frame in own:
-        if names.count(frame.name) == 1:
-            return frame.name, frame
+        if frame.type == pin.FrameType.BODY or names.count(frame.name) == 1:
+            return frame
     raise InputError(
         f"the joint {model.names[joint]!r} has no frame of its own name",
         element=place,

@@ -723,7 +723,7 @@ CONTINUOUS.appendBodyToJoint(
         (srm.SpringDamper(ANCHOR_A, srm.Anchor("arm"), damping=1.0), "same body"),
         (srm.Bushing(GROUND, srm.Anchor("world"), SIX_K), "same body"),
         (srm.Wrench(srm.Anchor("am"), (1.0, 0.0, 0.0)), "anchor at: there is no link 'am'"),
-        (srm.Wrench(GROUND, (1.0, 0.0, 0.0)), "'world' does not move"),
+        (srm.Wrench(GROUND, (1.0, 0.0, 0.0)), "'world' lies on the ground and does not move"),
     ],
 )
 def test_an_element_that_does_not_fit_the_model_is_refused(

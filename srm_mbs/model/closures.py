@@ -33,7 +33,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
-from srm_mbs.model.numbers import finite_numbers, vector
+from srm_mbs.model.numbers import finite_number, finite_numbers, vector
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -347,12 +347,8 @@ class LoopClosure:
             raise self._fault(f"the {key} is zero", "Give a direction")
         object.__setattr__(self, key, tuple((axis / size).tolist()))
 
-    def _take_numbers(self, key: str, given: Any, count: int) -> tuple[float, ...]:
-        remedy = f"Give {count} finite number(s)"
-        return finite_numbers(given, count, key, remedy, self._element)
-
     def _take_length(self) -> None:
-        (length,) = self._take_numbers("length", (self.length,), 1)
+        length = finite_number(self.length, "length", self._element)
         if length == 0.0:
             raise self._fault(
                 "a distance of 0 has no direction",
@@ -387,11 +383,14 @@ class LoopClosure:
                     f"a ratio relates two joints, not {len(joints)}",
                     "Name two joints, or give coefficients",
                 )
-            (ratio,) = self._take_numbers("ratio", (self.ratio,), 1)
+            ratio = finite_number(self.ratio, "ratio", self._element)
             object.__setattr__(self, "ratio", ratio)
             numbers: tuple[float, ...] = (ratio,)
         else:
-            numbers = self._take_numbers("coefficients", self.coefficients, len(joints))
+            remedy = "Give one number for each joint"
+            numbers = finite_numbers(
+                self.coefficients, len(joints), "coefficients", remedy, self._element
+            )
             object.__setattr__(self, "coefficients", numbers)
         if 0.0 in numbers:
             raise self._fault(
@@ -399,7 +398,7 @@ class LoopClosure:
                 "Remove that joint from the coupling; to hold a joint, name it in lock",
             )
         offset = 0.0 if self.offset is None else self.offset
-        object.__setattr__(self, "offset", self._take_numbers("offset", (offset,), 1)[0])
+        object.__setattr__(self, "offset", finite_number(offset, "offset", self._element))
         object.__setattr__(self, "joints", joints)
 
     @property

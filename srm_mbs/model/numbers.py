@@ -37,10 +37,28 @@ def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> Fl
     return array if fits and np.isfinite(array).all() else None
 
 
+def finite_number(value: Any, name: str, element: str) -> float:
+    """``value``, called ``name`` in messages, as a finite float.
+
+    Raises
+    ------
+    InputError
+        About ``element``, if it is anything else.
+    """
+    array = finite_array(value, ())
+    if array is None:
+        raise InputError(
+            f"{name} = {value!r} is not a finite number",
+            element=element,
+            remedy="Give a finite number",
+        )
+    return float(array)
+
+
 def finite_numbers(
     values: Any, count: int, name: str, remedy: str, element: str | None = None
 ) -> tuple[float, ...]:
-    """``values`` as a tuple of ``count`` finite floats.
+    """``values``, called ``name`` in messages, as a tuple of ``count`` finite floats.
 
     Raises
     ------

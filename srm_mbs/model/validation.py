@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dpotrf
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.numbers import finite_array, finite_numbers
+from srm_mbs.model.numbers import finite_array
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
@@ -252,11 +252,11 @@ def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
             element="model.friction",
             remedy="Give values >= 0",
         )
-    speed = finite_numbers((friction_speed,), 1, "friction_speed", "Give rad/s or m/s")[0]
-    if speed <= 0.0:
+    speed = finite_array(friction_speed, ())
+    if speed is None or speed <= 0.0:
         raise InputError(
-            f"friction_speed = {speed:g} is not positive",
+            f"friction_speed = {friction_speed!r} is not a positive number",
             element="friction_speed",
             remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
         )
-    return speed
+    return float(speed)

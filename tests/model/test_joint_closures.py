@@ -16,10 +16,9 @@ from scipy.spatial.transform import Rotation
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.model.closures import perpendicular_basis
 from tests.integration.kernel.test_kernel import agree
-from tests.model.test_couplings import on_both
+from tests.support.backends import needs_kernel, on_both
 from tests.support.lockstep import compare
 from tests.support.reduced import trajectory
 
@@ -310,7 +309,7 @@ def geared_pair() -> srm.Mechanism:
     return tree.closed(loop, {"arm": 1.0}, arm=0.3)
 
 
-@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+@needs_kernel
 @pytest.mark.parametrize(
     "make",
     [

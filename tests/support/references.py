@@ -44,7 +44,7 @@ def reference(name: str, t_end: float, samples: int) -> tuple[np.ndarray, np.nda
     if name in ("slider_crank", "slider_crank_whirl"):
         field = reduced.slider_crank()
     elif name == "parallelogram":
-        field = lambda t, y: [y[1], -reduced.G * 9.0 / 8.0 * np.cos(y[0])]  # noqa: E731
+        field = reduced.parallelogram()
     elif name == "spatial_dead_point":
         field, start = reduced.spatial_dead_point(), start - np.array([np.pi / 6, 0.0])
     elif name.startswith("n_four_bar"):

@@ -128,9 +128,8 @@ class ForceElement(ABC):
             return ()
         laws = tuple(law) if isinstance(law, list | tuple) else (law,)
         if len(laws) not in (1, count) or not all(isinstance(each, Law) for each in laws):
-            raise self._fault(
-                "law is not a law", f"Give srm.Sine(...) or alike, or a list of {count} of them"
-            )
+            several = f" or a list of {count}" if count > 1 else ""
+            raise self._fault(f"law is not a law{several}", "Give srm.Sine(...) or alike")
         self._set("law", laws[0] if len(laws) == 1 else laws)
         return laws
 

@@ -120,7 +120,7 @@ def _take(law: Law, key: str, above: float = -math.inf) -> float:
 def _take_list(law: Law, key: str, least: int) -> tuple[float, ...]:
     """Check a list of at least ``least`` numbers of ``law`` and store it as a tuple of floats."""
     array = finite_array(getattr(law, key), (None,))
-    remedy = f"Give a list of at least {least} finite numbers"
+    remedy = f"Give a list of finite numbers, at least {least}"
     if array is None:
         raise _fault(law, f"{key} is not a list of finite numbers", remedy)
     if len(array) < least:

@@ -255,7 +255,7 @@ def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
     speed = finite_array(friction_speed, ())
     if speed is None or speed <= 0.0:
         raise InputError(
-            f"friction_speed = {friction_speed!r} is not a positive number",
+            f"friction_speed = {friction_speed!r} is not a finite positive number",
             element="friction_speed",
             remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
         )

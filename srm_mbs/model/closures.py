@@ -341,7 +341,7 @@ class LoopClosure:
         return InputError(problem, element=self._element, remedy=remedy)
 
     def _take_axis(self, key: str) -> None:
-        axis = np.array(vector(getattr(self, key), key))
+        axis = np.array(vector(getattr(self, key), key, self._element))
         size = float(np.linalg.norm(axis))
         if size == 0.0:
             raise self._fault(f"the {key} is zero", "Give a direction")

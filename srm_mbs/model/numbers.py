@@ -75,13 +75,13 @@ def finite_numbers(
     return tuple(array.tolist())
 
 
-def vector(values: Any, name: str) -> tuple[float, float, float]:
-    """``values`` as three finite floats.
+def vector(values: Any, name: str, element: str | None = None) -> tuple[float, float, float]:
+    """``values``, called ``name`` in messages, as three finite floats.
 
     Raises
     ------
     InputError
-        About the element ``name``, if they are anything else.
+        About ``element``, by default ``name``, if they are anything else.
     """
-    x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]")
+    x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]", element)
     return (x, y, z)

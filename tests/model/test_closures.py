@@ -574,6 +574,9 @@ def refusals() -> dict[str, Callable[[], object]]:
             elif key not in type_.takes:
                 more = good | {key: values[key]}
                 calls[f"{kind} with {key}"] = partial(LoopClosure, kind, **more)
+    calls["an axis of two numbers"] = partial(
+        LoopClosure, "point_on_plane", Anchor("leg_3"), Anchor("arm_3"), (1.0, 0.0)
+    )
     for length in (0.0, -1.0, np.nan):
         calls[f"distance of length {length:g}"] = partial(
             LoopClosure, "distance", Anchor("leg_3"), Anchor("arm_3"), length=length

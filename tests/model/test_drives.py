@@ -15,7 +15,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from tests.support.backends import needs_kernel, on_both
-from tests.support.bundled import load
+from tests.support.bundled import finished, load
 from tests.support.convergence import observed_order
 from tests.support.lockstep import compare
 from tests.support.mechanisms import add_link, along_x
@@ -60,8 +60,7 @@ def test_a_pendulum_follows_a_sine_and_the_torque_is_that_of_its_inertia_and_wei
     start = pendulum(joint())
     mechanism = driven(start, srm.Drive(srm.Sine(2.0, omega=3.0, phase=0.5), "a"))
     t = np.linspace(0.0, 2.0, 41)
-    solution = srm.simulate(mechanism, 2.0, rtol=1e-10, t_eval=t, backend=backend)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 2.0, rtol=1e-10, t_eval=t, backend=backend)
     angle, rate = solution.joint("a")
     wanted = 0.4 + 2.0 * (np.sin(3.0 * t + 0.5) - np.sin(0.5))
     np.testing.assert_allclose(angle, wanted, atol=1e-9)
@@ -92,8 +91,7 @@ def test_an_arm_moved_with_minimum_jerk_needs_the_torques_of_inverse_dynamics(
     mechanism = driven(arm, *drives, q=np.array([0.3, 0.2, -0.4]))
     assert mechanism.degrees_of_freedom == 0
     t = np.linspace(0.0, 1.0, 51)
-    solution = srm.simulate(mechanism, 1.0, rtol=1e-9, t_eval=t, backend=backend)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 1.0, rtol=1e-9, t_eval=t, backend=backend)
     np.testing.assert_allclose(solution.q[-1], list(targets.values()), atol=1e-12)
     model, data = mechanism.model, mechanism.model.createData()
     curves = [mechanism.drive_curves[name] for name in targets]
@@ -117,8 +115,7 @@ def test_the_torque_of_a_slider_crank_at_constant_speed_is_that_of_the_reduced_e
     mechanism = slider_crank()
     model, data = mechanism.model, mechanism.model.createData()
     t = np.linspace(0.05, 2.95, 30)
-    solution = srm.simulate(mechanism, 3.0, rtol=1e-10, t_eval=t, backend=backend)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 3.0, rtol=1e-10, t_eval=t, backend=backend)
     assert solution.drift.max() < 1e-12
 
     def energies(crank: float, near: np.ndarray) -> tuple[float, float]:
@@ -201,8 +198,7 @@ every_case = pytest.mark.parametrize("make", CASES.values(), ids=CASES.keys())
 def test_the_work_of_the_drives_is_what_the_energy_gains(
     make: Callable[[], srm.Mechanism],
 ) -> None:
-    solution = srm.simulate(make(), 1.5, rtol=1e-10)
-    assert solution.success, solution.message
+    solution = finished(make(), 1.5, rtol=1e-10)
     balance = solution.energy_balance
     assert any(name.startswith("drive ") for name in balance.works)
     assert balance.relative < 1e-8
@@ -250,8 +246,7 @@ def test_a_driven_crank_leads_through_the_dead_points_of_equal_bars(backend: str
     """slider_crank has r = l: at pi/2 + k pi the closure and the drive lose rank together."""
     mechanism = driven(load("slider_crank"), srm.Drive(srm.ConstantSpeed(2.0), "crank"))
     assert mechanism.degrees_of_freedom == 0
-    solution = srm.simulate(mechanism, 20.0, rtol=1e-8, backend=backend)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 20.0, rtol=1e-8, backend=backend)
     crank, _ = solution.joint("crank")
     rod_angle, _ = solution.joint("rod")
     np.testing.assert_allclose(crank - crank[0], 2.0 * solution.t, atol=1e-11)
@@ -286,8 +281,7 @@ def test_drives_take_degrees_of_freedom_and_none_may_be_left() -> None:
         srm.Drive(srm.ConstantSpeed(-0.4), "crank_right"),
     )
     assert [m.degrees_of_freedom for m in (free, one, both)] == [2, 1, 0]
-    solution = srm.simulate(both, 0.5)
-    assert solution.success, solution.message
+    solution = finished(both, 0.5)
     assert solution.joint("crank_right")[0][-1] == pytest.approx(both.q0[2] - 0.2, abs=1e-12)
 
 
@@ -522,8 +516,7 @@ def test_a_driven_distance_needs_the_force_along_the_line(backend: str) -> None:
     )
     mechanism = driven(pendulum(), drive)
     t = np.linspace(0.0, 2.0, 21)
-    solution = srm.simulate(mechanism, 2.0, rtol=1e-10, t_eval=t, backend=backend)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 2.0, rtol=1e-10, t_eval=t, backend=backend)
     x, rate = solution.joint("a")
     arm = np.column_stack([0.8 * np.cos(x) - 0.5, 0.8 * np.sin(x) + 1.0])
     length = np.linalg.norm(arm, axis=1)
@@ -597,8 +590,7 @@ def test_a_delta_robot_moves_from_rest_to_rest_with_the_torques_of_inverse_dynam
     ]
     mechanism = driven(robot, *drives, v=0.0 * robot.v0)
     assert mechanism.degrees_of_freedom == 0
-    solution = srm.simulate(mechanism, 0.7, rtol=1e-9)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 0.7, rtol=1e-9)
     for k, (start, name) in enumerate(zip(starts, arms)):
         assert solution.joint(name)[0][-1] == pytest.approx(start + 0.06 * (k + 1), abs=1e-12)
     found = srm.inverse_dynamics(mechanism, solution, actuated=arms)

@@ -18,6 +18,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.forces import ForceKinematics
 from tests.model.test_drives import pendulum, written
 from tests.support.backends import needs_kernel, on_both
+from tests.support.bundled import finished
 from tests.support.lockstep import compare
 from tests.support.mechanisms import add_link
 from tests.support.snapshots import check_messages, refused
@@ -62,10 +63,9 @@ def test_a_wrench_from_tables_moves_a_mass_by_the_integrals_of_its_splines(backe
     laws = tuple(sampled(seed) for seed in range(6))
     at = srm.Anchor("bead", xyz=(0.3, 0.0, 0.0))
     wrench = srm.Wrench(at, law=laws, name="thrust")
-    solution = srm.simulate(
+    solution = finished(
         replace(bead(), forces=(wrench,)), 2.0, rtol=1e-10, backend=backend, t_eval=KNOTS
     )
-    assert solution.success, solution.message
     for k in range(3):
         twice = CubicSpline(KNOTS, laws[k].values).antiderivative(2)
         once = CubicSpline(KNOTS, laws[k].values).antiderivative(1)
@@ -151,8 +151,7 @@ def falling(damping: float = 0.0, **limits: Any) -> srm.Mechanism:
 
 @on_both
 def test_a_pendulum_bounces_on_its_limit_without_loss(backend: str) -> None:
-    solution = srm.simulate(falling(), 4.0, rtol=1e-9, backend=backend)
-    assert solution.success, solution.message
+    solution = finished(falling(), 4.0, rtol=1e-9, backend=backend)
     angle, rate = solution.joint("a")
     assert -0.6 < angle.min() < -0.5
     assert np.sum(np.diff(np.sign(rate)) > 0.0) >= 3  # it came back three times
@@ -338,8 +337,7 @@ def test_springs_at_all_limits_on_request(tmp_path: Path) -> None:
     assert spring.stiffness == pytest.approx(0.6 * (100.0 * rate) ** 2)
     assert spring.damping == pytest.approx(0.2 * 0.6 * 100.0 * rate)
     assert any(f"hinge {spring.stiffness:.3g}" in note for note in mechanism.notes)
-    solution = srm.simulate(mechanism, 4.0)
-    assert solution.success, solution.message
+    solution = finished(mechanism, 4.0)
     angle, rate_ = solution.joint("hinge")
     assert 0.3 < angle.max() < 0.35  # it falls on the upper limit and comes to rest there
     assert abs(rate_[-1]) < 0.1

@@ -32,6 +32,7 @@ from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.model.anchors import WORLD, Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure, perpendicular_basis
 from tests.support.backends import needs_kernel
+from tests.support.mechanisms import random_state
 from tests.support.snapshots import check_refusals
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
@@ -86,11 +87,6 @@ def tree(seed: int) -> pin.Model:
             model.addBodyFrame(name, parent, random_placement(rng), 0)
     model.gravity.linear = GRAVITY
     return model
-
-
-def random_state(model: pin.Model, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-    return q, rng.uniform(-1.0, 1.0, model.nv)
 
 
 def random_anchor(link: str, rng: np.random.Generator) -> Anchor:

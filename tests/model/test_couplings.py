@@ -20,6 +20,7 @@ from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.support.backends import needs_kernel, on_both
+from tests.support.mechanisms import random_state
 from tests.support.snapshots import check_messages, refused
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
@@ -194,8 +195,7 @@ def test_rows_have_constant_entries_at_the_coordinates_of_their_joints(seed: int
     for keep in ([True, True], [False, True], [True, False], [False, False]):
         rows = LoopKinematics(model, loops, scale, np.array(keep))
         data = model.createData()
-        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-        v = rng.uniform(-1.0, 1.0, model.nv)
+        q, v = random_state(model, rng)
 
         def at(q: Any, v: Any = v, rows: Any = rows, data: Any = data) -> Any:
             pin.crba(model, data, q, pin.Convention.WORLD)
@@ -334,8 +334,7 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
     )
     rng = np.random.default_rng(3)
     for _ in range(5):
-        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-        x = np.concatenate([q, rng.uniform(-1.0, 1.0, model.nv)])
+        x = np.concatenate(random_state(model, rng))
         terms = system.evaluate(0.0, x)
         found = kernel_system.terms(0.0, x, -1.0)
         for what in ("rate", "correction", "multiplier", "sigma", "constraint_residual"):

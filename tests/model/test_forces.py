@@ -21,7 +21,7 @@ from srm_mbs.cli.tables import equilibrium_rows
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.formats.build import friction_time
 from tests.support.bundled import finished
-from tests.support.mechanisms import add_link, rod
+from tests.support.mechanisms import add_link, mass_matrix, random_state, rod
 from tests.support.snapshots import check_messages, check_refusals, refused
 
 Coordinates = Callable[[FloatArray], FloatArray]
@@ -57,12 +57,6 @@ def tree() -> pin.Model:
 
 
 TREE = tree()
-
-
-def random_state(model: pin.Model, seed: int, turn: float = 1.0) -> tuple[FloatArray, FloatArray]:
-    rng = np.random.default_rng(seed)
-    q = pin.integrate(model, pin.neutral(model), turn * rng.uniform(-1.0, 1.0, model.nv))
-    return q, rng.standard_normal(model.nv)
 
 
 def placement(model: pin.Model, q: FloatArray, anchor: srm.Anchor) -> tuple[FloatArray, FloatArray]:
@@ -121,10 +115,7 @@ def exerted(
         make_system(srm.Mechanism(model, forces=elements)).evaluate(0.0, state).rate()[model.nv :]
         for elements in ((), forces)
     ]
-    M = pin.crba(model, model.createData(), q)
-    M = np.triu(M) + np.triu(M, 1).T
-    out: FloatArray = M @ (accelerations[1] - accelerations[0])
-    return out
+    return mass_matrix(model, q) @ (accelerations[1] - accelerations[0])  # type: ignore[no-any-return]
 
 
 SIX_K, SIX_C = (50.0, 80.0, 20.0, 3.0, 9.0, 5.0), (2.0, 0.7, 1.1, 0.3, 0.8, 0.5)
@@ -501,8 +492,7 @@ def test_the_time_of_friction_is_that_of_the_fastest_joint() -> None:
     chain = srm.load("pendulum_chain")
     model = chain.model.copy()
     model.friction = np.array([0.3, 0.0, 0.7])
-    M = pin.crba(model, model.createData(), chain.q0)
-    M = np.triu(M) + np.triu(M, 1).T
+    M = mass_matrix(model, chain.q0)
     fastest = np.abs(np.linalg.eigvals(np.linalg.solve(M, np.diag(model.friction)))).max() / SPEED
     rough = replace(chain, model=model, friction_speed=SPEED)
     assert time_of(rough) == pytest.approx(1.0 / fastest, rel=1e-10)

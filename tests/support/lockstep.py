@@ -10,10 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 import srm_mbs as srm
-from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
@@ -27,6 +25,7 @@ from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
+from tests.support.mechanisms import mass_matrix
 
 
 def control_state(control: Any) -> Any:
@@ -56,13 +55,6 @@ def control_state(control: Any) -> Any:
             assert isinstance(control, FixedStep)
             return control_struct(**state, index=control._index)
         control = control._inner
-
-
-def mass_matrix(mechanism: srm.Mechanism, state: FloatArray) -> FloatArray:
-    """M (nv, nv) at a state."""
-    model = mechanism.model
-    M = np.triu(pin.crba(model, model.createData(), state[: model.nq]))
-    return M + np.triu(M, 1).T  # type: ignore[no-any-return]
 
 
 @dataclass
@@ -200,7 +192,7 @@ def compare(
             scale = np.maximum(size, proposal.h * rates) / lowest**2
             moved = np.max(np.abs(change) / scale)
             if result.quiet or not system.has_constraints:
-                M = mass_matrix(mechanism, x)
+                M = mass_matrix(mechanism.model, x[: mechanism.model.nq])
                 out.enlarge(state=moved, condition=np.linalg.cond(M))
                 for d, s in zip(np.split(change, 2), np.split(scale, 2)):
                     out.enlarge(energy=np.sqrt((d @ M @ d) / (s * s @ np.diag(M))))

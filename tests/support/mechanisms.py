@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
+from srm_mbs._typing import FloatArray
 from srm_mbs.formats.load import models_folder
 
 CLOSED_MODELS = tuple(
@@ -46,6 +47,21 @@ def add_link(
     model.appendBodyToJoint(index, inertia or rod(), here)
     model.addBodyFrame(name, index, here, 0)
     return index
+
+
+def random_state(
+    model: pin.Model, seed: int | np.random.Generator, turn: float = 1.0
+) -> tuple[FloatArray, FloatArray]:
+    """q (nq,) up to ``turn`` (rad, m) away from neutral in each direction, and v (nv,) up to 1."""
+    rng = np.random.default_rng(seed)
+    q = pin.integrate(model, pin.neutral(model), turn * rng.uniform(-1.0, 1.0, model.nv))
+    return q, rng.uniform(-1.0, 1.0, model.nv)
+
+
+def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
+    """M (nv, nv) at q (nq,)."""
+    upper = np.triu(pin.crba(model, model.createData(), q))
+    return upper + np.triu(upper, 1).T  # type: ignore[no-any-return]
 
 
 def along_x(distance: float) -> pin.SE3:

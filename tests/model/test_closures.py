@@ -10,7 +10,7 @@ import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from tests.support.snapshots import check_refusals
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
 TYPES = tuple(name for name, kind in CLOSURE_TYPES.items() if "a" in kind.needs)
-"""Those between anchors; tests/test_couplings.py has those between joints."""
+"""Those between anchors; test_couplings.py has those between joints."""
 GRAVITY = np.array([3.0, -5.0, -9.81])
 
 # Anchors of a closure: both branches of the tree, one branch and the ground, one chain.
@@ -118,10 +118,19 @@ class Scene:
         (loop,) = self.loops
         return loop
 
+    @cached_property
+    def kinematics(self) -> LoopKinematics:
+        return LoopKinematics(self.model, self.loops)
+
     def rows(self, q: FloatArray | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
         """g, G and Gdot v of the closures at (q, v)."""
-        rows = LoopKinematics(self.model, self.loops)
-        return evaluate(self.model, rows, self.q if q is None else q, self.v)
+        return evaluate(self.model, self.kinematics, self.q if q is None else q, self.v)
+
+    def relative(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation R and position p of anchor a in anchor b."""
+        Ra, pa = anchor_placement(self.model, q, self.loop.a)
+        Rb, pb = anchor_placement(self.model, q, self.loop.b)
+        return Rb.T @ Ra, Rb.T @ (pa - pb)
 
     def moved(self, delta: FloatArray) -> FloatArray:
         """The configuration at q + delta (nv,)."""
@@ -174,15 +183,6 @@ def anchor_placement(model: pin.Model, q: FloatArray, anchor: Anchor) -> tuple[F
         rotation, origin = frame.rotation, frame.translation
     own = Rotation.from_euler("xyz", anchor.rpy).as_matrix()
     return rotation @ own, origin + rotation @ np.array(anchor.xyz)
-
-
-def relative_placement(
-    model: pin.Model, q: FloatArray, loop: LoopClosure
-) -> tuple[FloatArray, FloatArray]:
-    """Rotation R and position p of anchor a in anchor b."""
-    Ra, pa = anchor_placement(model, q, loop.a)
-    Rb, pb = anchor_placement(model, q, loop.b)
-    return Rb.T @ Ra, Rb.T @ (pa - pb)
 
 
 def extrapolated(difference: Callable[[float], FloatArray], step: float) -> FloatArray:
@@ -246,7 +246,7 @@ def test_bias_is_the_second_derivative_of_the_gap_itself(kind: str, seed: int) -
 def rows_from_placements(at: Scene, q: FloatArray) -> FloatArray:
     """The rows of every type written out, for a's rotation R and position p in b."""
     loop = at.loop
-    R, p = relative_placement(at.model, q, loop)
+    R, p = at.relative(q)
     axis, axis_a, axis_b = (np.array(u or (1, 0, 0)) for u in (loop.axis, loop.axis_a, loop.axis_b))
     n1, n2 = perpendicular_basis(axis)
     across, aligned = [n1 @ p, n2 @ p], [n1 @ R @ axis, n2 @ R @ axis]
@@ -511,7 +511,7 @@ def test_a_reversed_axis_satisfies_the_rows_but_not_the_matched_axes(kind: str) 
     turn = Rotation.from_rotvec(np.pi * perpendicular_basis(axis)[0])
     here = here.closed_at(pin.SE3(turn.as_matrix(), np.zeros(3)))
     assert_close(here.rows()[0], 0.0, atol=1e-13)
-    R, _ = relative_placement(here.model, here.q, here.loop)
+    R, _ = here.relative(here.q)
     assert np.abs(here.loop.rows.matched @ R.T - here.loop.rows.matched).max() > 0.5
 
 
@@ -591,7 +591,7 @@ def test_a_length_that_is_not_given_is_the_distance_in_the_initial_configuration
         _ = bare.rows
     mechanism = srm.Mechanism(here.model, (bare,), q0=here.q)
     (resolved,) = mechanism.loops
-    expected = np.linalg.norm(relative_placement(here.model, here.q, here.loop)[1])
+    expected = np.linalg.norm(here.relative(here.q)[1])
     assert resolved.length == pytest.approx(expected, rel=1e-14)
     other = random_state(here.model, here.rng)
     assert mechanism.with_state(*other).loops == (resolved,)  # the guess, not a later start

@@ -72,7 +72,7 @@ def placement(model: pin.Model, q: FloatArray, anchor: srm.Anchor) -> tuple[Floa
 
 
 def coordinates(element: Any) -> Coordinates:
-    """What a spring or damper acts on, y(q): a distance (1,), a joint's position (1,), or the
+    """The coordinates y(q) of a spring or damper: a distance (1,), a joint's position (1,), or the
     position and rotation vector of a in b (6,)."""
     if isinstance(element, srm.TorsionSpring):
         index = TREE.joints[TREE.getJointId(element.joint)].idx_q

@@ -25,7 +25,7 @@ def _open_chain(mechanism: srm.Mechanism) -> reduced.Field:
 
 
 def observed(name: str, solution: srm.Solution, t: np.ndarray) -> np.ndarray:
-    """What :func:`reference` gives, from a run: angle and rate of the crank, or the whole state."""
+    """The quantities of :func:`reference` in a run: angle and rate of the crank, or the state."""
     q, v = solution(t)
     if name in ("four_bar", "spatial_four_bar", "pendulum_chain"):
         return np.hstack([q, v])

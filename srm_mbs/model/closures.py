@@ -33,7 +33,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
-from srm_mbs.model.numbers import finite_number, finite_numbers, vector
+from srm_mbs.model.numbers import finite_number, finite_numbers, unit_vector
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -318,15 +318,16 @@ class LoopClosure:
             )
         kind = self.kind
         for entry in fields(self):
-            key, given = entry.name, getattr(self, entry.name) is not None
-            if not given and key in kind.needs:
+            key, missing = entry.name, getattr(self, entry.name) is None
+            if missing and key in kind.needs:
                 problem = f"a {kind.name} closure needs {entry.metadata['words']}"
                 raise self._fault(problem, entry.metadata["remedy"])
-            if given and key not in ("type", "name", *kind.needs, *kind.takes):
+            if not missing and key not in ("type", "name", *kind.needs, *kind.takes):
                 raise self._fault(f"a {kind.name} closure takes no {key}", f'Remove "{key}"')
         for key in ("axis", "axis_a", "axis_b"):
-            if getattr(self, key) is not None:
-                self._take_axis(key)
+            given = getattr(self, key)
+            if given is not None:
+                object.__setattr__(self, key, unit_vector(given, key, self._element))
         if self.length is not None:
             self._take_length()
         if self.joints is not None:
@@ -339,13 +340,6 @@ class LoopClosure:
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
-
-    def _take_axis(self, key: str) -> None:
-        axis = np.array(vector(getattr(self, key), key, self._element))
-        size = float(np.linalg.norm(axis))
-        if size == 0.0:
-            raise self._fault(f"the {key} is zero", "Give a direction")
-        object.__setattr__(self, key, tuple((axis / size).tolist()))
 
     def _take_length(self) -> None:
         length = finite_number(self.length, "length", self._element)

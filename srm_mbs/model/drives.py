@@ -20,6 +20,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
+from srm_mbs.model.numbers import unit_vector
 
 LAWS_WITH_VALUES = (Table, Polynomial, Sine)
 """Laws with a value s(0) of their own, which can prescribe positions."""
@@ -90,8 +91,8 @@ class Drive:
                 f"the law {self.law.type!r} starts from the initial value in any case",
                 "Remove absolute",
             )
-        if self.axis is not None and self.closure is not None:
-            object.__setattr__(self, "axis", self.closure.axis)
+        if self.axis is not None:
+            object.__setattr__(self, "axis", unit_vector(self.axis, "axis", self._element))
 
     @property
     def _element(self) -> str:
@@ -108,8 +109,8 @@ class Drive:
             return None
         if self.distance:
             return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL_LENGTH)
-        x, y, z = self.axis or ()
-        return LoopClosure("point_on_plane", self.a, self.b, (x, y, z), self.name)
+        axis: Any = self.axis
+        return LoopClosure("point_on_plane", self.a, self.b, axis, self.name)
 
     def frozen(self, value: float) -> LoopClosure:
         """For a point: the closure that holds its coordinate at ``value`` (m).

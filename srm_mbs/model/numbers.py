@@ -85,3 +85,19 @@ def vector(values: Any, name: str, element: str | None = None) -> tuple[float, f
     """
     x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]", element)
     return (x, y, z)
+
+
+def unit_vector(values: Any, name: str, element: str) -> tuple[float, float, float]:
+    """The direction of ``values``, called ``name`` in messages: three floats of norm 1.
+
+    Raises
+    ------
+    InputError
+        About ``element``, if they are not three finite numbers, or all zero.
+    """
+    direction = np.array(vector(values, name, element))
+    size = float(np.linalg.norm(direction))
+    if size == 0.0:
+        raise InputError(f"the {name} is zero", element=element, remedy="Give a direction")
+    x, y, z = (direction / size).tolist()
+    return (x, y, z)

@@ -22,10 +22,6 @@ from srm_mbs.model.drives import Drive
 
 _KINDS = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
 _ANCHORS = {pin.PointAnchorConstraintModel: "point", pin.FrameAnchorConstraintModel: "frame"}
-_SHIFTED = {
-    "desired_constraint_offset": "a desired offset",
-    "desired_constraint_velocity": "a desired velocity",
-}
 _KNOWN = (
     "Use RigidConstraintModel, PointAnchorConstraintModel or FrameAnchorConstraintModel, or give "
     "the closure as a srm.LoopClosure"
@@ -112,9 +108,9 @@ def _closure(model: pin.Model, constraint: Any, place: str) -> LoopClosure:
             raise _fault("it has a desired placement or velocity", place)
     if kind is None:
         raise _fault(f"there is no closure for a {type(constraint).__name__}", place)
-    for name, words in _SHIFTED.items():
-        if np.any(np.asarray(getattr(constraint, name, 0.0))):
-            raise _fault(f"it has {words}", place)
+    for what in ("offset", "velocity"):
+        if np.any(np.asarray(getattr(constraint, f"desired_constraint_{what}", 0.0))):
+            raise _fault(f"it has a desired {what}", place)
     one = int(constraint.joint1_id), constraint.joint1_placement
     two = int(constraint.joint2_id), constraint.joint2_placement
     if two[0] == 0:  # the world is b

@@ -146,9 +146,10 @@ def test_a_point_driven_along_a_line_needs_the_force_that_moves_it(backend: str)
         srm.Polynomial([7.0, 0.5, 0.3, -0.2]),
         a=srm.Anchor("bead", xyz=(0.1, 0.2, 0.3)),
         b=srm.Anchor("world", xyz=(0.0, 0.0, -1.0)),
-        axis=(0.0, 0.0, 2.0),
+        axis=np.array([0.0, 0.0, 2.0]),  # type: ignore[arg-type]
         name="lift",
     )
+    assert drive.axis == (0.0, 0.0, 1.0)
     mechanism = driven(srm.Mechanism(model, q0=[0.25]), drive)
     t = np.linspace(0.0, 1.5, 16)
     solution = srm.simulate(mechanism, 1.5, t_eval=t, backend=backend)
@@ -361,6 +362,8 @@ def refusals() -> dict[str, Callable[[], Any]]:
         "an axis for a joint": lambda: srm.Drive(SPEED, "a", axis=(0.0, 0.0, 1.0)),
         "a point without axis": lambda: srm.Drive(SPEED, None, *ends),
         "axis and distance": lambda: srm.Drive(SPEED, None, *ends, (0.0, 0.0, 1.0), distance=True),
+        "an axis of two numbers": lambda: srm.Drive(SPEED, None, *ends, (0.0, 1.0)),
+        "an axis of zeros": lambda: srm.Drive(SPEED, None, *ends, (0.0, 0.0, 0.0)),
         "an absolute speed": lambda: srm.Drive(SPEED, "a", absolute=True),
         "an unknown joint": lambda: replace(pendulum(), drives=(srm.Drive(SPEED, "x"),)),
         "a joint twice": lambda: replace(pendulum(), drives=2 * (srm.Drive(SPEED, "a"),)),

@@ -17,7 +17,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.constraints.structure import ManifoldSampler, row_names, structure_of
-from srm_mbs.model.mechanism import MechanismData
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 RESTARTS = 4
 STEPS = 4
@@ -85,6 +85,7 @@ class Mobility:
     idle: tuple[IdleMotion, ...]
 
 
+@per_model
 def mobility(mechanism: MechanismData) -> Mobility:
     """Count and analyse the degrees of freedom of ``mechanism``, whose drives take them away again.
 

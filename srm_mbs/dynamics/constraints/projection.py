@@ -50,6 +50,12 @@ def cholesky(M: FloatArray) -> FloatArray:
     return U  # type: ignore[no-any-return]
 
 
+def symmetric(M: FloatArray) -> FloatArray:
+    """M (nv, nv) whole, of which Pinocchio computes the upper triangle."""
+    upper = np.triu(M)
+    return upper + np.triu(upper, 1).T
+
+
 def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
     """L^-1 right = U^-T right, for ``right`` (n,) or (n, k)."""
     return lapack.dtrtrs(U, right, trans=1)[0]  # type: ignore[no-any-return]

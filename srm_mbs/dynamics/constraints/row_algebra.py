@@ -227,7 +227,7 @@ class DenseAlgebra:
         """Q x or Q^T x for x (nv, k), with the reflections of the rows in use."""
         if self.rank == 0:
             return x
-        out: FloatArray = lapack.dormqr(
+        return lapack.dormqr(  # type: ignore[no-any-return]
             side="L",
             trans="T" if transposed else "N",
             a=self._packed[:, : self.rank],
@@ -235,7 +235,6 @@ class DenseAlgebra:
             c=x,
             lwork=64 * x.shape[1],
         )[0]
-        return out
 
     def tangential(self, w: FloatArray) -> FloatArray:
         """See :class:`RowAlgebra`."""
@@ -399,8 +398,7 @@ def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
     rank = int(np.sum(size > cut))
 
     def solve(b: FloatArray) -> FloatArray:
-        out: FloatArray = right[:rank].T @ ((left[:, :rank].T @ b) / size[:rank])
-        return out
+        return right[:rank].T @ ((left[:, :rank].T @ b) / size[:rank])  # type: ignore[no-any-return]
 
     return RankRevealingQR(right[rank:].T, solve)
 
@@ -408,12 +406,7 @@ def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
 def null_basis(A: FloatArray, cut: float) -> FloatArray:
     """Orthonormal basis (n, n - rank) of the x with A x = 0, for A (m, n) with everything below
     ``cut`` as zero."""
-    algebra = _pivoted(A, cut)
-    if algebra is not None:
-        return algebra.complement()
-    _, size, right = np.linalg.svd(A)
-    out: FloatArray = right[int(np.sum(size > cut)) :].T
-    return out
+    return rank_revealing_qr(A, cut).null
 
 
 def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
@@ -423,8 +416,7 @@ def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
     algebra = _pivoted(A, rcond * longest)
     if algebra is not None:
         return algebra.solve(b)
-    out: FloatArray = np.asarray(np.linalg.lstsq(A, b, rcond=rcond)[0], dtype=np.float64)
-    return out
+    return np.asarray(np.linalg.lstsq(A, b, rcond=rcond)[0], dtype=np.float64)
 
 
 def smallest_singular_value(A: FloatArray, zero: float) -> float:

@@ -23,6 +23,7 @@ from srm_mbs.dynamics.constraints.projection import (
     PIVOT_ZERO,
     cholesky,
     pivoted_qr,
+    symmetric,
     unwhiten,
     whiten,
 )
@@ -110,8 +111,7 @@ class ManifoldSampler:
 
     def _evaluate(self, q: FloatArray) -> None:
         """g and G of all rows, and M in ``data``, at q."""
-        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self._rows.update(self.data, q, with_bias=False)
+        self._rows.evaluate(self.model, self.data, q)
         self._factorised = None
 
     def _scaled(self, q: FloatArray) -> FloatArray:
@@ -199,13 +199,10 @@ class ManifoldSampler:
         rows, _ = self.factorised(q)
         count = len(self.scale)
         X = np.array([rows.solve(row) for row in np.eye(count)])
-        upper = np.triu(self.data.M)
-        M = upper + np.triu(upper, 1).T
-        size = np.sqrt(np.maximum(((X @ M) * X).sum(axis=1), 0.0))
+        size = np.sqrt(np.maximum(((X @ symmetric(self.data.M)) * X).sum(axis=1), 0.0))
         # A row is no further from a span than it is long, unless it is not in use.
         used = size * np.sqrt(rows.row_squares) > 0.5
-        out: FloatArray = np.divide(1.0, size, out=np.full(count, np.nan), where=used)
-        return out
+        return np.where(used, 1.0 / np.where(used, size, 1.0), np.nan)
 
     def separate(self, samples: Sequence[FloatArray], kept: BoolArray) -> None:
         """Find eliminations for rows that are nearly parallel to others between the same bodies.

@@ -117,8 +117,7 @@ class BranchLimit:
 
     @staticmethod
     def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
-        out: FloatArray = np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
-        return out
+        return np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
 
     def _follow(self, q: FloatArray, move: FloatArray) -> FloatArray | None:
         """The configuration of the branch near q (+) move, moved off it along the normals only."""
@@ -167,12 +166,10 @@ class BranchLimit:
     def projector(self) -> FloatArray:
         """P (nv, nv) in the model's coordinates."""
         nv = len(self._unit)
-        out: FloatArray = self._normal[:, :nv] * self._unit[:, None] / self._unit
-        return out
+        return self._normal[:, :nv] * self._unit[:, None] / self._unit
 
     def _off(self, normal: FloatArray, v: FloatArray) -> FloatArray:
-        out: FloatArray = normal @ self._geometry.rates(v) * self._unit
-        return out
+        return normal @ self._geometry.rates(v) * self._unit
 
     def off_branch(self, v: FloatArray) -> FloatArray:
         """P v - E s' (nv,): the part of the velocity v (nv,) that leads off the branch."""
@@ -184,8 +181,7 @@ class BranchLimit:
             acceleration = self._centre.limit_acceleration(v, np.zeros(len(v)))
             return -acceleration if acceleration is not None else np.zeros(len(v))
         bias = self._geometry.bias(node, self._geometry.rates(v))
-        out: FloatArray = self._generalised_inverse(node, bias[:, None])[:, 0] * self._unit
-        return out
+        return self._generalised_inverse(node, bias[:, None])[:, 0] * self._unit
 
     def quadratic(self, v: FloatArray) -> FloatArray:
         """z = E (Gdot v - s'') (nv,) at q for the velocity v (nv,), model coordinates."""
@@ -222,8 +218,7 @@ def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray
     normal = null - tangent @ (tangent.T @ null)
     effects = np.array([(singular.hessians(t) @ normal).ravel() for t in tangent.T]).T
     wanted = effects @ (tangent.T @ u)
-    out: FloatArray = tangent @ determined_solution(effects, wanted)
-    return out
+    return tangent @ determined_solution(effects, wanted)
 
 
 def branch_limit(

@@ -37,8 +37,7 @@ def _two_lines(form: FloatArray) -> FloatArray:
     if not (low < 0.0 < high and min(-low, high) > ISOLATED * max(-low, high)):
         return np.zeros((0, 2))
     along = np.sqrt(np.array([high, -low]) / (high - low))
-    out: FloatArray = np.array([vectors @ along, vectors @ (along * [1.0, -1.0])])
-    return out
+    return np.array([vectors @ along, vectors @ (along * [1.0, -1.0])])
 
 
 def _newton(forms: FloatArray, metric: FloatArray, target: FloatArray | None) -> FloatArray:
@@ -75,8 +74,7 @@ def _newton(forms: FloatArray, metric: FloatArray, target: FloatArray | None) ->
             break
     good = np.abs(residual).max(axis=1) <= SOLVED
     good &= np.linalg.svd(matrix, compute_uv=False)[:, -1] > ISOLATED
-    out: FloatArray = w[good]
-    return out
+    return w[good]  # type: ignore[no-any-return]
 
 
 def branch_tangents(

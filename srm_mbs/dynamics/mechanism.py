@@ -53,12 +53,12 @@ class Mechanism(MechanismData):
 
     @property
     def structure(self) -> Structure:
-        """Rank, redundancy and scales of the closures, by the walk of docs/notation.md."""
+        """Rank, redundancy and scales of the closures (docs/notation.md, "Load-time analysis")."""
         return structure_of(self)
 
     @property
     def mobility(self) -> Mobility:
-        """Gruebler counts against the true rank, redundant rows, joints that are stuck or idle."""
+        """Gruebler's count and the rank, redundant rows, joints that are stuck or idle."""
         return mobility(self)
 
     @property

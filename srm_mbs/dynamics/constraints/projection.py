@@ -179,7 +179,7 @@ class Projection:
     rank
         Structural rank: the number of pivots that are used in a regular configuration.
     sigma_ref
-        Median of the last structural pivot over the closed samples of the load-time walk.
+        Median of the last structural pivot over the closed samples of the load-time analysis.
     order
         The rows along the graph of the loops, for many of them; see
         :func:`~srm_mbs.dynamics.constraints.row_algebra.graph_order`.

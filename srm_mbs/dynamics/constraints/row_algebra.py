@@ -207,7 +207,6 @@ class DenseAlgebra:
         self.pivots = self.row_squares = np.zeros(0)
 
     def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
-        """See :class:`RowAlgebra`."""
         self._U = None if M is None else cholesky(M)
         W = G.T if self._U is None else whiten(self._U, G.T)
         self.row_squares = (W * W).sum(axis=0)
@@ -237,14 +236,12 @@ class DenseAlgebra:
         )[0]
 
     def tangential(self, w: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
         white = (w if self._U is None else self._U @ w)[:, None]
         inside = self._times_q(white, transposed=True)
         inside[: self.rank] = 0.0
         return self._coloured(self._times_q(inside)[:, 0])
 
     def solve(self, g: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
         x = np.zeros((self._packed.shape[0], 1))
         if self.rank:
             R = self._packed[: self.rank, : self.rank]
@@ -252,7 +249,6 @@ class DenseAlgebra:
         return self._coloured(self._times_q(x)[:, 0])
 
     def multiplier(self, white: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
         out = np.zeros(self._packed.shape[1])
         if self.rank:
             R = self._packed[: self.rank, : self.rank]
@@ -261,7 +257,6 @@ class DenseAlgebra:
         return out
 
     def complement(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
         nv = self._packed.shape[0]
         return self._times_q(np.eye(nv)[:, self.rank :])
 
@@ -270,81 +265,68 @@ class DenseAlgebra:
 
 
 class CompiledAlgebra:
-    """:class:`RowAlgebra` by the kernel: sparse where that pays."""
+    """:class:`RowAlgebra` by the kernel's ``algebra``: sparse where that pays."""
 
-    def __init__(self, kernel_system: Any) -> None:
-        self._kernel_system = kernel_system
+    def __init__(self, algebra: Any) -> None:
+        self._algebra = algebra
         self._one: FloatArray | None = None
 
     @property
     def entries(self) -> int:
         """Numbers that Q and R hold."""
-        return self._kernel_system.entries  # type: ignore[no-any-return]
+        return self._algebra.entries  # type: ignore[no-any-return]
 
     @property
     def rank(self) -> int:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.rank  # type: ignore[no-any-return]
+        return self._algebra.rank  # type: ignore[no-any-return]
 
     @property
     def pivots(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        falling: FloatArray = np.sort(self._kernel_system.pivots)[::-1]
-        return falling
+        return np.sort(self._algebra.pivots)[::-1]
 
     @property
     def row_squares(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.row_squares  # type: ignore[no-any-return]
+        return self._algebra.row_squares  # type: ignore[no-any-return]
 
     def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
-        """See :class:`RowAlgebra`."""
         if M is None:
             if self._one is None:
                 self._one = np.eye(G.shape[1])
             M = self._one
         try:
-            self._kernel_system.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
+            self._algebra.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
         except ArithmeticError:
             cholesky(M)  # raises if the fault is in the mass matrix
             raise EvaluationError("the closures are not finite") from None
 
     def tangential(self, w: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
+        return self._algebra.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
 
     def solve(self, g: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
+        return self._algebra.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
 
     def multiplier(self, white: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
+        return self._algebra.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
 
     def complement(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        basis: FloatArray = self._kernel_system.complement()
-        return basis.T
+        return self._algebra.complement().T  # type: ignore[no-any-return]
 
 
-def row_algebra(
-    pattern: BoolArray, model: pin.Model | None = None, choice: str = "auto"
-) -> RowAlgebra:
-    """The algebra of rows with entries where ``pattern`` (rows, nv) is true.
+def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebra:
+    """The algebra of rows with entries where ``pattern`` (rows, nv) is true: by the kernel for
+    more than ``KERNEL_ABOVE`` coordinates, otherwise by LAPACK.
 
     Parameters
     ----------
     model
         The tree, if M is its mass matrix, and not 1.
-    choice
-        ``"dense"``: LAPACK; ``"kernel"``: the kernel; ``"auto"``: the kernel for many coordinates.
     """
     from srm_mbs._kernel import core
 
     rows, nv = pattern.shape
     parents = [-1] * nv if model is None else coordinate_parents(model)
     order = graph_order(pattern, parents)
-    if core is None or choice == "dense" or (choice == "auto" and nv <= KERNEL_ABOVE) or not rows:
+    if core is None or nv <= KERNEL_ABOVE or not rows:
         return DenseAlgebra(order)
     supports = [np.flatnonzero(p).tolist() for p in pattern]
     return CompiledAlgebra(

@@ -544,10 +544,10 @@ def test_rows_are_balanced_where_the_last_pivot_would_be_small_everywhere(
 @pytest.mark.parametrize("name", ["bricard", "delta_robot", "squeezing_mechanism", "n_four_bar_40"])
 def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: str) -> None:
     mechanism = load(name)
-    walker = ManifoldSampler(mechanism, mechanism.structure.units)
-    walker.set_scale(mechanism, np.random.default_rng(0))
-    q = next(walker.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
-    found = walker.distances(q)
+    sampler = ManifoldSampler(mechanism, mechanism.structure.units)
+    sampler.set_scale(np.random.default_rng(0))
+    q = next(sampler.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
+    found = sampler.distances(q)
     used = np.flatnonzero(np.isfinite(found))
     assert len(used) == mechanism.structure.rank
     model, data = mechanism.model, mechanism.model.createData()
@@ -555,7 +555,7 @@ def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: s
     M = np.triu(pin.crba(model, data, q, pin.Convention.WORLD))
     rows.update(data, q, with_bias=False)
     L = np.linalg.cholesky(M + np.triu(M, 1).T)
-    W = np.linalg.solve(L, (rows.G / walker.scale[:, None]).T)[:, used]
+    W = np.linalg.solve(L, (rows.G / sampler.scale[:, None]).T)[:, used]
     for k, distance in enumerate(found[used]):
         others = np.delete(W, k, axis=1)
         nearest = others @ np.linalg.lstsq(others, W[:, k], rcond=None)[0]

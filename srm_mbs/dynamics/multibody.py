@@ -78,34 +78,43 @@ class OpenTerms:
 
 
 class ClosedTerms:
-    """Terms of one stage of a closed-loop mechanism."""
+    """Terms of one stage of a closed-loop mechanism, which the factorisation of the system has.
 
-    def __init__(
-        self,
-        projection: Projection,
-        loops: DrivenKinematics,
-        residual_scale: FloatArray,
-        driven: bool,
-    ) -> None:
-        self._p = projection
-        self._loops = loops
-        self._driven = driven
-        self._residual_scale = residual_scale
-        self.v = np.zeros(0)
-        self.predicted: FloatArray | None = None
-        self.sigma = projection.sigma
-        self.rank_deficient = projection.rank_deficient
+    Parameters
+    ----------
+    system
+        The mechanism, with the rows and the factorisation at the stage.
+    v : (nv,)
+        Velocity.
+    predicted : (nv,) or None
+        yhat of the zone, of which the part of dropped rows is used.
+    """
+
+    def __init__(self, system: ClosedSystem, v: FloatArray, predicted: FloatArray | None) -> None:
+        self._p = system.projection
+        self._loops = system.loops
+        self._residual_scale = system.residual_scale
+        self._driven = bool(system.mechanism.drives)
+        self._v, self._predicted = v, predicted
+
+    @property
+    def sigma(self) -> float:
+        return self._p.sigma
 
     @property
     def rank(self) -> int:
         return self._p.rank
 
+    @property
+    def rank_deficient(self) -> bool:
+        return self._p.rank_deficient
+
     def _completed(self, white: FloatArray) -> FloatArray:
         """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
-        if self.predicted is None:
+        if self._predicted is None:
             return white
         p = self._p
-        prediction = p.U @ self.predicted
+        prediction = p.U @ self._predicted
         return white + prediction - p.Q @ (p.Q.T @ prediction)
 
     @property
@@ -113,14 +122,14 @@ class ClosedTerms:
         return self._p.held is not None
 
     def normals(self) -> FloatArray:
-        return np.zeros((self.v.size, 0)) if self._driven else self._p.normals()
+        return np.zeros((self._v.size, 0)) if self._driven else self._p.normals()
 
     def _white_multiplier(self) -> FloatArray:
         return self._completed(self._p.white_multiplier)
 
     def rate(self) -> FloatArray:
         p = self._p
-        return np.concatenate([self.v, p.unwhiten(p.white_force - self._white_multiplier())])
+        return np.concatenate([self._v, p.unwhiten(p.white_force - self._white_multiplier())])
 
     def multiplier(self) -> FloatArray:
         return self._p.unwhiten(self._white_multiplier())
@@ -143,13 +152,13 @@ class ClosedTerms:
     def correction(self) -> FloatArray:
         p = self._p
         position = p.normal(self._loops.g[p.order])
-        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self.v))])
+        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self._v))])
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         p = self._p
         position = p.unwhiten(p.normal(self._loops.g[p.order]))
-        white = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
-        rate = np.concatenate([self.v - position / eps, p.unwhiten(p.white_force - white)])
+        white = self._completed(self._white_rates(previous + self._v / eps, 1.0 / eps))
+        rate = np.concatenate([self._v - position / eps, p.unwhiten(p.white_force - white)])
         return rate, p.unwhiten(white)
 
 
@@ -360,7 +369,7 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
-        self._residual_scale = _residual_scale(mechanism)
+        self.residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
 
@@ -375,11 +384,6 @@ class ClosedSystem(Mechanics):
         M: FloatArray = self.data.M  # a view on what crba writes
         return M
 
-    @cached_property
-    def _terms(self) -> ClosedTerms:
-        driven = bool(self.mechanism.drives)
-        return ClosedTerms(self.projection, self.loops, self._residual_scale, driven)
-
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
         own = super().constants()
@@ -387,7 +391,7 @@ class ClosedSystem(Mechanics):
 
     def constants_of_start(self) -> dict[str, Any]:
         """As for open mechanisms, and the scales of the closures."""
-        return super().constants_of_start() | {"gap_scale": self._residual_scale}
+        return super().constants_of_start() | {"gap_scale": self.residual_scale}
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""
@@ -445,14 +449,10 @@ class ClosedSystem(Mechanics):
         projection = self.projection
         threshold = None if zone is None else zone.threshold
         projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
-        terms = self._terms
-        terms.v = v
-        terms.sigma = projection.sigma
-        terms.rank_deficient = projection.rank_deficient
-        terms.predicted = None
+        predicted = None
         if projection.rank_deficient and zone is not None:
-            terms.predicted = zone.predict(t)
-            if terms.predicted is None:
+            predicted = zone.predict(t)
+            if predicted is None:
                 if zone.normals is None:
                     raise EvaluationError(
                         "the motion stays next to a singular configuration with too little "
@@ -462,12 +462,12 @@ class ClosedSystem(Mechanics):
                         "lead to one that it cannot pass"
                     )
                 projection.hold(zone.normals)
-        return terms
+        return ClosedTerms(self, v, predicted)
 
     def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""
         g, _ = self.residuals(state, t)
-        return float(np.max(np.abs(g) * self._residual_scale))
+        return float(np.max(np.abs(g) * self.residual_scale))
 
     def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Scaled g - s (m,) and G v - s' (m,) of the kept rows at the time t (s)."""

@@ -49,7 +49,7 @@ SERIES = _bernoulli_terms(14)
 
 @dataclass(frozen=True)
 class GroupJoint:
-    """A joint whose configuration is a non-commutative Lie group."""
+    """A joint whose configurations are a Lie group that does not commute."""
 
     group: str
     """``so3``, ``se3`` or ``se2``."""
@@ -62,24 +62,16 @@ class GroupJoint:
     def ad(self, u: FloatArray) -> FloatArray:
         """Matrix of w -> [u, w] in Pinocchio's order (linear, angular)."""
         if self.group == "so3":
-            return _skew(u)
-        if self.group == "se2":
-            x, y, w = u
-            return np.array([[0.0, -w, y], [w, 0.0, -x], [0.0, 0.0, 0.0]])
-        out = np.zeros((6, 6))
-        out[:3, :3] = out[3:, 3:] = _skew(u[3:])
-        out[:3, 3:] = _skew(u[:3])
-        return out
+            return pin.skew(u)  # type: ignore[no-any-return]
+        if self.group == "se3":
+            return pin.Motion(u).action  # type: ignore[no-any-return]
+        x, y, w = u
+        return np.array([[0.0, -w, y], [w, 0.0, -x], [0.0, 0.0, 0.0]])
 
     def rotation(self, v: FloatArray) -> float:
         """Size of the joint's angular part of a whole tangent vector v (nv,): rad or rad/s."""
         angular = {"so3": 0, "se3": 3, "se2": 2}[self.group]
         return float(np.linalg.norm(v[self.start + angular : self.start + self.size]))
-
-
-def _skew(w: FloatArray) -> FloatArray:
-    x, y, z = w
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def group_joints(model: pin.Model) -> tuple[GroupJoint, ...]:
@@ -142,7 +134,7 @@ def dexp_inverse(joint: GroupJoint, u: FloatArray, v: FloatArray) -> FloatArray:
     """
     ad = joint.ad(u)
     w = ad @ v
-    out: FloatArray = v + 0.5 * w
+    out = v + 0.5 * w
     for coefficient in SERIES:
         w = ad @ w
         term = coefficient * w
@@ -177,7 +169,7 @@ def _angle_pairs(mechanism: MechanismData) -> IndexArray:
 
 @per_start
 def _caps(mechanism: Mechanism) -> FloatArray:
-    """Largest size (2 nv,) that a component of a state counts as in :meth:`Manifold.magnitudes`."""
+    """Largest scale (2 nv,) of a component of a state in :meth:`Manifold.state_scale`."""
     unit = mechanism.structure.units.coordinate
     return np.concatenate([unit, np.full(mechanism.model.nv, np.inf)])
 
@@ -276,7 +268,7 @@ class Manifold:
 
     def rate_change(self, delta: FloatArray) -> FloatArray:
         """(dv, 0); see :class:`~srm_mbs.dynamics.system.System`."""
-        out: FloatArray = np.zeros(delta.shape)
+        out = np.zeros(delta.shape)
         out[..., : self.nv] = delta[..., self.nv :]
         return out
 
@@ -290,8 +282,7 @@ class Manifold:
         Angles are capped at 1 rad so that the accuracy does not decay with the number of turns.
         """
         if self._flat:
-            sizes: FloatArray = np.minimum(np.abs(state), self._caps)
-            return sizes
+            return np.minimum(np.abs(state), self._caps)
         q, v = self.split(state)
         position = self._unit.copy()
         vector = self._position_of >= 0

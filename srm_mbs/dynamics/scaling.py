@@ -1,7 +1,7 @@
 """Units of coordinates, rows and rates.
 
-Tolerances and step rules count in them, so that the same mechanism in millimetres, with other
-masses or on another time scale, takes the same steps.
+Tolerances and rules for steps count in these units, so that the same mechanism in millimetres, with
+other masses or on another time scale, takes the same steps.
 """
 
 from __future__ import annotations
@@ -176,39 +176,28 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
 
 def _gyration(model: pin.Model) -> float:
     """The largest radius of gyration (m) of a body about its centre of mass."""
-    return max(
-        (
-            # Lumping and shifting may round the trace of a point mass to a negative number.
-            float(np.sqrt(max(np.trace(body.inertia), 0.0) / body.mass))
-            for body in model.inertias.tolist()
-            if body.mass > 0.0
-        ),
-        default=0.0,
-    )
+    massive = [body for body in model.inertias.tolist() if body.mass > 0.0]
+    # Lumping and shifting may round the trace of a point mass to a negative number.
+    squares = [max(np.trace(body.inertia), 0.0) / body.mass for body in massive]
+    return float(np.sqrt(max(squares, default=0.0)))
 
 
 @per_model
 def _anchors(mechanism: MechanismData) -> list[tuple[int, FloatArray]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
-    found = []
-    driven = [anchor for drive in mechanism.drives for anchor in (drive.a, drive.b)]
-    for anchors in (*(loop.anchors for loop in mechanism.loops), driven):
-        for anchor in anchors:
-            if anchor is None:
-                continue
-            joint, placement = anchor.resolve(mechanism.model)
-            found.append((joint, placement.translation.copy()))
-    return found
+    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
+    places = [anchor.resolve(mechanism.model) for loop in closures for anchor in loop.anchors]
+    return [(joint, placement.translation.copy()) for joint, placement in places]
 
 
 def _acceleration_by_forces(mechanism: MechanismData, q: FloatArray) -> FloatArray:
     """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
     model = mechanism.model
     forces = resolved_forces(mechanism)
-    data = workspace(model)
     rest = np.zeros(model.nv)
     if forces is None:
         return rest
+    data = workspace(model)
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, rest)
     try:

@@ -13,7 +13,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from tests.support import maximal, reduced
 from tests.support.bundled import load
-from tests.support.mechanisms import rescaled
+from tests.support.mechanisms import add_link, rescaled, with_slider_mass
 from tests.support.references import observed, reference
 
 # Powers of four scale every quantity, square roots included, without rounding.
@@ -111,18 +111,6 @@ def _observed_in_units(name: str, solution: srm.Solution, t: np.ndarray, time: f
     return np.column_stack([angle, v[:, 0] * time])
 
 
-def slider_of(mass: float) -> srm.Mechanism:
-    """slider_crank_slider with another mass (kg) of the slider."""
-    base = load("slider_crank_slider")
-    model = base.model.copy()
-    slider = model.getJointId("slider")
-    inertia = model.inertias[slider]
-    model.inertias[slider] = pin.Inertia(
-        mass, inertia.lever, inertia.inertia * (mass / inertia.mass)
-    )
-    return srm.Mechanism(model, base.loops, q0=base.q0, v0=base.v0)
-
-
 def screwed(pitch: float) -> srm.Mechanism:
     """slider_crank_slider with its slider of 0.5 kg on a screw of ``pitch`` (m/rad): its coordinate
     is an angle, as behind a reduction gear."""
@@ -137,9 +125,8 @@ def screwed(pitch: float) -> srm.Mechanism:
             unit[joint.idx_v] = 1.0 / pitch
             joint = pin.JointModelHX(pitch)
             inertia = pin.Inertia(inertia.mass, np.zeros(3), np.zeros((3, 3)))
-        index = model.addJoint(base.model.parents[j], joint, base.model.jointPlacements[j], name)
-        model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
-        model.addBodyFrame(name, index, pin.SE3.Identity(), 0)
+        place = base.model.jointPlacements[j]
+        add_link(model, base.model.parents[j], joint, name, inertia, place)
     (pin_,) = base.loops
     # The rows in the rod's axes: those of the slider would turn with the screw.
     loop = srm.LoopClosure("point", pin_.b, pin_.a, name="pin")
@@ -172,7 +159,7 @@ def passages(field: Any, start: list[float], t: np.ndarray) -> int:
 @pytest.mark.parametrize("exponent", [-6, -3, 1, 6])
 def test_the_mass_of_the_slider_changes_no_branch(exponent: int) -> None:
     mass = 10.0**exponent
-    mechanism = slider_of(mass)
+    mechanism = with_slider_mass(mass)
     solution = srm.simulate(mechanism, 5.0, rtol=1e-8)
     assert solution.success
     t = np.linspace(0.0, 5.0, 101)[1:]
@@ -240,8 +227,8 @@ def test_points_that_coincide_but_for_rounding_give_no_length(at: float) -> None
     model = pin.Model()
     for name, offset in (("a", 0.0), ("b", at)):
         place = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.3 + offset]))
-        index = model.addJoint(0, pin.JointModelRZ(), place, name)
-        model.appendBodyToJoint(index, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+        inertia = pin.Inertia(1.0, np.zeros(3), np.eye(3))
+        add_link(model, 0, pin.JointModelRZ(), name, inertia, place)
     units = srm.Mechanism(model, q0=[0.1, 0.2]).structure.units
     assert units.length == 1.0
     assert units.rate == pytest.approx(np.sqrt(9.81))

@@ -9,6 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.system import Terms
 from srm_mbs.formats.load import models_folder
 
 CLOSED_MODELS = tuple(
@@ -31,6 +33,12 @@ def rod(mass: float = 1.0, length: float = 1.0, thickness: float = 0.24) -> pin.
 
 def along_x(distance: float) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array([distance, 0.0, 0.0]))
+
+
+def start_terms(mechanism: srm.Mechanism) -> Terms:
+    """The terms of the reference at the start."""
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    return make_system(mechanism).evaluate(0.0, state)
 
 
 def add_link(

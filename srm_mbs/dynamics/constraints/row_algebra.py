@@ -190,13 +190,6 @@ class RowAlgebra(Protocol):
     def solve(self, g: FloatArray) -> FloatArray:
         """E g (nv,): the shortest x in the metric M with G x = g (rows,) in the rows in use."""
 
-    def multiplier(self, white: FloatArray) -> FloatArray:
-        """Pi R^-1 Q^T white (rows,), zero in rows that are not in use: the transpose of
-        :meth:`solve` where M = 1."""
-
-    def complement(self) -> FloatArray:
-        """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
-
 
 class DenseAlgebra:
     """:class:`RowAlgebra` by LAPACK, with pivots along ``order`` if there is one."""
@@ -248,18 +241,6 @@ class DenseAlgebra:
             x[: self.rank, 0] = whiten(R, g[self._order[: self.rank]])
         return self._coloured(self._times_q(x)[:, 0])
 
-    def multiplier(self, white: FloatArray) -> FloatArray:
-        out = np.zeros(self._packed.shape[1])
-        if self.rank:
-            R = self._packed[: self.rank, : self.rank]
-            inside = self._times_q(white[:, None], transposed=True)[: self.rank, 0]
-            out[self._order[: self.rank]] = unwhiten(R, inside)
-        return out
-
-    def complement(self) -> FloatArray:
-        nv = self._packed.shape[0]
-        return self._times_q(np.eye(nv)[:, self.rank :])
-
     def _coloured(self, white: FloatArray) -> FloatArray:
         return white if self._U is None else unwhiten(self._U, white)
 
@@ -306,9 +287,12 @@ class CompiledAlgebra:
         return self._algebra.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
 
     def multiplier(self, white: FloatArray) -> FloatArray:
+        """Pi R^-1 Q^T white (rows,), zero in rows that are not in use: the transpose of
+        :meth:`solve` where M = 1."""
         return self._algebra.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
 
     def complement(self) -> FloatArray:
+        """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
         return self._algebra.complement().T  # type: ignore[no-any-return]
 
 
@@ -372,7 +356,7 @@ class RankRevealingQR:
 
 
 def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
-    """A (m, n) with everything below ``cut`` as zero."""
+    """Null space and solution of A (m, n)."""
     algebra = _pivoted(A, cut)
     if algebra is not None:
         return RankRevealingQR(algebra.complement(), algebra.solve)
@@ -418,7 +402,7 @@ def singular_value(A: FloatArray, k: int) -> float:
     return float(np.linalg.svd(A, compute_uv=False)[k - 1])
 
 
-def _pivoted(A: FloatArray, cut: float) -> RowAlgebra | None:
+def _pivoted(A: FloatArray, cut: float) -> CompiledAlgebra | None:
     """The factorisation of A by the kernel, if it is there and A has many columns."""
     if A.shape[1] <= ARPACK_ABOVE:
         return None

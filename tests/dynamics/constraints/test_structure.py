@@ -16,7 +16,6 @@ from srm_mbs.dynamics.constraints.projection import symmetric
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.constraints.structure import ManifoldSampler, Structure, analyse
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.dynamics.system import Terms
 from tests.support.bundled import load
 from tests.support.mechanisms import (
     add_link,
@@ -24,6 +23,7 @@ from tests.support.mechanisms import (
     floating_ring,
     rescaled,
     rod,
+    start_terms,
     with_slider_mass,
 )
 
@@ -71,12 +71,6 @@ def started(name: str, q: list[float], v: list[float] | None = None) -> srm.Mech
     """A bundled mechanism analysed from another start."""
     mechanism = load(name)
     return srm.Mechanism(mechanism.model, mechanism.loops, np.array(q), v)
-
-
-def start_terms(mechanism: srm.Mechanism) -> Terms:
-    """The terms at the start."""
-    state = np.concatenate([mechanism.q0, mechanism.v0])
-    return make_system(mechanism).evaluate(0.0, state)
 
 
 def same(a: Structure, b: Structure) -> bool:

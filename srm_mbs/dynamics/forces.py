@@ -65,20 +65,20 @@ class Evaluator(ABC):
         does; None for functions of the user, which the kernel calls."""
 
 
-class HeldAnchor:
-    """An anchor: a frame on a body."""
+class ResolvedAnchor:
+    """An anchor as a frame on the body of a joint, 0 for the world."""
 
     def __init__(self, model: pin.Model, anchor: Anchor) -> None:
-        self.joint, self.inside = anchor.resolve(model)
+        self.joint, self.in_joint = anchor.resolve(model)
         self.support = support(model, self.joint)
 
     def constants(self) -> tuple[int, FloatArray]:
         """Joint, and placement in its axes as numbers, for the compiled kernel."""
-        return self.joint, placement_numbers(self.inside)
+        return self.joint, placement_numbers(self.in_joint)
 
     def placement(self, data: pin.Data) -> pin.SE3:
-        """Of the frame in the world."""
-        return data.oMi[self.joint] * self.inside if self.joint else self.inside
+        """Placement of the frame in the world."""
+        return data.oMi[self.joint] * self.in_joint if self.joint else self.in_joint
 
     def velocity(self, data: pin.Data) -> pin.Motion:
         """Spatial velocity of the body, in world axes at the world origin."""
@@ -133,7 +133,7 @@ class SpringDamperEvaluator(Evaluator):
 
     def __init__(self, model: pin.Model, force: SpringDamper) -> None:
         self.name = force.name
-        self.a, self.b = HeldAnchor(model, force.a), HeldAnchor(model, force.b)
+        self.a, self.b = ResolvedAnchor(model, force.a), ResolvedAnchor(model, force.b)
         self.support = self.a.support - self.b.support
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_length = float(force.rest_length or 0.0)
@@ -180,7 +180,7 @@ class WrenchEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.Wrench`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Wrench) -> None:
-        self.at = HeldAnchor(model, force.at)
+        self.at = ResolvedAnchor(model, force.at)
         self.turns = force.frame == "link"
         self.wrench = ValuesOverTime([*force.force, *force.moment], force.law)
 
@@ -205,7 +205,7 @@ class BushingEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Bushing) -> None:
-        self.a, self.b = HeldAnchor(model, force.a), HeldAnchor(model, force.b)
+        self.a, self.b = ResolvedAnchor(model, force.a), ResolvedAnchor(model, force.b)
         self.support = self.a.support - self.b.support
         self.stiffness = np.array(force.stiffness, dtype=float)
         self.damping = np.array(force.damping, dtype=float)
@@ -329,7 +329,7 @@ class _UserForceEvaluator(Evaluator):
 
     def __init__(self, model: pin.Model, force: UserForce) -> None:
         self.name, self.function = f"the force {force.name!r}", force.function
-        self.at = None if force.at is None else HeldAnchor(model, force.at)
+        self.at = None if force.at is None else ResolvedAnchor(model, force.at)
         self.size = model.nv if force.at is None else 6
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -183,21 +182,10 @@ class Manifold:
         self.nq, self.nv = model.nq, model.nv
         self.tangent_size = 2 * self.nv
         self._groups = _groups(mechanism)
+        self._planar = [joint for joint in self._groups if joint.group == "se2"]
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
         self._position_of = _vector_coordinates(mechanism)
-
-    @cached_property
-    def _caps(self) -> FloatArray:
-        return _caps(self.mechanism)
-
-    @cached_property
-    def _planar(self) -> tuple[GroupJoint, ...]:
-        return tuple(joint for joint in self._groups if joint.group == "se2")
-
-    @cached_property
-    def _wrapped_angles(self) -> IndexArray:
-        return _angle_pairs(self.mechanism)
 
     def chart_constants(self) -> dict[str, Any]:
         """Constants for the compiled kernel, independent of the start."""
@@ -205,7 +193,7 @@ class Manifold:
             "position_of": [int(i) for i in self._position_of],
             "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
             "series": np.array(SERIES),
-            "turning": [int(i) for i in self._wrapped_angles],
+            "turning": [int(i) for i in _angle_pairs(self.mechanism)],
             "largest_rotation": LARGEST_ROTATION,
             "farthest_node": FARTHEST_NODE,
             "rotation_per_step": ROTATION_PER_STEP,
@@ -249,7 +237,7 @@ class Manifold:
         moved = self.retract(start, delta)
         delta[: self.nv] += pin.difference(self.model, moved[:nq], end[:nq])
         if near is not None:
-            turning = self._wrapped_angles
+            turning = _angle_pairs(self.mechanism)
             turns = np.round((near[turning] - delta[turning]) / (2.0 * np.pi))
             delta[turning] += 2.0 * np.pi * turns
         return delta
@@ -282,7 +270,7 @@ class Manifold:
         Angles are capped at 1 rad so that the accuracy does not decay with the number of turns.
         """
         if self._flat:
-            return np.minimum(np.abs(state), self._caps)
+            return np.minimum(np.abs(state), _caps(self.mechanism))
         q, v = self.split(state)
         position = self._unit.copy()
         vector = self._position_of >= 0

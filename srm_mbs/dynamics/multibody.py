@@ -24,11 +24,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import (
-    GRAPH_ORDER_ABOVE,
-    coordinate_parents,
-    graph_order,
-)
+from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
@@ -347,9 +343,7 @@ def _rows_in_use(mechanism: Mechanism) -> DrivenKinematics:
 
 @per_model
 def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
-    """The rows in use along the graph of the loops, if there are many coordinates."""
-    if mechanism.model.nv <= GRAPH_ORDER_ABOVE:  # every pivot order is cheap
-        return ()
+    """The rows in use along the graph of the loops; () for few coordinates."""
     return graph_order(_rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
 
 
@@ -378,11 +372,6 @@ class ClosedSystem(Mechanics):
         """The rows of closures and drives that are in use, with memory of their own."""
         curves = self.mechanism.drive_curves
         return _rows_in_use(self.mechanism).copy_workspace().follow(curves)
-
-    @cached_property
-    def _mass_matrix(self) -> FloatArray:
-        M: FloatArray = self.data.M  # a view on what crba writes
-        return M
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
@@ -448,7 +437,7 @@ class ClosedSystem(Mechanics):
         loops.move_to(t)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
-        projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
+        projection.factor(data.M, loops.G, f, loops.bias, threshold)
         predicted = None
         if projection.rank_deficient and zone is not None:
             predicted = zone.predict(t)

@@ -200,14 +200,14 @@ class DriveRows:
             [d.curve(starts[d.name])(0.0) for d in in_order_of_rows(mechanism.drives)]
         ).reshape(-1, 3)
         self.rates = moving[:, 1] / self._row_unit
-        self._bends = moving[:, 2] / self._row_unit
+        self._accelerations = moving[:, 2] / self._row_unit
         self._kinematics.evaluate(self._model, self._data, q)
         self.rows = self._kinematics.G / self._row_unit[:, None] * self._unit
 
     def bias(self, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (k,) for the rates u (nv,) in units."""
         self._kinematics.evaluate(self._model, self._data, self._q, u * self._unit)
-        return self._kinematics.bias / self._row_unit - self._bends
+        return self._kinematics.bias / self._row_unit - self._accelerations
 
 
 class DrivenGeometry(ClosureGeometry):
@@ -243,8 +243,8 @@ class DrivenGeometry(ClosureGeometry):
         self._rows = DrivenKinematics(self.model, mechanism.loops, drives).follow(curves)
         fastest = units.rate
         for drive, unit in zip(drives, self.row_unit[closures:].tolist()):
-            _, rate, bend = curves[drive.name](0.0 if t is None else t)
-            fastest = max(fastest, abs(rate) / unit, float(np.sqrt(abs(bend) / unit)))
+            _, rate, acceleration = curves[drive.name](0.0 if t is None else t)
+            fastest = max(fastest, abs(rate) / unit, float(np.sqrt(abs(acceleration) / unit)))
         self.unit = np.append(self.coordinate_unit, 1.0 / fastest)
 
     @cached_property

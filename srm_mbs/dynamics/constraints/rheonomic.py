@@ -116,10 +116,10 @@ class DrivenKinematics(LoopKinematics):
     def move_to(self, t: float) -> None:
         """Subtract s, s' and s'' at t (s) from the rows of :meth:`update`."""
         for (row, factor, _, _, wound), curve in zip(self._driven, self._curves):
-            s, rate, bend = curve(t)
+            s, rate, acceleration = curve(t)
             self.g[row] -= factor * s
             self.target_rate[row] = factor * rate
-            self.bias[row] -= factor * bend
+            self.bias[row] -= factor * acceleration
             if wound:  # of all turns the nearest
                 self.g[row] = factor * math.remainder(self.g[row] / factor, 2.0 * math.pi)
 

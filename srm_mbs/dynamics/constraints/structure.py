@@ -103,10 +103,11 @@ class ManifoldSampler:
         pattern = self._pattern = self._rows.pattern()
         closures = [loop for loop in mechanism.loops for _ in loop.row_names]
         self._anchored = [row for row, loop in enumerate(closures) if not loop.rows.joint_rows]
+        # All rows and those of the loops in the mass metric, those of the loops in units.
         self._all = row_algebra(pattern, self.model)
         driven = self.closed < len(self.scale)
         self._loops = row_algebra(pattern[: self.closed], self.model) if driven else self._all
-        self._plain = row_algebra(pattern[: self.closed])
+        self._in_units = row_algebra(pattern[: self.closed])
         self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
@@ -149,10 +150,10 @@ class ManifoldSampler:
                 by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
                 try:
                     longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
-                    self._plain.factor(None, by_unit, CLOSING_RANK * longest)
+                    self._in_units.factor(None, by_unit, CLOSING_RANK * longest)
                 except EvaluationError:
                     return None
-                return pin.integrate(self.model, q, -self._plain.solve(g) * unit)  # type: ignore[no-any-return]
+                return pin.integrate(self.model, q, -self._in_units.solve(g) * unit)  # type: ignore[no-any-return]
 
             return float(np.abs(g).max()), step
 

@@ -10,6 +10,8 @@ import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.system import Terms
 from srm_mbs.formats.load import models_folder
 
 CLOSED_MODELS = tuple(
@@ -68,6 +70,31 @@ def along_x(distance: float) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array([distance, 0.0, 0.0]))
 
 
+def start_terms(mechanism: srm.Mechanism) -> Terms:
+    """The terms of the reference at the start."""
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    return make_system(mechanism).evaluate(0.0, state)
+
+
+def add_link(
+    model: pin.Model,
+    parent: int,
+    joint: object,
+    name: str,
+    inertia: pin.Inertia | None = None,
+    at: pin.SE3 | None = None,
+) -> int:
+    """Add a joint and a link on it, both called ``name``; by default a :func:`rod` at the parent.
+
+    Returns the index of the joint.
+    """
+    here = pin.SE3.Identity()
+    index: int = model.addJoint(parent, joint, at or here, name)
+    model.appendBodyToJoint(index, inertia or rod(), here)
+    model.addBodyFrame(name, index, here, 0)
+    return index
+
+
 def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     """Four rods in a ring of ball joints, free in space without gravity: nq != nv throughout."""
     rng = np.random.default_rng(seed)
@@ -90,6 +117,18 @@ def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     mechanism = srm.Mechanism(model, (loop,), q0=q)
     state = srm.assemble(mechanism, v=1.5 * rng.standard_normal(model.nv))
     return mechanism.with_state(state.q, state.v)
+
+
+def with_slider_mass(mass: float) -> srm.Mechanism:
+    """The bundled slider_crank_slider with another mass (kg) of the slider."""
+    base = srm.load("slider_crank_slider")
+    model = base.model.copy()
+    slider = model.getJointId("slider")
+    inertia = model.inertias[slider]
+    model.inertias[slider] = pin.Inertia(
+        mass, inertia.lever, inertia.inertia * (mass / inertia.mass)
+    )
+    return srm.Mechanism(model, base.loops, q0=base.q0, v0=base.v0)
 
 
 def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mechanism:

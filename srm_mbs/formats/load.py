@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,10 @@ from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array
 
-_GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
+log = logging.getLogger(__name__)
+
+GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
+"""Names of generated mechanisms, with the number of loops."""
 
 
 def models_folder() -> Path:
@@ -45,18 +47,9 @@ def bundled_models() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in models_folder().glob("*.toml")))
 
 
-def generated_size(name: str) -> int | None:
-    """N if ``name`` is ``n_four_bar_<N>``, else None."""
-    match = _GENERATED.match(name)
-    return int(match[1]) if match else None
-
-
-log = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True)
 class Overrides:
-    """Arguments of :func:`load` that replace values of the file; None: the file's."""
+    """Arguments of :func:`load` that replace values of the file; None or empty: the file's."""
 
     gravity: Sequence[float] | None = None
     base: str | None = None
@@ -71,7 +64,8 @@ def _gravity(value: Any) -> tuple[float, float, float]:
             element="gravity",
             remedy="Give [x, y, z] in m/s^2",
         )
-    return (float(array[0]), float(array[1]), float(array[2]))
+    x, y, z = array.tolist()
+    return (x, y, z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,20 +108,19 @@ def _translated(
         entries = merged(entries, translation.entries, urdf_name)
         text = tomli_w.dumps(entries)
         description = check_description(entries, own.file)
-    base = overrides.base
-    base = description.base if base is None else base
+    base = description.base if overrides.base is None else overrides.base
     if not isinstance(base, str) or base not in ROOT_JOINTS:
         raise InputError(
             f"there is no base {base!r}", element="base", remedy=f"Known: {', '.join(ROOT_JOINTS)}"
         )
-    gravity = overrides.gravity
+    gravity = description.gravity if overrides.gravity is None else overrides.gravity
     source = Source(
         description=text,
         urdf=translation.urdf,
         urdf_path=translation.urdf_file or model.file,
         path=own.file,
         base=base,
-        gravity=_gravity(description.gravity if gravity is None else gravity),
+        gravity=_gravity(gravity),
         format=found.name,
     )
     log.debug("%s: read as %s", model.file, found.name)
@@ -163,8 +156,7 @@ def _of_file(path: Path, overrides: Overrides) -> Reading:
     if found is DESCRIPTION:
         return _of_description(document, overrides)
     entries = {"format": 1, "urdf": path.name}
-    # A JSON string is a TOML string too.
-    own = Document(f"format = 1\nurdf = {json.dumps(path.name)}\n", document.file)
+    own = Document(tomli_w.dumps(entries), document.file)
     description = check_description(entries, own.file)
     return _translated(own, entries, description, found, document, overrides)
 
@@ -182,13 +174,13 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
     if is_name and name in bundled_models():
         name = str(models_folder() / f"{name}.toml")
     elif is_name and not (name and Path(name).exists()):  # "" would be the working folder
-        size = generated_size(name)
-        if size is None:
+        generated = GENERATED.match(name)
+        if generated is None:
             raise InputError(
                 f"there is no bundled mechanism {name!r}",
                 remedy=f"Known: {', '.join(bundled_models())}; or give the path of a file",
             )
-        return _generated(size, overrides)
+        return _generated(int(generated[1]), overrides)
     try:
         return _of_file(Path(name), overrides)
     except InputError as error:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -20,7 +21,6 @@ from srm_mbs.errors import InputError
 from srm_mbs.formats.graph.joint_graph import (
     Body,
     Joint,
-    NoTreeError,
     SpanningTree,
     components,
     spanning_tree,
@@ -330,10 +330,8 @@ class GraphTranslator:
         base, root = self._rooted()
         try:
             tree = spanning_tree(self.joints, root, cut)
-        except NoTreeError as error:
-            raise InputError(
-                error.problem, file=self.file, element="cut", remedy=error.remedy
-            ) from error
+        except InputError as error:
+            raise error.located(self.file) from None
         entries: dict[str, Any] = {"base": base} if base != "fixed" else {}
         loops = [self._closure(joint) for joint in tree.cut]
         forces = [
@@ -357,12 +355,9 @@ class GraphTranslator:
             root = self.root
             if is_identity(self.placements[root]):
                 return "floating", root
-            frame = Body(MODEL_FRAME)
-            self.bodies = {MODEL_FRAME: frame, **self.bodies}
-            self.joints.insert(
-                0,
-                Joint(f"{MODEL_FRAME}::{root}", "fixed", MODEL_FRAME, root, self.placements[root]),
-            )
+            self.bodies = {MODEL_FRAME: Body(MODEL_FRAME), **self.bodies}
+            name = f"{MODEL_FRAME}::{root}"
+            self.joints.insert(0, Joint(name, "fixed", MODEL_FRAME, root, self.placements[root]))
             return "floating", MODEL_FRAME
         for part in free:
             known = next((body for body in part if body in self.free), None)
@@ -376,12 +371,14 @@ class GraphTranslator:
                 )
         return "fixed", WORLD
 
+    def _fault(self, joint: Joint, problem: str, remedy: str) -> InputError:
+        return InputError(problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy)
+
     def _refuse_cut(self, joint: Joint, why: str) -> InputError:
-        return InputError(
+        return self._fault(
+            joint,
             f"it closes a loop and has {why}, which no closure has",
-            file=self.file,
-            element=f"joint {joint.name!r}",
-            remedy="Name another joint of the loop in cut",
+            "Name another joint of the loop in cut",
         )
 
     def _closure(self, joint: Joint) -> dict[str, Any]:
@@ -401,9 +398,7 @@ class GraphTranslator:
             (joint.child, joint.in_child),
             joint.axis,
             joint.second_axis,
-            fault=lambda problem, remedy: InputError(
-                problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy
-            ),
+            fault=partial(self._fault, joint),
         )
 
     def _bushing(self, joint: Joint) -> list[dict[str, Any]]:

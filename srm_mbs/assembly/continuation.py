@@ -47,7 +47,8 @@ BETWEEN = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """A singular configuration on the way: parameter, q (nq,), its loops, its dragged values."""
+    """A singular configuration on the way: q (nq,), the loops that lose rank, the dragged values
+    (rad, m)."""
 
     q: FloatArray
     loops: tuple[str, ...]

@@ -18,7 +18,6 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.build import assembled, rebuild
 from srm_mbs.formats.document import Document
-from srm_mbs.formats.generators import n_four_bar as _n_four_bar_texts
 from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.translation import Options, merged
@@ -236,6 +235,25 @@ def largest_n() -> int:
     return LARGEST_DENSE_N if core is None else LARGEST_N
 
 
+def n_four_bar_texts(n: int) -> tuple[str, str]:
+    """Description and URDF of the N-four-bar with ``n`` loops (n >= 1)."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["number"] = "{:.10g}".format  # without the noise of rounding
+    toml, urdf = (
+        environment.get_template(f"n_four_bar.{suffix}.j2").render(n=n)
+        for suffix in ("toml", "urdf")
+    )
+    return toml, urdf
+
+
 def _generated(n: int, overrides: Overrides) -> Reading:
     largest = largest_n()
     if n > largest:
@@ -245,12 +263,24 @@ def _generated(n: int, overrides: Overrides) -> Reading:
             remedy=f"Take N <= {largest}"
             + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
         )
-    text, urdf = _n_four_bar_texts(n)
+    text, urdf = n_four_bar_texts(n)
     return _of_description(Document(text, f"n_four_bar_{n}, generated"), overrides, urdf)
 
 
 def n_four_bar(n: int) -> Mechanism:
     """The IFToMM N-four-bar benchmark with ``n`` loops (n >= 1), assembled.
+
+    Benchmark A02 of the IFToMM Technical Committee for Multibody Dynamics (Library of
+    Computational Benchmark Problems): 2 N + 1 uniform rods of 1 m and 1 kg, of which N + 1
+    are cranks pivoted at (i, 0, 0) and N are couplers between neighbouring crank tips, under
+    gravity of 9.81 m/s^2.  It starts with the cranks upright and the first crank tip moving at
+    1 m/s in +x.  It has one degree of freedom, and N + 1 whenever the cranks are horizontal.  The
+    common crank angle obeys
+
+        I theta'' = -g W cos(theta),   I = (N + 1)/3 + N,   W = (N + 1)/2 + N,
+
+    with theta(0) = pi/2, theta'(0) = -1/s; at t = 10 s the first crank tip is
+    at x = 0.3284581115, z = 0.9445185382 (N = 2) and x = 0.1805122267, z = 0.9835727406 (N = 40).
 
     Raises
     ------

@@ -19,8 +19,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.formats.build import friction_time, rebuild
-from srm_mbs.formats.generators import n_four_bar as n_four_bar_texts
-from srm_mbs.formats.load import models_folder
+from srm_mbs.formats.load import models_folder, n_four_bar_texts
 from srm_mbs.model.closures import CLOSURE_TYPES
 from srm_mbs.model.coordinates import set_position, set_rate
 from tools.models import made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -137,11 +138,12 @@ def _of_description(own: Document, overrides: Overrides, urdf: str | None = None
         try:
             model = Document.read(path)
         except InputError as error:
+            relative = "Check the path, which is relative to the description"
             raise InputError(
                 f"the {key.upper()} {name!r} cannot be read ({error.problem}: {str(path)!r})",
                 file=own.file,
                 element=key,
-                remedy="Check the path, which is relative to the description",
+                remedy=error.remedy if os.path.isfile(path) else relative,
             ) from error
     found = of_key(key, path, model)
     return _translated(own, own.toml, description, found, model, overrides)

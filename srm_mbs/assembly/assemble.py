@@ -28,7 +28,7 @@ from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
 from srm_mbs.model.numbers import finite_numbers
 
@@ -196,11 +196,13 @@ def assemble(
                 element="guess",
                 remedy="Keep one of the two",
             )
-        set_position(mechanism, start, name, value)
+        with naming("guess"):
+            set_position(mechanism, start, name, value)
     held: tuple[str, ...] = ()
     if isinstance(q, Mapping):
         for name, value in q.items():
-            set_position(mechanism, start, name, value)
+            with naming("q"):
+                set_position(mechanism, start, name, value)
         held = tuple(q)
     elif q is not None:
         start = pin.normalize(model, np.array(finite_numbers(q, model.nq, "q", ARRAY_OR_MAPPING)))
@@ -213,12 +215,14 @@ def assemble(
     if hold is not None:
         held = (hold,) if isinstance(hold, str) else tuple(hold)
         for name in held:
-            mechanism.joint(name)
+            with naming("hold"):
+                mechanism.joint(name)
     rates = np.zeros(model.nv)
     held_rates: tuple[str, ...] = ()
     if isinstance(v, Mapping):
         for name, value in v.items():
-            set_rate(mechanism, rates, name, value)
+            with naming("v"):
+                set_rate(mechanism, rates, name, value)
         held_rates = tuple(v)
     elif v is not None:
         rates = np.array(finite_numbers(v, model.nv, "v", ARRAY_OR_MAPPING))

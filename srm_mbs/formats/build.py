@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.description import Description, parse_description
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
@@ -76,16 +75,6 @@ def _check_joint_names(description: Description, model: pin.Model) -> None:
             )
 
 
-@contextmanager
-def _element(where: str) -> Iterator[None]:
-    """Name the key of the description in errors that do not name one."""
-    try:
-        yield
-    except InputError as error:
-        error.element = error.element or where
-        raise
-
-
 def _check_frames(description: Description, model: pin.Model) -> None:
     """Refuse an anchor's frame name that means two different frames, say a joint's and a link's."""
     for where, anchor in description.anchors():
@@ -115,10 +104,10 @@ def _without_locked(
         joint = model.joints[model.getJointId(name)]
         for where, values in (("initial.q", q), ("initial.guess", guess)):
             if name in values:
-                with _element(where):
+                with naming(where):
                     write_position(joint, frozen, name, values.pop(name))
         rate = np.zeros(model.nv)
-        with _element("initial.v"):
+        with naming("initial.v"):
             write_rate(joint, rate, name, v.pop(name, np.zeros(joint.nv)))
         if rate.any():
             raise InputError(
@@ -200,10 +189,10 @@ def unassembled(
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
-            with _element(where):
+            with naming(where):
                 write_position(model.joints[model.getJointId(name)], start, name, value)
     for name, value in v.items():
-        with _element("initial.v"):
+        with naming("initial.v"):
             write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
     csv = CsvFolder(Path(source.path).parent) if tables else None

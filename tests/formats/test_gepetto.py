@@ -10,8 +10,8 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from tests.formats.test_loading import mass_matrix
 from tests.formats.urdf.test_urdf_loops import PAIR, gaps, measured, random_positions
+from tests.support.dynamics import mass_matrix
 from tests.support.snapshots import check_messages, refused
 from tests.support.urdf_files import BRANCHES, MASSES, open_mechanism, placement, relative, tree
 

@@ -6,6 +6,7 @@ What a test patches while it loads is not in them: such tests call ``srm.load``.
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import pinocchio as pin
 
@@ -25,6 +26,25 @@ def load(name: str) -> srm.Mechanism:
     mechanism, model = _loaded(name)
     assert mechanism.model == model, f"a test has changed {name!r}, which it shares with others"
     return mechanism
+
+
+def rewritten(
+    folder: Path, name: str, *changes: tuple[str, str], urdf: tuple[tuple[str, str], ...] = ()
+) -> Path:
+    """Path of a bundled description in ``folder``, with its URDF, both with texts replaced."""
+    source = load(name).source
+    assert source is not None
+    texts = {}
+    for suffix, text, pairs in (
+        ("urdf", source.urdf, urdf),
+        ("toml", source.description, ((f"../urdf/{name}", name), *changes)),
+    ):
+        for old, new in pairs:
+            assert old in text, f"{old!r} is not in the text to be changed"
+            text = text.replace(old, new)
+        texts[suffix] = folder / f"{name}.{suffix}"
+        texts[suffix].write_text(text, encoding="utf-8")
+    return texts["toml"]
 
 
 @cache

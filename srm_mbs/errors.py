@@ -67,11 +67,12 @@ class InputError(SrmError, ValueError):
 
 
 @contextmanager
-def naming(element: str) -> Iterator[None]:
-    """Fill ``element`` into an :class:`InputError` that names none."""
+def naming(*, file: str | None = None, element: str | None = None) -> Iterator[None]:
+    """Fill ``file`` and ``element`` into an :class:`InputError` that names none."""
     try:
         yield
     except InputError as error:
+        error.file = error.file or file
         error.element = error.element or element
         raise
 

@@ -196,12 +196,12 @@ def assemble(
                 element="guess",
                 remedy="Keep one of the two",
             )
-        with naming("guess"):
+        with naming(element="guess"):
             set_position(mechanism, start, name, value)
     held: tuple[str, ...] = ()
     if isinstance(q, Mapping):
         for name, value in q.items():
-            with naming("q"):
+            with naming(element="q"):
                 set_position(mechanism, start, name, value)
         held = tuple(q)
     elif q is not None:
@@ -215,13 +215,13 @@ def assemble(
     if hold is not None:
         held = (hold,) if isinstance(hold, str) else tuple(hold)
         for name in held:
-            with naming("hold"):
+            with naming(element="hold"):
                 mechanism.joint(name)
     rates = np.zeros(model.nv)
     held_rates: tuple[str, ...] = ()
     if isinstance(v, Mapping):
         for name, value in v.items():
-            with naming("v"):
+            with naming(element="v"):
                 set_rate(mechanism, rates, name, value)
         held_rates = tuple(v)
     elif v is not None:

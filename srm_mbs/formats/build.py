@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -21,7 +21,7 @@ from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
 from srm_mbs.formats.csv_table import CsvFolder
-from srm_mbs.formats.toml.description import Description, parse_description
+from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.coordinates import write_position, write_rate
@@ -104,10 +104,10 @@ def _without_locked(
         joint = model.joints[model.getJointId(name)]
         for where, values in (("initial.q", q), ("initial.guess", guess)):
             if name in values:
-                with naming(where):
+                with naming(element=where):
                     write_position(joint, frozen, name, values.pop(name))
         rate = np.zeros(model.nv)
-        with naming("initial.v"):
+        with naming(element="initial.v"):
             write_rate(joint, rate, name, v.pop(name, np.zeros(joint.nv)))
         if rate.any():
             raise InputError(
@@ -153,33 +153,44 @@ def _friction_note(model: pin.Model, q: FloatArray, friction_speed: float) -> tu
     )
 
 
-def unassembled(
-    description: Description,
-    tree: Element,
-    source: Source,
-    notes: Sequence[str] = (),
-    tables: bool = True,
-) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
-    """The mechanism with the guess as its q0, and the held positions and rates by joint.
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A file as it was read.
 
-    Parameters
+    Attributes
     ----------
-    description, tree
-        The checked description, and the root element of its URDF, which is changed.
+    description, entries
+        The checked description, and its tables.
+    tree
+        Root element of its URDF; building the mechanism changes it.
     source
         The texts of both.
     notes
-        Sentences of the translator that made them.
-    tables
-        Whether to read the drives and forces that may need tables from other files.
+        Sentences about approximations and ignored elements.
+    """
+
+    description: Description
+    entries: Mapping[str, Any]
+    tree: Element
+    source: Source
+    notes: tuple[str, ...] = ()
+
+
+def unassembled(
+    reading: Reading, tables: bool = True
+) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
+    """The mechanism with the guess as its q0, and the held positions and rates by joint.
+
+    Without ``tables``, drives and forces that may need tables from other files are left out.
 
     Raises
     ------
     InputError
         Naming file, element and remedy.
     """
+    description, source = reading.description, reading.source
     built = build_urdf(
-        tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
+        reading.tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
     )
     built.model.gravity.linear = np.array(source.gravity)
     _check_joint_names(description, built.model)
@@ -189,10 +200,10 @@ def unassembled(
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
-            with naming(where):
+            with naming(element=where):
                 write_position(model.joints[model.getJointId(name)], start, name, value)
     for name, value in v.items():
-        with naming("initial.v"):
+        with naming(element="initial.v"):
             write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
     csv = CsvFolder(Path(source.path).parent) if tables else None
@@ -207,7 +218,7 @@ def unassembled(
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(*notes, *built.notes, *_friction_note(model, start, friction_speed)),
+        notes=(*reading.notes, *built.notes, *_friction_note(model, start, friction_speed)),
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
@@ -230,9 +241,10 @@ def _with_limit_springs(mechanism: Mechanism) -> Mechanism:
 def rebuild(source: Source) -> Mechanism:
     """The mechanism of a saved run without its drives; its q0 is the guess of the description, not
     assembled."""
-    description = parse_description(source.description, source.path)
+    entries = parse_toml(source.description, source.path)
+    description = check_description(entries, source.path)
     tree = parse_xml(source.urdf, source.urdf_path)
-    return unassembled(description, tree, source, tables=False)[0]
+    return unassembled(Reading(description, entries, tree, source), tables=False)[0]
 
 
 def _in_gimbal_lock(source: Source, why: str) -> InputError:
@@ -245,17 +257,16 @@ def _in_gimbal_lock(source: Source, why: str) -> InputError:
     )
 
 
-def assembled(
-    description: Description, tree: Element, source: Source, notes: Sequence[str] = ()
-) -> Mechanism:
-    """The mechanism with its loops closed; parameters as in :func:`unassembled`.
+def assembled(reading: Reading) -> Mechanism:
+    """The mechanism with its loops closed.
 
     Raises
     ------
     InputError, AssemblyError
         As :func:`srm_mbs.load`.
     """
-    mechanism, q, v = unassembled(description, tree, source, notes)
+    description, source = reading.description, reading.source
+    mechanism, q, v = unassembled(reading)
     # Assembly analyses this copy, of the guess; the mechanism is analysed at its assembled state.
     guess = copy(mechanism)
     try:

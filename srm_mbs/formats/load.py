@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import tomli_w
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
-from srm_mbs.formats.build import assembled, rebuild
+from srm_mbs.errors import InputError, naming
+from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
@@ -66,29 +65,6 @@ def _gravity(value: Any) -> tuple[float, float, float]:
         )
     x, y, z = array.tolist()
     return (x, y, z)
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """A file as it was read: what :mod:`srm_mbs.formats.build` takes.
-
-    Attributes
-    ----------
-    description, entries
-        The checked description, and its tables.
-    tree
-        Root element of its URDF; building the mechanism changes it.
-    source
-        The texts of both.
-    notes
-        Sentences about approximations and ignored elements.
-    """
-
-    description: Description
-    entries: Mapping[str, Any]
-    tree: Element
-    source: Source
-    notes: tuple[str, ...] = ()
 
 
 def _translated(
@@ -182,10 +158,8 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
                 remedy=f"Known: {', '.join(bundled_models())}; or give the path of a file",
             )
         return _generated(int(generated[1]), overrides)
-    try:
+    with naming(file=name):
         return _of_file(Path(name), overrides)
-    except InputError as error:
-        raise error.located(name) from error.__cause__
 
 
 def load(
@@ -219,10 +193,8 @@ def load(
         If the loops cannot close or held values contradict each other.
     """
     reading = read(path, Overrides(gravity, base, tuple(cut)))
-    try:
-        return assembled(reading.description, reading.tree, reading.source, reading.notes)
-    except InputError as error:
-        raise error.located(reading.source.path) from error.__cause__
+    with naming(file=reading.source.path):
+        return assembled(reading)
 
 
 LARGEST_N, LARGEST_DENSE_N = 1000, 300
@@ -293,8 +265,4 @@ def n_four_bar(n: int) -> Mechanism:
         raise InputError(
             f"an N-four-bar needs n >= 1, not {n!r}", element="n", remedy="Give a positive integer"
         )
-    reading = _generated(int(n), Overrides())
-    return assembled(reading.description, reading.tree, reading.source)
-
-
-__all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]
+    return assembled(_generated(int(n), Overrides()))

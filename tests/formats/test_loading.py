@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import tomllib
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
@@ -17,7 +18,7 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.formats.build import friction_time, rebuild
 from srm_mbs.formats.load import models_folder, n_four_bar_texts
-from srm_mbs.formats.toml.description import parse_description
+from srm_mbs.formats.toml.description import check_description
 from srm_mbs.model.closures import CLOSURE_TYPES
 from srm_mbs.model.coordinates import set_position, set_rate
 from tests.support.bundled import load, rewritten
@@ -221,7 +222,7 @@ def test_a_closure_is_what_it_says_between_the_anchors_of_the_file(
 
 
 def _closures(path: Path) -> tuple[srm.LoopClosure, ...]:
-    return parse_description(path.read_text(), str(path)).closures()
+    return check_description(tomllib.loads(path.read_text()), str(path)).closures()
 
 
 def test_joint_damping_of_the_file_acts(tmp_path: Path) -> None:

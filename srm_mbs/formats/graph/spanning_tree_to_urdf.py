@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.joint_graph import (
     Body,
     Joint,
@@ -284,10 +284,11 @@ MODEL_FRAME = "__model__"
 """Massless root link of a floating robot: the frame in which the file places its bodies."""
 
 
+@dataclass(eq=False)
 class GraphTranslator:
     """Translates bodies and joints of one file; raises :class:`InputError` at the first fault.
 
-    Parameters
+    Attributes
     ----------
     file, name
         Of the file, for messages, and of the robot.
@@ -301,23 +302,18 @@ class GraphTranslator:
         The body that floats if nothing connects it with the ground.
     free
         Bodies that move freely beside others, and the names of their joints.
+    notes
+        Sentences about the translation.
     """
 
-    def __init__(
-        self,
-        file: str,
-        name: str,
-        bodies: Mapping[str, Body],
-        placements: Mapping[str, pin.SE3],
-        joints: Sequence[Joint],
-        root: str,
-        free: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
-        self.file, self.name = file, name
-        self.bodies, self.placements = dict(bodies), placements
-        self.joints = list(joints)
-        self.root, self.free = root, free
-        self.notes: list[str] = []
+    file: str
+    name: str
+    bodies: Mapping[str, Body]
+    placements: Mapping[str, pin.SE3]
+    joints: Sequence[Joint]
+    root: str
+    free: Mapping[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def translate(self, cut: Sequence[str] = ()) -> Translation:
         """The tree and the entries ``base``, ``loop`` and ``force``.
@@ -328,10 +324,8 @@ class GraphTranslator:
             Names of the joints to cut; empty: chosen by :func:`spanning_tree`.
         """
         base, root = self._rooted()
-        try:
+        with naming(file=self.file):
             tree = spanning_tree(self.joints, root, cut)
-        except InputError as error:
-            raise error.located(self.file) from None
         entries: dict[str, Any] = {"base": base} if base != "fixed" else {}
         loops = [self._closure(joint) for joint in tree.cut]
         forces = [
@@ -357,13 +351,15 @@ class GraphTranslator:
                 return "floating", root
             self.bodies = {MODEL_FRAME: Body(MODEL_FRAME), **self.bodies}
             name = f"{MODEL_FRAME}::{root}"
-            self.joints.insert(0, Joint(name, "fixed", MODEL_FRAME, root, self.placements[root]))
+            held = Joint(name, "fixed", MODEL_FRAME, root, self.placements[root])
+            self.joints = (held, *self.joints)
             return "floating", MODEL_FRAME
         for part in free:
             known = next((body for body in part if body in self.free), None)
             body = known or (self.root if self.root in part else part[0])
             name = self.free.get(body, f"{body}::free")
-            self.joints.append(Joint(name, "floating", WORLD, body, self.placements[body]))
+            moving = Joint(name, "floating", WORLD, body, self.placements[body])
+            self.joints = (*self.joints, moving)
             if known is None:
                 self.notes.append(
                     f"nothing connects {body!r} with the ground: it moves freely by the joint "

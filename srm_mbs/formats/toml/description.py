@@ -237,17 +237,6 @@ def _wrench_laws(file: str, time: str | None, tables: CsvFolder) -> tuple[Law, .
 # -- text to tables --------------------------------------------------------------------------
 
 
-def parse_description(text: str, file: str) -> Description:
-    """Parse and check the TOML ``text`` of ``file``.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key or line, and the remedy.
-    """
-    return check_description(parse_toml(text, file), file)
-
-
 def parse_toml(text: str, file: str) -> dict[str, Any]:
     """The tables of the TOML ``text`` of ``file``.
 

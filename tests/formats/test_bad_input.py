@@ -352,17 +352,6 @@ def test_a_path_relative_to_the_working_folder_is_named(
     assert message.startswith("robot.txt: a file of type '.txt'")
 
 
-@pytest.mark.parametrize("name", ["robot.xml", "robot.urdf.xacro", "robot.yaml", "robot.toml"])
-def test_a_urdf_is_known_by_its_content(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_text(URDF)
-    assert srm.load(tmp_path / name).joint_names == ("hinge", "knee")
-
-
-def test_a_description_is_known_by_its_content(tmp_path: Path) -> None:
-    path = write(tmp_path).rename(tmp_path / "bars.txt")
-    assert [loop.name for loop in srm.load(path).loops] == ["pin"]
-
-
 @pytest.mark.parametrize("name", ["slider-crank", "", "n_four_bar_0", "n_four_bar_x", "Four_bar"])
 def test_an_unknown_bundled_name_lists_the_known_ones(name: str) -> None:
     with pytest.raises(srm.InputError) as caught:
@@ -727,23 +716,22 @@ def test_elements_that_are_no_list_of_them_are_refused(what: str, given: Any) ->
         replace(mechanism, **{what: given})
 
 
-@pytest.mark.parametrize("what", ["gravity", "damping"])
-def test_gravity_and_damping_that_are_not_finite_are_refused(what: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"gravity": [np.nan, 0.0, 0.0]}, "the gravity of the model is not finite"),
+        ({"damping": [np.nan, 0.0, 0.0]}, "the damping of the model is not finite"),
+        ({"damping": [0.0, -0.1, 0.0]}, "damping of the joint 'coupler' is negative"),
+    ],
+)
+def test_gravity_and_damping_are_finite_and_damping_does_not_drive(
+    change: dict[str, list[float]], problem: str
+) -> None:
     mechanism = srm.load("four_bar")
     model = mechanism.model.copy()
-    numbers = model.gravity.linear if what == "gravity" else model.damping
-    numbers[0] = np.nan
-    if what == "gravity":
-        model.gravity.linear = numbers
-    with pytest.raises(srm.InputError, match=f"the {what} of the model is not finite"):
-        replace(mechanism, model=model)
-
-
-def test_joint_damping_that_would_drive_is_refused_with_the_joint() -> None:
-    mechanism = srm.load("four_bar")
-    model = mechanism.model.copy()
-    model.damping = np.array([0.0, -0.1, 0.0])
-    with pytest.raises(srm.InputError, match="damping of the joint 'coupler' is negative"):
+    model.gravity.linear = np.array(change.get("gravity", model.gravity.linear))
+    model.damping = np.array(change.get("damping", model.damping))
+    with pytest.raises(srm.InputError, match=problem):
         replace(mechanism, model=model)
 
 

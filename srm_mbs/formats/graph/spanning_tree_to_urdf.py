@@ -7,7 +7,7 @@ same freedom; :data:`CLOSURE_OF` has the names of joint types of all formats.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -327,14 +327,11 @@ class GraphTranslator:
         with naming(file=self.file):
             tree = spanning_tree(self.joints, root, cut)
         entries: dict[str, Any] = {"base": base} if base != "fixed" else {}
-        loops = [self._closure(joint) for joint in tree.cut]
+        if tree.cut:
+            entries["loop"] = [self._closure(joint) for joint in tree.cut]
         forces = [
-            force
-            for joint in self.joints
-            for force in (self._bushing(joint) if joint in tree.cut else self._spring(joint))
+            force for joint in self.joints for force in self._springs(joint, joint in tree.cut)
         ]
-        if loops:
-            entries["loop"] = loops
         if forces:
             entries["force"] = forces
         self._add_notes(tree)
@@ -397,15 +394,14 @@ class GraphTranslator:
             fault=partial(self._fault, joint),
         )
 
-    def _bushing(self, joint: Joint) -> list[dict[str, Any]]:
-        """Spring and damper of a joint that is cut, in the one direction that it leaves free."""
-        if not (joint.stiffness or joint.damping):
-            return []
-        if joint.type not in ("revolute", "prismatic"):
-            raise self._refuse_cut(joint, "damping or a spring")
-        return [
-            bushing(
-                f"{joint.name}::spring",
+    def _springs(self, joint: Joint, cut: bool) -> Iterator[dict[str, Any]]:
+        """Spring and damper of a joint; the damping of a joint of the tree is in the URDF."""
+        name = f"{joint.name}::spring"
+        if cut and (joint.stiffness or joint.damping):
+            if joint.type not in ("revolute", "prismatic"):
+                raise self._refuse_cut(joint, "damping or a spring")
+            yield bushing(
+                name,
                 joint.type,
                 (joint.parent, joint.in_parent),
                 (joint.child, joint.in_child),
@@ -414,21 +410,14 @@ class GraphTranslator:
                 damping=joint.damping,
                 rest=joint.rest,
             )
-        ]
-
-    def _spring(self, joint: Joint) -> list[dict[str, Any]]:
-        """The spring of a joint of the tree; its damping is in the URDF."""
-        if not joint.stiffness:
-            return []
-        return [
-            {
+        elif joint.stiffness:
+            yield {
                 "type": "torsion_spring",
-                "name": f"{joint.name}::spring",
+                "name": name,
                 "joint": joint.name,
                 "stiffness": joint.stiffness,
                 "rest_angle": joint.rest,
             }
-        ]
 
     def _add_notes(self, tree: SpanningTree) -> None:
         """Note the joints that are cut, and those whose parent and child changed places."""

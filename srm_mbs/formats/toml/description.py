@@ -169,7 +169,7 @@ def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
             raise InputError(
                 "the values are given twice", remedy="Give table, or t and values, not both"
             )
-        return _table_law(given["table"], given.get("time"), given.get("value"), tables)
+        return _table_law(given, tables)
     _refuse_columns(given)
     missing = [key.name for key in keys if key.default is MISSING and key.name not in given]
     if missing:
@@ -180,9 +180,10 @@ def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
     return kind(**given)
 
 
-def _table_law(file: str, time: str | None, value: str | None, tables: CsvFolder) -> Table:
-    columns = tables.table(file).columns((time or "t", value or "value"))
-    return Table(*columns.T.tolist())
+def _table_law(keys: Mapping[str, Any], tables: CsvFolder) -> Table:
+    """The law of the columns, by default t and value, of a table in a CSV file."""
+    names = (keys.get("time") or "t", keys.get("value") or "value")
+    return Table(*tables.table(keys["table"]).columns(names).T.tolist())
 
 
 def _refuse_columns(given: Mapping[str, Any]) -> None:
@@ -203,19 +204,18 @@ def _with_law(kind: str, values: Mapping[str, Any], tables: CsvFolder) -> dict[s
         If law and table are both given, neither of them nor a torque, or a table is malformed.
     """
     out = {key: value for key, value in values.items() if key not in TABLE_KEYS}
-    table = values["table"]
     if values["law"] is not None:
         if any(values.get(key) is not None for key in TABLE_KEYS):
             raise InputError("law and table are given", remedy="Give one of them")
         out["law"] = _law(dict(values["law"]), tables)
-    elif table is None:
+    elif values["table"] is None:
         _refuse_columns(values)
         if kind == "torque" and values["torque"] is None:
             raise InputError("there is no torque", remedy="Give torque, law or table")
     elif kind == "torque":
-        out["law"] = _table_law(table, values["time"], values["value"], tables)
+        out["law"] = _table_law(values, tables)
     else:
-        out["law"] = _wrench_laws(table, values["time"], tables)
+        out["law"] = _wrench_laws(values["table"], values["time"], tables)
     return out
 
 

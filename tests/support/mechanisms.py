@@ -76,25 +76,6 @@ def start_terms(mechanism: srm.Mechanism) -> Terms:
     return make_system(mechanism).evaluate(0.0, state)
 
 
-def add_link(
-    model: pin.Model,
-    parent: int,
-    joint: object,
-    name: str,
-    inertia: pin.Inertia | None = None,
-    at: pin.SE3 | None = None,
-) -> int:
-    """Add a joint and a link on it, both called ``name``; by default a :func:`rod` at the parent.
-
-    Returns the index of the joint.
-    """
-    here = pin.SE3.Identity()
-    index: int = model.addJoint(parent, joint, at or here, name)
-    model.appendBodyToJoint(index, inertia or rod(), here)
-    model.addBodyFrame(name, index, here, 0)
-    return index
-
-
 def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     """Four rods in a ring of ball joints, free in space without gravity: nq != nv throughout."""
     rng = np.random.default_rng(seed)

@@ -31,7 +31,7 @@ from srm_mbs.dynamics.constraints.row_algebra import (
 )
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.errors import EvaluationError
-from srm_mbs.formats import generators
+from srm_mbs.formats.load import n_four_bar_texts
 from srm_mbs.integration.kernel import backend
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring, floating_slider_crank
@@ -199,7 +199,7 @@ def test_the_factors_of_a_chain_grow_with_its_loops(angle: float) -> None:
     for four times the loops."""
     entries = []
     for n in (80, 320):
-        model = pin.buildModelFromXML(generators.n_four_bar(n)[1])
+        model = pin.buildModelFromXML(n_four_bar_texts(n)[1])
         tip = {"xyz": (1.0, 0.0, 0.0)}
         loops = [
             srm.LoopClosure(

@@ -13,7 +13,7 @@ import tomli_w
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.forces import ForceKinematics
-from srm_mbs.formats.toml.description import parse_description
+from srm_mbs.formats.toml.description import check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.shapes import visuals_of
@@ -52,7 +52,7 @@ class Twins:
         self.model.gravity.linear = np.array(made.entries["gravity"])
         keys = {key: value for key, value in made.entries.items() if key != "loop"}
         toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})
-        forces = parse_description(toml, "x.toml").force_elements(None)
+        forces = check_description(parse_toml(toml, ""), "").force_elements(None)
         self.forces = ForceKinematics(self.model, forces)
         self.theirs = mujoco.MjModel.from_xml_string(text)
         self.theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT

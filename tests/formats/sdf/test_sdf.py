@@ -13,7 +13,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.formats.document import Document
-from srm_mbs.formats.graph.joint_graph import Joint, NoTreeError, spanning_tree
+from srm_mbs.formats.graph.joint_graph import Joint, spanning_tree
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, rpy
 from srm_mbs.formats.sdf.reader import translate
 from srm_mbs.formats.translation import Options, Translation
@@ -358,7 +358,7 @@ def test_the_users_cut_counts() -> None:
     ],
 )
 def test_a_cut_that_leaves_no_tree_is_refused(cut: list[str], problem: str) -> None:
-    with pytest.raises(NoTreeError, match=problem):
+    with pytest.raises(srm.InputError, match=problem):
         spanning_tree(SQUARE, "world", cut)
 
 

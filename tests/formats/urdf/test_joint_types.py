@@ -14,10 +14,11 @@ from scipy.integrate import solve_ivp
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.integration.kernel import backend
-from tests.formats.test_loading import mass_matrix, placement
 from tests.integration.kernel.test_kernel import agree
+from tests.support.dynamics import mass_matrix
 from tests.support.lockstep import compare
 from tests.support.snapshots import check_messages, refused
+from tests.support.urdf_files import placement
 
 PITCH = 0.3  # m per turn
 AXIS, AXIS2 = (2.0, 1.0, 2.0), (0.0, -3.0, 4.0)

@@ -13,7 +13,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from tests.formats.test_loading import closure, mass_matrix
+from tests.support.dynamics import closure, mass_matrix
 from tests.support.snapshots import check_messages, refused
 from tests.support.urdf_files import (
     AXIS,

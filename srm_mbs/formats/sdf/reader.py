@@ -141,7 +141,7 @@ class SdfReader:
         """
         where = f"model {scope.prefix.removesuffix(SEPARATOR) or node.get('name', '')!r}"
         values = self.values
-        values.attributes(node, where, ("name", "canonical_link"), ())
+        values.attributes(node, where, ("name", "canonical_link"))
         if node.get("placement_frame"):
             raise values.fault(where, "placement_frame is not read by this version", "Remove it")
         values.children(node, where, MODEL_READ, MODEL_IGNORED, MANY)

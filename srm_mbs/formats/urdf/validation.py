@@ -17,8 +17,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from srm_mbs.errors import SrmWarning
+from srm_mbs.formats.graph.joint_graph import inertia_tensor
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import XmlFile
+from srm_mbs.formats.xml import XmlFile, local_name
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
@@ -85,35 +86,47 @@ class ElementChecker(XmlFile):
         super().__init__(file)
         self.notes: list[str] = []
 
-    def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
+    def vector(self, node: Element, key: str, where: str, count: int = 3) -> list[float]:
         """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
+        text, tag = node.get(key), local_name(node)
+        if text is None:
+            raise self.fault(where, f"<{tag}> has no {key!r}", f'Give {key}="..."')
         # Limits do not act, and exporters write the largest double there.
-        largest = sys.float_info.max if node.tag == "limit" else LARGEST_MAGNITUDE
-        return self.attribute_numbers(node, key, count, where, largest)
+        largest = sys.float_info.max if tag == "limit" else LARGEST_MAGNITUDE
+        values: list[float] = self.numbers(text, count, where, f"<{tag} {key}>", largest).tolist()
+        node.set(key, " ".join(map(repr, values)))
+        return values
+
+    def vector_or_zero(self, node: Element | None, key: str, where: str) -> list[float]:
+        """Three numbers; zero without the attribute."""
+        if node is None or node.get(key) is None:
+            return [0.0, 0.0, 0.0]
+        return self.vector(node, key, where)
+
+    def number(self, node: Element, key: str, where: str) -> float:
+        """The finite number of attribute ``key``."""
+        return self.vector(node, key, where, 1)[0]
+
+    def number_or(self, default: float, node: Element | None, key: str, where: str) -> float:
+        """The number of attribute ``key``; ``default`` without the attribute."""
+        return default if node is None or node.get(key) is None else self.number(node, key, where)
 
     def attributes(self, node: Element, where: str, count: bool = True) -> None:
         """Refuse unknown attributes; count and remove those that are ignored, or leave them."""
-        known = ATTRIBUTES.get(node.tag)
-        ignored = INFORMATIVE.get(node.tag, ())
-        for key in list(node.attrib):
-            if key in ignored:
-                if not count:
-                    continue
+        ignored = [key for key in INFORMATIVE.get(node.tag, ()) if key in node.attrib]
+        if node.tag in ATTRIBUTES:
+            self.only(node, where, ATTRIBUTES[node.tag], ignored)
+        if count:
+            for key in ignored:
                 self.ignore(f"<{node.tag} {key}> attribute")
                 del node.attrib[key]
-            elif known is not None and key not in known:
-                raise self.fault(
-                    where,
-                    f"<{node.tag}> has an unknown attribute {key!r}",
-                    f"Known: {', '.join(known)}",
-                )
 
     def children(self, node: Element, where: str) -> None:
         """Refuse unknown elements of ``node``; count and remove those that are ignored."""
         read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
         for child in list(node):
             tag = child.tag
-            local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
+            local = local_name(child)
             if tag in read:
                 self.attributes(child, where)
                 if tag not in READ and len(child):
@@ -140,11 +153,8 @@ class ElementChecker(XmlFile):
                     "Describe the loop as [[loop]] in a TOML description and remove the element",
                 )
             else:
-                raise self.fault(
-                    where or f"<{tag}>",
-                    f"unknown element <{tag}> in <{node.tag}>",
-                    f"Known: {', '.join((*read, *ignored))}",
-                )
+                problem = f"unknown element <{tag}> in <{node.tag}>"
+                raise self.unknown(where or f"<{tag}>", problem, (*read, *ignored))
         for tag in set(read) - {"link", "joint"}:
             if len(node.findall(tag)) > 1:
                 raise self.fault(where, f"<{tag}> is given twice", "Keep one")
@@ -188,12 +198,8 @@ class ElementChecker(XmlFile):
         return found
 
     def origin(self, node: Element, where: str) -> None:
-        origin = node.find("origin")
-        if origin is None:
-            return
         for key in ("xyz", "rpy"):
-            if origin.get(key) is not None:
-                self.numbers(origin, key, 3, where)
+            self.vector_or_zero(node.find("origin"), key, where)
 
 
 URDF_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
@@ -223,9 +229,7 @@ class JointChecker(ElementChecker):
         self.children(joint, where)
         kind = joint.get("type")
         if kind not in JOINT_TYPES:
-            raise self.fault(
-                where, f"there is no joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
-            )
+            raise self.unknown(where, f"there is no joint type {kind!r}", JOINT_TYPES)
         self.origin(joint, where)
         self.axis(joint, kind, where)
         self.only_of(joint, kind, where)
@@ -248,7 +252,7 @@ class JointChecker(ElementChecker):
 
     def direction(self, axis: Element, where: str) -> list[float]:
         """The unit vector of <axis> or <axis2>, written afresh."""
-        direction = self.numbers(axis, "xyz", 3, where)
+        direction = self.vector(axis, "xyz", where)
         if not any(direction):
             raise self.fault(where, "its axis is zero", "Give a direction")
         # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
@@ -272,7 +276,7 @@ class JointChecker(ElementChecker):
             if node is None:
                 continue
             if tag == "thread_pitch":
-                if self.numbers(node, "value", 1, where) == [0.0]:
+                if self.number(node, "value", where) == 0.0:
                     raise self.fault(
                         where, "its thread pitch is zero", 'Give m per turn, or type="revolute"'
                     )
@@ -298,22 +302,19 @@ class JointChecker(ElementChecker):
                 )
             return
         for key in limit.attrib:
-            self.numbers(limit, key, 1, where)
+            self.number(limit, key, where)
         if kind not in WITH_LIMIT:
             joint.remove(limit)
             return
         for key in ("effort", "velocity"):
             if limit.get(key) is None and kind in ("continuous", "screw"):
                 limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
-            (value,) = self.numbers(limit, key, 1, where)
+            value = self.number(limit, key, where)
             if value < 0.0:
                 raise self.fault(
                     where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
                 )
-        lower, upper = (
-            self.numbers(limit, key, 1, where)[0] if key in limit.attrib else 0.0
-            for key in ("lower", "upper")
-        )
+        lower, upper = (self.number_or(0.0, limit, key, where) for key in ("lower", "upper"))
         if lower > upper:
             self.notes.append(
                 f"{where}: its limits are none: lower = {lower:g} is above upper = {upper:g}"
@@ -324,7 +325,7 @@ class JointChecker(ElementChecker):
         if dynamics is None:
             return
         for key in dynamics.attrib:
-            (value,) = self.numbers(dynamics, key, 1, where)
+            value = self.number(dynamics, key, where)
             if value < 0.0:
                 raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
             if value != 0.0 and kind in ("floating", "planar") and not locked:
@@ -396,7 +397,7 @@ class UrdfChecker(JointChecker):
         if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
             self.attributes(origin, where)
             for key in ("xyz", "rpy"):
-                if origin.get(key) is not None and any(self.numbers(origin, key, 3, where)):
+                if any(self.vector_or_zero(origin, key, where)):
                     raise self.fault(
                         where,
                         "<origin> in <link> has no meaning in URDF and would not move anything",
@@ -413,13 +414,11 @@ class UrdfChecker(JointChecker):
         if mass is None or inertia is None:
             missing = "mass" if mass is None else "inertia"
             raise self.fault(where, f"<inertial> has no <{missing}>", "Add it")
-        (value,) = self.numbers(mass, "value", 1, where)
+        value = self.number(mass, "value", where)
         if value < 0.0:
             raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
-        xx, yy, zz, xy, xz, yz = (
-            self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
-        )
-        principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        moments = [self.number(inertia, key, where) for key in ATTRIBUTES["inertia"]]
+        principal = np.linalg.eigvalsh(inertia_tensor(moments))
         rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
         if principal[0] < -rounding:
             raise self.fault(
@@ -449,11 +448,8 @@ class UrdfChecker(JointChecker):
                         f"joint {name!r}", f"it has no <{side} link=...>", f"Name its {side} link"
                     )
                 if link not in links:
-                    raise self.fault(
-                        f"joint {name!r}",
-                        f"its {side} link {link!r} does not exist",
-                        f"Known: {', '.join(links)}",
-                    )
+                    problem = f"its {side} link {link!r} does not exist"
+                    raise self.unknown(f"joint {name!r}", problem, links)
                 ends[side] = link
             child = ends["child"]
             if child in parent_joint:

@@ -17,20 +17,15 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
+
+def words(text: str) -> tuple[str, ...]:
+    """The words of ``text``, for tables of names."""
+    return tuple(text.split())
+
+
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
-ACTING = (
-    "joint",
-    "constraint",
-    "bushing",
-    "spring",
-    "damper",
-    "inertia",
-    "gear",
-    "mimic",
-    "coupling",
-    "tendon",
-)
+ACTING = words("joint constraint bushing spring damper inertia gear mimic coupling tendon")
 """Words in the names of other tools' elements that act, such as ``drake:rotor_inertia``."""
 LARGEST_NESTING = 300
 """Largest depth of nested elements."""
@@ -150,6 +145,16 @@ class XmlValues(XmlFile):
         if word not in ("true", "false", "1", "0"):
             raise self.fault(where, f"{what} is {word!r}", "Write true or false")
         return word in ("true", "1")
+
+    def child_number(self, node: Element | None, tag: str, where: str, default: float) -> float:
+        """The number in the child ``tag``; ``default`` without one."""
+        text = None if node is None else node.findtext(tag)
+        return default if text is None else float(self.numbers(text, 1, where, f"<{tag}>")[0])
+
+    def child_truth(self, node: Element, tag: str, where: str, default: bool) -> bool:
+        """The truth in the child ``tag``; ``default`` without one."""
+        text = node.findtext(tag)
+        return default if text is None else self.truth(text, where, f"<{tag}>")
 
     def direction(self, values: FloatArray, where: str, what: str) -> FloatArray:
         """``values`` (3,) as a unit vector."""

@@ -15,23 +15,17 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.formats.xml import XmlValues
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(text.split())
+from srm_mbs.formats.xml import XmlValues, words
 
 
 def _table(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
-    return {tag: _words(names) for tag, names in rows.items()}
+    return {tag: words(names) for tag, names in rows.items()}
 
 
-SECTIONS = _words(
-    "compiler option default asset worldbody equality tendon contact actuator include"
-)
+SECTIONS = words("compiler option default asset worldbody equality tendon contact actuator include")
 """Sections that are read, or looked into."""
-IGNORED_SECTIONS = _words("size visual statistic sensor keyframe custom extension")
-BODY_READ = _words("inertial joint freejoint geom site body frame")
+IGNORED_SECTIONS = words("size visual statistic sensor keyframe custom extension")
+BODY_READ = words("inertial joint freejoint geom site body frame")
 BODY_IGNORED = ("camera", "light")
 PLACED = "pos quat axisangle xyaxes zaxis euler"
 ATTRIBUTES = _table(
@@ -58,7 +52,7 @@ ATTRIBUTES = _table(
     }
 )
 """Attributes that are read; those of a joint equality are in JOINT_EQUALITY."""
-JOINT_EQUALITY = _words("name class active joint1 joint2 polycoef")
+JOINT_EQUALITY = words("name class active joint1 joint2 polycoef")
 CONTACT = "solref solimp margin gap user"
 IGNORED_ATTRIBUTES = _table(
     {
@@ -87,16 +81,16 @@ IGNORED_ATTRIBUTES = _table(
             roughness""",
     }
 )
-GEOMS = _words("sphere capsule ellipsoid cylinder box mesh plane hfield sdf")
+GEOMS = words("sphere capsule ellipsoid cylinder box mesh plane hfield sdf")
 """Types of geom, the default first."""
-DEFAULTS_OF_OTHERS = _words(
+DEFAULTS_OF_OTHERS = words(
     """camera light pair general motor position velocity intvelocity damper cylinder muscle adhesion
     dcmotor texture"""
 )
 """Defaults of elements that are not read."""
 MAIN = "main"
 """The default class that all others inherit from."""
-ORIENTATIONS = _words("quat axisangle xyaxes zaxis euler")
+ORIENTATIONS = words("quat axisangle xyaxes zaxis euler")
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 

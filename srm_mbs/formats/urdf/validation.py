@@ -19,41 +19,24 @@ import numpy as np
 from srm_mbs.errors import SrmWarning
 from srm_mbs.formats.graph.joint_graph import inertia_tensor
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import XmlFile, local_name
+from srm_mbs.formats.xml import XmlFile, local_name, words
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
 IGNORED = {
-    "robot": ("material", "transmission", "gazebo", "sensor", "ros2_control", "verbose"),
-    "link": (
-        "visual",
-        "collision",
-        "contact",
-        "self_filter",
-        "sensor",
-        "self_collision_checking",
-        "collision_checking",
-        "surface",
-        "kinematic",
-        "gravity",
+    "robot": words("material transmission gazebo sensor ros2_control verbose"),
+    "link": words(
+        "visual collision contact self_filter sensor self_collision_checking collision_checking "
+        "surface kinematic gravity"
     ),
-    "joint": ("safety_controller", "calibration", "joint_properties"),
+    "joint": words("safety_controller calibration joint_properties"),
 }
 READ = {
     "robot": ("link", "joint"),
     "link": ("inertial",),
     "inertial": ("origin", "mass", "inertia"),
-    "joint": (
-        "origin",
-        "parent",
-        "child",
-        "axis",
-        "axis2",
-        "thread_pitch",
-        "limit",
-        "dynamics",
-    ),
+    "joint": words("origin parent child axis axis2 thread_pitch limit dynamics"),
 }
 ATTRIBUTES = {
     "link": ("name", "type"),

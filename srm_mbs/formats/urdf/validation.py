@@ -60,6 +60,9 @@ INFORMATIVE = {
 """Attributes of other tools found in published files: ignored, with a note."""
 DRAWN_ONLY = ("material", "visual", "collision")
 """Elements that are removed without a note: they do not act."""
+MANY = ("link", "joint")
+"""Elements that may be there several times."""
+DESCRIBE_LOOP = "Describe the loop as [[loop]] in a TOML description and remove the element"
 
 
 class ElementChecker(XmlFile):
@@ -108,59 +111,52 @@ class ElementChecker(XmlFile):
         """Refuse unknown elements of ``node``; count and remove those that are ignored."""
         read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
         for child in list(node):
-            tag = child.tag
-            local = local_name(child)
+            tag, local = child.tag, local_name(child)
+            before = f"{where}, " if where else ""
             if tag in read:
                 self.attributes(child, where)
                 if tag not in READ and len(child):
-                    raise self.fault(
-                        where, f"unknown element <{child[0].tag}> in <{tag}>", "Remove it"
-                    )
+                    problem = f"unknown element <{child[0].tag}> in <{tag}>"
+                    raise self.fault(where, problem, "Remove it")
             elif tag in ignored:
-                self.no_loop_inside(child, where)
-                self.no_inertia_inside(child, where)
+                self.nothing_acts_in(child, f"{before}<{local}>")
                 if tag not in DRAWN_ONLY:
                     self.ignore(f"<{tag}> element")
                 node.remove(child)
             elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
                 raise self.fault(
-                    f"{where}, <xacro:{local}>" if where else f"<xacro:{local}>",
+                    f"{before}<xacro:{local}>",
                     "this is a xacro macro, not URDF",
                     "Run xacro on the file first",
                 )
             elif local in LOOP_ELEMENTS or tag != local:
                 raise self.fault(
-                    f"{where}, <{local}>" if where else f"<{local}>",
+                    f"{before}<{local}>",
                     f"the element <{local}> (a loop, coupling or force of another tool) is not "
                     "read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                    DESCRIBE_LOOP,
                 )
             else:
                 problem = f"unknown element <{tag}> in <{node.tag}>"
                 raise self.unknown(where or f"<{tag}>", problem, (*read, *ignored))
-        for tag in set(read) - {"link", "joint"}:
-            if len(node.findall(tag)) > 1:
+        for tag in read:
+            if tag not in MANY and len(node.findall(tag)) > 1:
                 raise self.fault(where, f"<{tag}> is given twice", "Keep one")
 
-    def no_loop_inside(self, node: Element, where: str) -> None:
-        """Refuse loops and couplings inside an element that is ignored as a whole."""
+    def nothing_acts_in(self, node: Element, where: str) -> None:
+        """Refuse loops and couplings in an element that is ignored as a whole, and inertia in one
+        that is only drawn: the link would lose it."""
         for inner in node.iter():
             if inner.tag in (*LOOP_ELEMENTS, "mimic"):
                 raise self.fault(
-                    ", ".join(part for part in (where, f"<{node.tag}>, <{inner.tag}>") if part),
+                    f"{where}, <{inner.tag}>",
                     f"the element <{inner.tag}> (a loop or coupling) inside <{node.tag}> is not "
                     "read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                    DESCRIBE_LOOP,
                 )
-
-    def no_inertia_inside(self, node: Element, where: str) -> None:
-        """Refuse inertia inside an element that is only drawn: the link would lose it."""
-        if node.tag not in DRAWN_ONLY:
-            return
-        for inner in node.iter():
-            if inner.tag in ("inertial", "mass", "inertia"):
+            if node.tag in DRAWN_ONLY and inner.tag in ("inertial", "mass", "inertia"):
                 raise self.fault(
-                    where or f"<{node.tag}>",
+                    where,
                     f"<{inner.tag}> inside <{node.tag}> would not act",
                     "Put <mass> and <inertia> into the <inertial> of the link",
                 )
@@ -174,9 +170,8 @@ class ElementChecker(XmlFile):
             if not name:
                 raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')
             if name in found:
-                raise self.fault(
-                    f"{tag} {name!r}", f"two {tag}s have this name", "Rename one of them"
-                )
+                where = f"{tag} {name!r}"
+                raise self.fault(where, f"two {tag}s have this name", "Rename one of them")
             found[name] = node
         return found
 
@@ -195,10 +190,102 @@ ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
 PARALLEL_AXES_TOLERANCE = 1e-6
 """Axes of a universal joint at an angle (rad) below this are parallel."""
+LARGEST_TREE_DEPTH = 1000
+"""Largest number of links between the root and a leaf: Pinocchio's recursive parser overflows the
+stack in deeper trees."""
+POINT_MASS_GYRATION_SQUARED = 1e-18
+"""Square of the radius of gyration (m^2) below which it is rounding: a nanometre."""
 
 
-class JointChecker(ElementChecker):
-    """Checks one joint at a time."""
+class UrdfChecker(ElementChecker):
+    """Walks a URDF once; raises :class:`InputError` at the first fault."""
+
+    def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
+        """Check the whole file; ``root`` keeps what Pinocchio is to read."""
+        self.root(root)
+        for block in root.findall("gazebo"):
+            for joint in block.iter("joint"):
+                if joint.find("child") is not None:
+                    raise self.fault(
+                        f"<gazebo><joint> {joint.get('name', '')!r}",
+                        "a joint deep inside <gazebo> is not read",
+                        "Move it up, directly into <gazebo>",
+                    )
+        self.children(root, "")
+        links, joints = self.named(root, "link"), self.named(root, "joint")
+        if not links:
+            raise self.fault("<robot>", "there is no <link>", "Add one for every body")
+        for name, link in links.items():
+            self.link(name, link)
+        self.tree(links, joints, base)
+        for name, joint in joints.items():
+            self.joint(name, joint, base, name in locked)
+        self.notes += self.ignored_notes()
+
+    def root(self, root: Element) -> None:
+        """The root element and its attributes, of which the name is kept."""
+        if root.tag.endswith("}robot"):
+            raise self.fault(
+                "<robot>",
+                "it has a default namespace (xmlns=...), so that none of its elements is URDF",
+                "Remove the attribute xmlns",
+            )
+        if root.tag != "robot":
+            raise self.fault(f"<{root.tag}>", "the root element is not <robot>", "Give a URDF file")
+        version = root.get("version", "1.0")
+        if version not in ("1", "1.0", "1.1", "1.2"):
+            raise self.fault(
+                "<robot>", f"there is no URDF version {version!r}", "Known: 1.0, 1.1, 1.2"
+            )
+        name = root.get("name")
+        if not name:
+            raise self.fault("<robot>", "it has no name", 'Give name="..."')
+        root.attrib.clear()
+        root.set("name", name)
+
+    def link(self, name: str, link: Element) -> None:
+        where = f"link {name!r}"
+        origin = link.find("origin")
+        if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
+            self.attributes(origin, where)
+            for key in ("xyz", "rpy"):
+                if any(self.vector_or_zero(origin, key, where)):
+                    raise self.fault(
+                        where,
+                        "<origin> in <link> has no meaning in URDF and would not move anything",
+                        "Put it into the joint, <inertial> or <visual> that it belongs to",
+                    )
+            link.remove(origin)
+        self.children(link, where)
+        inertial = link.find("inertial")
+        if inertial is None:
+            return
+        self.children(inertial, where)
+        self.origin(inertial, where)
+        mass, inertia = inertial.find("mass"), inertial.find("inertia")
+        if mass is None or inertia is None:
+            missing = "mass" if mass is None else "inertia"
+            raise self.fault(where, f"<inertial> has no <{missing}>", "Add it")
+        value = self.number(mass, "value", where)
+        if value < 0.0:
+            raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
+        moments = [self.number(inertia, key, where) for key in ATTRIBUTES["inertia"]]
+        principal = np.linalg.eigvalsh(inertia_tensor(moments))
+        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
+        if principal[0] < -rounding:
+            raise self.fault(
+                where,
+                f"a principal moment of inertia is negative ({principal[0]:.3g} kg m^2)",
+                "Check the entries of <inertia>",
+            )
+        if principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
+            note = (
+                f"link {name!r}: the principal moments of inertia {principal[0]:.3g}, "
+                f"{principal[1]:.3g}, {principal[2]:.3g} violate the triangle inequality: "
+                "no real body has them"
+            )
+            self.notes.append(note)
+            warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
 
     def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
         where = f"joint {name!r}"
@@ -320,104 +407,6 @@ class JointChecker(ElementChecker):
         if not dynamics.attrib:
             joint.remove(dynamics)
 
-
-LARGEST_TREE_DEPTH = 1000
-"""Largest number of links between the root and a leaf: Pinocchio's recursive parser overflows the
-stack in deeper trees."""
-POINT_MASS_GYRATION_SQUARED = 1e-18
-"""Square of the radius of gyration (m^2) below which it is rounding: a nanometre."""
-
-
-class UrdfChecker(JointChecker):
-    """Walks a URDF once; raises :class:`InputError` at the first fault."""
-
-    def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
-        """Check the whole file; ``root`` keeps what Pinocchio is to read."""
-        self.root(root)
-        for block in root.findall("gazebo"):
-            for joint in block.iter("joint"):
-                if joint.find("child") is not None:
-                    raise self.fault(
-                        f"<gazebo><joint> {joint.get('name', '')!r}",
-                        "a joint deep inside <gazebo> is not read",
-                        "Move it up, directly into <gazebo>",
-                    )
-        self.children(root, "")
-        links, joints = self.named(root, "link"), self.named(root, "joint")
-        if not links:
-            raise self.fault("<robot>", "there is no <link>", "Add one for every body")
-        for name, link in links.items():
-            self.link(name, link)
-        self.tree(links, joints, base)
-        for name, joint in joints.items():
-            self.joint(name, joint, base, name in locked)
-        self.notes += self.ignored_notes()
-
-    def root(self, root: Element) -> None:
-        """The root element and its attributes, of which the name is kept."""
-        if root.tag.endswith("}robot"):
-            raise self.fault(
-                "<robot>",
-                "it has a default namespace (xmlns=...), so that none of its elements is URDF",
-                "Remove the attribute xmlns",
-            )
-        if root.tag != "robot":
-            raise self.fault(f"<{root.tag}>", "the root element is not <robot>", "Give a URDF file")
-        version = root.get("version", "1.0")
-        if version not in ("1", "1.0", "1.1", "1.2"):
-            raise self.fault(
-                "<robot>", f"there is no URDF version {version!r}", "Known: 1.0, 1.1, 1.2"
-            )
-        name = root.get("name")
-        if not name:
-            raise self.fault("<robot>", "it has no name", 'Give name="..."')
-        root.attrib.clear()
-        root.set("name", name)
-
-    def link(self, name: str, link: Element) -> None:
-        where = f"link {name!r}"
-        origin = link.find("origin")
-        if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
-            self.attributes(origin, where)
-            for key in ("xyz", "rpy"):
-                if any(self.vector_or_zero(origin, key, where)):
-                    raise self.fault(
-                        where,
-                        "<origin> in <link> has no meaning in URDF and would not move anything",
-                        "Put it into the joint, <inertial> or <visual> that it belongs to",
-                    )
-            link.remove(origin)
-        self.children(link, where)
-        inertial = link.find("inertial")
-        if inertial is None:
-            return
-        self.children(inertial, where)
-        self.origin(inertial, where)
-        mass, inertia = inertial.find("mass"), inertial.find("inertia")
-        if mass is None or inertia is None:
-            missing = "mass" if mass is None else "inertia"
-            raise self.fault(where, f"<inertial> has no <{missing}>", "Add it")
-        value = self.number(mass, "value", where)
-        if value < 0.0:
-            raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
-        moments = [self.number(inertia, key, where) for key in ATTRIBUTES["inertia"]]
-        principal = np.linalg.eigvalsh(inertia_tensor(moments))
-        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
-        if principal[0] < -rounding:
-            raise self.fault(
-                where,
-                f"a principal moment of inertia is negative ({principal[0]:.3g} kg m^2)",
-                "Check the entries of <inertia>",
-            )
-        if principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
-            note = (
-                f"link {name!r}: the principal moments of inertia {principal[0]:.3g}, "
-                f"{principal[1]:.3g}, {principal[2]:.3g} violate the triangle inequality: "
-                "no real body has them"
-            )
-            self.notes.append(note)
-            warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
-
     def tree(self, links: dict[str, Element], joints: dict[str, Element], base: str) -> None:
         parent_joint: dict[str, str] = {}
         parent_link: dict[str, str] = {}
@@ -452,31 +441,27 @@ class UrdfChecker(JointChecker):
             raise self.fault(
                 "<robot>", problem, "Keep exactly one root link; close loops by [[loop]]"
             )
-        children: dict[str, list[str]] = {}
-        for child, parent in parent_link.items():
-            children.setdefault(parent, []).append(child)
-        level, depth, loose = roots, 0, set(links)
-        while level:
-            if depth > LARGEST_TREE_DEPTH:
-                raise self.fault(
-                    f"link {level[0]!r}",
-                    f"more than {LARGEST_TREE_DEPTH} joints lie between it and the root link",
-                    "Split the chain: Pinocchio cannot read such a deep one",
-                )
-            loose -= set(level)
-            level = [child for link in level for child in children.get(link, ())]
-            depth += 1
-        if loose:
-            ring: dict[str, None] = {}
-            at = next(link for link in links if link in loose)
-            while at not in ring:
-                ring[at] = None
+        depth = {roots[0]: 0}
+        for link in links:
+            at, path = link, dict[str, None]()
+            while at not in depth:
+                if at in path:
+                    raise self.fault(
+                        f"link {at!r}",
+                        f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a "
+                        "ring",
+                        "Close loops by [[loop]] in a TOML description",
+                    )
+                path[at] = None
                 at = parent_link[at]
-            raise self.fault(
-                f"link {at!r}",
-                f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a ring",
-                "Close loops by [[loop]] in a TOML description",
-            )
+            for below in reversed(path):
+                depth[below] = depth[parent_link[below]] + 1
+                if depth[below] > LARGEST_TREE_DEPTH:
+                    raise self.fault(
+                        f"link {below!r}",
+                        f"more than {LARGEST_TREE_DEPTH} joints lie between it and the root link",
+                        "Split the chain: Pinocchio cannot read such a deep one",
+                    )
         for reserved in (WORLD, UNIVERSE):
             if reserved in links and (roots[0] != reserved or base != "fixed"):
                 raise self.fault(

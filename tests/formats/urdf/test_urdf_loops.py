@@ -338,12 +338,10 @@ def slider_crank(on_pin: str = "", on_guide: str = "") -> str:
     return "\n".join(['<robot name="slider_crank">', links, *joints, "</robot>"])
 
 
-def described(folder: Path, urdf: str, entries: str = "", cut: str = "") -> srm.Mechanism:
-    write(folder, urdf, f"slider_crank{cut}.urdf")
-    path = folder / f"slider_crank{cut}.toml"
-    line = f'cut = ["{cut}"]\n' if cut else ""
-    path.write_text(f'format = 1\nurdf = "slider_crank{cut}.urdf"\n{line}{entries}')
-    return srm.load(path)
+def described(folder: Path, urdf: str, entries: str = "") -> Path:
+    """A description with these entries of a URDF that is written beside it."""
+    write(folder, urdf)
+    return write(folder, f'format = 1\nurdf = "robot.urdf"\n{entries}', "robot.toml")
 
 
 def end_of(mechanism: srm.Mechanism, link: str, q: FloatArray) -> FloatArray:
@@ -361,8 +359,8 @@ def test_the_motion_does_not_depend_on_where_the_loop_is_cut(tmp_path: Path) -> 
     """Nor on whether a damped joint is the one: it then becomes a bushing."""
     damped = '<dynamics damping="0.6"/>'
     ends = []
-    for cut, name in (("", "guide"), ("pin", "pin")):
-        mechanism = described(tmp_path, slider_crank(damped, damped), START, cut)
+    for cut, name in (("", "guide"), ('cut = ["pin"]\n', "pin")):
+        mechanism = srm.load(described(tmp_path, slider_crank(damped, damped), cut + START))
         assert [loop.name for loop in mechanism.loops] == [name]
         assert [force.name for force in mechanism.forces] == [f"{name}::damping"]
         assert mechanism.degrees_of_freedom == 1
@@ -384,8 +382,8 @@ def test_a_description_adds_its_loops_to_those_of_the_file(tmp_path: Path) -> No
         'b = { link = "rod" }\n'
     )
     with pytest.raises(srm.InputError, match="'own'"):  # on one joint: both anchors are the same
-        described(tmp_path, slider_crank(), own.replace('"rod"', '"crank"'))
-    mechanism = described(tmp_path, slider_crank(), own + START)
+        srm.load(described(tmp_path, slider_crank(), own.replace('"rod"', '"crank"')))
+    mechanism = srm.load(described(tmp_path, slider_crank(), own + START))
     assert [loop.name for loop in mechanism.loops] == ["own", "guide"]
 
 
@@ -396,7 +394,7 @@ def test_names_that_are_missing_are_made(tmp_path: Path) -> None:
 
 
 def test_a_saved_run_of_a_file_with_loops_is_read_again(tmp_path: Path) -> None:
-    mechanism = described(tmp_path, slider_crank(), START)
+    mechanism = srm.load(described(tmp_path, slider_crank(), START))
     solution = srm.simulate(mechanism, 0.2)
     solution.save(tmp_path / "run.npz")
     for file in tmp_path.glob("*.urdf"):
@@ -411,7 +409,7 @@ def test_what_a_robot_is_drawn_with_survives(tmp_path: Path) -> None:
 
     box = '<visual><geometry><box size="1 2 3"/></geometry></visual></link>'
     urdf = slider_crank().replace("</link>", box, 1)
-    (visual,) = visuals_of(described(tmp_path, urdf, START))
+    (visual,) = visuals_of(srm.load(described(tmp_path, urdf, START)))
     assert isinstance(visual.shape, Box)
     assert visual.shape.size == (1.0, 2.0, 3.0)
 
@@ -460,13 +458,11 @@ def test_with_two_more_frames_along_z_it_is_a_hinge(tmp_path: Path) -> None:
 
 
 def test_a_closure_of_the_description_replaces_the_pair(tmp_path: Path) -> None:
-    write(tmp_path, tree(PAIR))
-    path = tmp_path / "own.toml"
-    path.write_text(
-        'format = 1\nurdf = "robot.urdf"\n[[loop]]\nname = "weld"\ntype = "frame"\n'
-        'a = { link = "closing_ring_2" }\nb = { frame = "closing_ring_1" }\n'
+    own = (
+        '[[loop]]\nname = "weld"\ntype = "frame"\na = { link = "closing_ring_2" }\n'
+        'b = { frame = "closing_ring_1" }\n'
     )
-    mechanism = open_mechanism(path)
+    mechanism = open_mechanism(described(tmp_path, tree(PAIR), own))
     assert [loop.name for loop in mechanism.loops] == ["weld"]
 
 
@@ -524,6 +520,9 @@ FAULTS = {
     ),
     "gazebo pose of five numbers": gazebo("ball", "<pose>0 0 0 0 0</pose>"),
     "gazebo axis without direction": gazebo("revolute", "<axis/>"),
+    "gazebo axis in another frame": gazebo(
+        "revolute", "<axis><xyz expressed_in='__model__'>1 0 0</xyz></axis>"
+    ),
     "gazebo joint with friction": gazebo(
         "revolute", "<axis><xyz>1 0 0</xyz><dynamics><friction>2</friction></dynamics></axis>"
     ),
@@ -557,13 +556,10 @@ def test_a_faulty_loop_or_mimic_is_one_clear_error(tmp_path: Path) -> None:
 
 
 def test_a_mimic_of_a_locked_joint_is_refused_and_a_locked_mimic_is_ignored(tmp_path: Path) -> None:
-    write(tmp_path, tree(joints={"wheel": '<mimic joint="hip"/>'}))
-    path = tmp_path / "robot.toml"
-    path.write_text('format = 1\nurdf = "robot.urdf"\nlock = ["hip"]\n')
+    urdf = tree(joints={"wheel": '<mimic joint="hip"/>'})
     with pytest.raises(srm.InputError, match="'hip' is locked"):
-        srm.load(path)
-    path.write_text('format = 1\nurdf = "robot.urdf"\nlock = ["wheel"]\n')
-    mechanism = srm.load(path)
+        srm.load(described(tmp_path, urdf, 'lock = ["hip"]\n'))
+    mechanism = srm.load(described(tmp_path, urdf, 'lock = ["wheel"]\n'))
     assert not mechanism.loops
     assert any("<mimic> is ignored" in note for note in mechanism.notes)
 

@@ -1,11 +1,12 @@
-"""Mechanisms, loaded once for all tests of a process: most of them only want to have one.
+"""Mechanisms, loaded once for all tests of a process, and runs that finish.
 
-What a test patches while it loads is not in them: such tests call ``srm.load``.
+Tests that change how a mechanism is loaded call ``srm.load`` instead.
 """
 
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import pinocchio as pin
 
@@ -25,6 +26,13 @@ def load(name: str) -> srm.Mechanism:
     mechanism, model = _loaded(name)
     assert mechanism.model == model, f"a test has changed {name!r}, which it shares with others"
     return mechanism
+
+
+def finished(mechanism: srm.Mechanism, t_end: float, **options: Any) -> srm.Solution:
+    """``srm.simulate``, which must succeed."""
+    solution = srm.simulate(mechanism, t_end, **options)
+    assert solution.success, solution.message
+    return solution
 
 
 @cache

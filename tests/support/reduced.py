@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
+from tests.support.mechanisms import mass_matrix
 
 G = 9.81
 Field = Callable[[float, Any], Any]
@@ -220,6 +221,5 @@ class OneDegree:
         bend = np.zeros(self.model.nv)
         bend[self.others] = np.linalg.lstsq(G[:, self.others], -bias, rcond=1e-9)[0]
         nle = pin.nonLinearEffects(self.model, self.data, q, v)
-        M = pin.crba(self.model, self.data, q)
-        M = np.triu(M) + np.triu(M, 1).T
+        M = mass_matrix(self.model, q)
         return [rate, float(-along @ (M @ bend + nle) / (along @ M @ along))]

@@ -25,7 +25,7 @@ def _open_chain(mechanism: srm.Mechanism) -> reduced.Field:
 
 
 def observed(name: str, solution: srm.Solution, t: np.ndarray) -> np.ndarray:
-    """What :func:`reference` gives, from a run: angle and rate of the crank, or the whole state."""
+    """The quantities of :func:`reference` in a run: angle and rate of the crank, or the state."""
     q, v = solution(t)
     if name in ("four_bar", "spatial_four_bar", "pendulum_chain"):
         return np.hstack([q, v])
@@ -44,7 +44,7 @@ def reference(name: str, t_end: float, samples: int) -> tuple[np.ndarray, np.nda
     if name in ("slider_crank", "slider_crank_whirl"):
         field = reduced.slider_crank()
     elif name == "parallelogram":
-        field = lambda t, y: [y[1], -reduced.G * 9.0 / 8.0 * np.cos(y[0])]  # noqa: E731
+        field = reduced.parallelogram()
     elif name == "spatial_dead_point":
         field, start = reduced.spatial_dead_point(), start - np.array([np.pi / 6, 0.0])
     elif name.startswith("n_four_bar"):

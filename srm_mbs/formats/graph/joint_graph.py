@@ -17,6 +17,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import WORLD
 
@@ -53,6 +54,21 @@ class Body:
     name: str
     inertia: pin.Inertia | None = None
     visuals: tuple[Element, ...] = ()
+
+
+def inertia_tensor(moments: Sequence[float] | FloatArray) -> FloatArray:
+    """The tensor (3, 3) of the moments xx, yy, zz, xy, xz, yz (kg m^2)."""
+    xx, yy, zz, xy, xz, yz = moments
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def inertia_at(
+    placement: pin.SE3, mass: float, moments: Sequence[float] | FloatArray
+) -> pin.Inertia:
+    """Inertia in the body's frame, from the moments about the centre of mass, which is at
+    ``placement``, in its axes (:func:`inertia_tensor`)."""
+    R = placement.rotation
+    return pin.Inertia(mass, placement.translation, R @ inertia_tensor(moments) @ R.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,6 +64,19 @@ def origin(parent: Element, placement: pin.SE3) -> None:
         )
 
 
+def visual(
+    placement: pin.SE3, shape: str, sizes: Mapping[str, str], rgba: Iterable[float] | None
+) -> Element:
+    """A ``<visual>``: the element ``shape`` of its geometry with the attributes ``sizes``; red,
+    green, blue and opacity."""
+    out = Element("visual")
+    origin(out, placement)
+    SubElement(SubElement(out, "geometry"), shape, dict(sizes))
+    if rgba is not None:
+        SubElement(SubElement(out, "material", name=""), "color", rgba=numbers(rgba))
+    return out
+
+
 def anchor(link: str, placement: pin.SE3) -> dict[str, Any]:
     """An anchor of a description."""
     out: dict[str, Any] = {"link": link}
@@ -164,7 +177,7 @@ AXIS_TOLERANCE = 1e-9
 """Norm of the difference of two unit vectors below which they are the same axis."""
 
 
-def placement(xyz: Sequence[float], rpy: Sequence[float]) -> pin.SE3:
+def placement(xyz: Sequence[float] | FloatArray, rpy: Sequence[float] | FloatArray) -> pin.SE3:
     """Placement of a URDF <origin>; m and rad."""
     return pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
 

@@ -383,13 +383,13 @@ def test_many_breakpoints_cost_little(slider_crank: srm.Mechanism) -> None:
     assert solution.stats.evaluations <= 13 * 20_010
 
 
-def test_pieces_join_times_that_no_step_fits_between() -> None:
-    pieces = smooth_intervals(np.array([0.3, 3 * 0.1, -1.0, 7.0]), np.array([0.6]), 0.0, 1.0)
-    assert pieces.ends.tolist() == [0.3, 0.6, 1.0]
-    assert pieces.given.tolist() == [False, True]
-    assert pieces.last[0] < 0.3 < 3 * 0.1 < pieces.first[1]
-    assert pieces.first[0] == -np.inf
-    assert pieces.last[-1] == np.inf
+def test_intervals_join_times_that_no_step_fits_between() -> None:
+    intervals = smooth_intervals(np.array([0.3, 3 * 0.1, -1.0, 7.0]), np.array([0.6]), 0.0, 1.0)
+    assert intervals.ends.tolist() == [0.3, 0.6, 1.0]
+    assert intervals.given.tolist() == [False, True]
+    assert intervals.last[0] < 0.3 < 3 * 0.1 < intervals.first[1]
+    assert intervals.first[0] == -np.inf
+    assert intervals.last[-1] == np.inf
     ends = smooth_intervals(np.array([0.0, 1.0]), np.zeros(0), 0.0, 1.0)
     assert ends.count == 1
     assert 0.0 < ends.first[0] < 1e-300

@@ -41,11 +41,12 @@ class PSRM(DelegatingMethod):
     simple      sweep        multiplier held over the step, one corrector (3.1)    h
     =========== ============ ===================================================== ==============
 
-    The split form has the order of its tableau and is the one to use.  Orders of the others
-    (observed ones: ``tests/integration/methods/thesis/test_sweeps.py``): simple 2 with eps proportional to h, 1 with a fixed
-    eps; exact sweeps O(eps h^2) + O(h^4/eps^2) for erk4, so 8/3 with eps = h^(2/3), and
-    O(eps h^4) + O(h^5/eps^2) for dopr54, so 13/3 with eps = h^(1/3).  With a fixed eps the exact
-    sweeps with ``interpolation="stages"``, and the fused form, have the order of the tableau.
+    The split form has the order of its tableau and is the one to use.  Orders of the others, which
+    ``tests/integration/methods/thesis/test_sweeps.py`` observes: simple 2 with eps proportional to
+    h, 1 with a fixed eps; exact sweeps O(eps h^2) + O(h^4/eps^2) for erk4, so 8/3 with
+    eps = h^(2/3), and O(eps h^4) + O(h^5/eps^2) for dopr54, so 13/3 with eps = h^(1/3).  With a
+    fixed eps the exact sweeps with ``interpolation="stages"``, and the fused form, have the order
+    of the tableau.
 
     Parameters
     ----------

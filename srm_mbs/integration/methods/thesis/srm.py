@@ -32,10 +32,11 @@ class SRM(DelegatingMethod):
 
     Theory: O(eps^m) + O(h^p), so min(m, p) with eps = h.  Observed
     (``tests/integration/methods/thesis/test_sweeps.py``): 2 for mechanisms with tvd32 and erk4,
-    whose linear interpolation of the multiplier is of second order; about 3 with dopr54 and m = 5, because with eps = h an explicit scheme has stage order 1
-    on the terms in 1/eps; 1 when restarted from multiplier 0, and 2 with ``carry``, whose first
-    multiplier is constant over the step, whatever m.  The higher orders of the thesis show on its
-    problem 1, which has no error but these.
+    whose linear interpolation of the multiplier is of second order; about 3 with dopr54 and m = 5,
+    because with eps = h an explicit scheme has stage order 1 on the terms in 1/eps; 1 when
+    restarted from multiplier 0, and 2 with ``carry``, whose first multiplier is constant over the
+    step, whatever m.  The higher orders of the thesis show on its problem 1, which has no error but
+    these.
 
     With step-size control, singular configurations that rounding keeps such short steps from
     passing within the tolerance are passed by the split form of the same tableau

@@ -115,13 +115,12 @@ class RunRecord:
 
     def mark_aborted(self, t: float, error: BaseException) -> None:
         """Mark it as interrupted, or failed because a function of the user raised, at ``t``."""
-        kept = "verything up to there is kept."
         if isinstance(error, KeyboardInterrupt):
             self.status = RunStatus.INTERRUPTED
-            self.message = f"Interrupted at t = {t:.6g} s; e{kept}"
+            self.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
             self.status = RunStatus.FAILED
-            self.message = f"Stopped at t = {t:.6g} s: {error}. E{kept}"
+            self.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
 
     def mark_failed(
         self,

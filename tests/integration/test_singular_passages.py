@@ -146,6 +146,8 @@ def test_the_zone_carries_a_run_whose_steps_are_too_small_to_step_over() -> None
     solution = srm.simulate(srm.load("slider_crank"), 1.3, rtol=1e-12, max_step=5e-4)
     assert solution.success
     assert solution.stats.zone_steps > 0
+    in_the_zone = solution.crossings[0].time + np.linspace(-1e-3, 1e-3, 201)
+    assert off_branch(solution(in_the_zone)[0]) < 1e-8
     q, v = solution(np.linspace(0.0, 1.3, 201))
     assert off_branch(q) < 1e-11
     assert off_branch(v) < 1e-11

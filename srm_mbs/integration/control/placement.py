@@ -126,11 +126,9 @@ def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
             zero = 2.0 * start / (-a + np.sqrt(root))
         elif a + 2.0 * b >= 0.0 or root < 0.0:
             return None if line > PREDICTION_STEPS else line
-    return (
-        float(zero)
-        if 1.0 < zero < PREDICTION_STEPS
-        else (line if 1.0 < line < PREDICTION_STEPS and zero <= 1.0 else None)
-    )
+    if zero <= 1.0:
+        zero = line
+    return float(zero) if 1.0 < zero < PREDICTION_STEPS else None
 
 
 class Arrival(IntEnum):

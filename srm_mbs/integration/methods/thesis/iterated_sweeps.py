@@ -19,7 +19,7 @@ Next to a singular configuration the algebra of all sweeps is evaluated on the b
 from the closures to determine the branch are restarted from the accepted state.
 
 The zone serves the exact prediction only.  Multipliers of sweeps carry their initial layers and
-errors of order eps; extrapolated, they stalled runs that pass without (measured).
+errors of order eps; runs that extrapolate them stall where others pass (measured).
 
 **Split takeover.**  Sweeps take short steps: their error is a power of eps, which is about as long
 as a step.  Next to a singular configuration rounding of the positions, u, changes h times the

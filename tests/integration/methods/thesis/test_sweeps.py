@@ -106,7 +106,7 @@ def test_srm_passes_singular_configurations_with_the_step_of_the_thesis(method: 
 def test_adaptive_sweeps_pass_a_singular_configuration_and_follow_the_tolerance(
     method: Any, bounds: tuple[float, float]
 ) -> None:
-    """Nothing is singular about the step size there: at 1e-5 SRM used to stall at the passage."""
+    """The steps do not become short there."""
     for solution in runs_within(method, 1.6, dict(zip((1e-4, 1e-5), bounds)), passages=1):
         assert solution.stats.rejected < 0.2 * solution.stats.steps
 
@@ -128,7 +128,7 @@ def test_adaptive_sweeps_pass_a_singular_configuration_and_follow_the_tolerance(
 def test_adaptive_sweeps_meet_no_impasse_where_the_thesis_control_does(
     method: Any, bounds: tuple[float, float]
 ) -> None:
-    """Its estimate compared two sweeps' trajectories and stalled near t = 34.5."""
+    """The thesis' estimate compares two sweeps' trajectories and stalls near t = 34.5."""
     for solution, bound in zip(runs_within(method, 40.0, dict(zip((1e-4, 1e-5), bounds))), bounds):
         assert slider_crank.off_branch(solution.q) < bound
 
@@ -185,8 +185,8 @@ LINEAR = srm.PSRM("dopr54", correction="sweep", interpolation="linear")
 
 @pytest.mark.parametrize("tol", [1e-4, pytest.param(1e-5, marks=pytest.mark.stress)])
 def test_constraint_errors_of_restarted_sweeps_stay_near_the_tolerance(tol: float) -> None:
-    """They last for about eps, many steps: what a step adds says little about what is left.
-    Counted as it is, it left closure rates of 90 and 123 tolerances; some 7 remain."""
+    """They last for about eps, many steps: what a step adds says little about what is left.  The
+    estimate counts them as they settle."""
     solution = srm.simulate(load("slider_crank_regular"), 3.0, method=LINEAR, rtol=tol, atol=tol)
     assert solution.success
     assert solution.drift[:, 1].max() < 12.0 * tol
@@ -197,7 +197,7 @@ def test_constraint_errors_of_restarted_sweeps_stay_near_the_tolerance(tol: floa
 def test_two_sweeps_with_linear_interpolation_pass_singular_configurations(
     tol: float, error: float
 ) -> None:
-    """To t = 70, 33 passages: they stopped in the 24th with steps of 1e-11 s."""
+    """To t = 70, 33 of them, with steps that do not become short."""
     solution = srm.simulate(load("slider_crank"), 70.0, method=LINEAR, rtol=tol)
     reference = srm.simulate(load("slider_crank"), 70.0, rtol=1e-11)
     assert solution.success

@@ -95,10 +95,9 @@ class SRM(DelegatingMethod):
         order, m = self.scheme.order, self.iterations
         if m is None:
             m = min(order, LARGEST_CARRIED) if self.carry else order
-            object.__setattr__(self, "iterations", m)
         if isinstance(m, np.integer):
             m = int(m)
-            object.__setattr__(self, "iterations", m)
+        object.__setattr__(self, "iterations", m)
         if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise InputError(
                 f"iterations = {m!r} is not a number of sweeps",

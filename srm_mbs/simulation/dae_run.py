@@ -14,10 +14,10 @@ from srm_mbs.errors import ControllerError, EvaluationError, InputError
 from srm_mbs.integration.control.prescribed_times import suspected
 from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.dense_output import step_data
-from srm_mbs.integration.driver import DAE, RunRecord, RunStatus
+from srm_mbs.integration.driver import RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import branch_changes, method_messages
-from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.messages import DAE, branch_changes
+from srm_mbs.integration.methods.base import ErrorNorm, Method, method_messages
 from srm_mbs.integration.methods.thesis.dae_stability import instability
 from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE

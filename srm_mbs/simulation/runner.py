@@ -41,13 +41,8 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.run import CompiledRun
 from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
-from srm_mbs.integration.messages import (
-    MECHANISM,
-    ProblemVocabulary,
-    branch_changes,
-    method_messages,
-)
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
+from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, branch_changes
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, method_messages
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start

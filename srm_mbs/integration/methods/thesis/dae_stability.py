@@ -11,15 +11,12 @@ function R of the scheme.  With T = (GB)^-1 all mu are 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.driver import RunRecord
-from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.thesis.regularisation import (
     real_stability_limit,
@@ -33,19 +30,8 @@ EIGENVALUE_ROUNDING = 1e-9
 """Rounding of an eigenvalue, over the largest."""
 
 
-class DampedSystem(Protocol):
-    """A system whose sweeps damp their constraint errors at known rates."""
-
-    def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:
-        """Eigenvalues of G B T at a state: the rates at which sweeps reduce g, times eps."""
-
-
-def _sweeps_of(result: StepResult) -> Sequence[SweepNode]:
-    return result.sweeps if isinstance(result, SweepResult) else ()
-
-
 def instability(
-    system: DampedSystem,
+    system: DaeSystem,
     scheme: ButcherTableau,
     record: RunRecord,
     start: Sequence[SweepNode],
@@ -65,7 +51,8 @@ def instability(
     cases: list[tuple[float, float, float, SweepNode]] = []
     nodes, t = start, record.t0
     for result in record.steps[-EXAMINED_STEPS:]:
-        nodes, t = _sweeps_of(result), result.t + result.h
+        nodes = result.sweeps if isinstance(result, SweepResult) else ()
+        t = result.t + result.h
         cases += [(t, result.h, node.eps, node) for node in nodes if node.eps > 0.0]
     if record.attempts and record.attempts[-1].t == t and eps is not None:
         h = record.attempts[-1].h

@@ -214,7 +214,7 @@ def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
 
 
 def joined_balance(
-    segments: Sequence[BalancedRun], parts: Sequence[BalancedRun], order: IndexArray | None
+    segments: Sequence[BalancedRun], parts: Sequence[BalancedRun], order: IndexArray | slice
 ) -> EnergyBalance:
     """The balance of a run of several segments, with what happened between them as ``events``.
 
@@ -225,7 +225,7 @@ def joined_balance(
     parts
         The same ones, read at the times that are wanted.
     order
-        Where the rows of all parts go; None where they stay.
+        Index of the rows of all parts, one part after the other, that puts them in order.
     """
     balances = [part.energy_balance for part in parts]
     ends = [segment.at([segment.steps.end]).energy_balance for segment in segments]
@@ -242,8 +242,8 @@ def joined_balance(
             jumped += ends[k + 1].start - float(end.kinetic[-1] + end.potential[-1])
 
     def joined(pieces: Sequence[FloatArray]) -> FloatArray:
-        whole = np.concatenate(pieces)
-        return whole if order is None else whole[order]
+        whole: FloatArray = np.concatenate(pieces)[order]
+        return whole
 
     return EnergyBalance(
         joined([balance.t for balance in balances]),

@@ -165,6 +165,16 @@ def test_times_are_of_double_precision_whatever_the_type_of_a_step(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_states_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
+    simulator = srm.Simulator(slider_crank, backend=backend)
+    q, v = simulator.step(0.1)
+    before = q.copy(), v.copy()
+    for array in (q, v, simulator.q, simulator.v):
+        array[:] = np.nan
+    np.testing.assert_array_equal((simulator.q, simulator.v), before)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_forces_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator, other = (srm.Simulator(slider_crank, backend=backend) for _ in range(2))
     tau = np.zeros(2)

@@ -25,7 +25,7 @@ from srm_mbs.integration.control.step_size import (
 )
 from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
-from srm_mbs.integration.kernel.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
+from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.singular_endpoints import start
@@ -212,17 +212,18 @@ class KernelRun(IncrementalRun):
         grid: float,
     ) -> None:
         run = self._run
-        reason = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
+        returned = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
         self._held.only(force)  # clones need it, too
-        if reason == FINISHED:
+        if returned == ReturnReason.FINISHED:
             return
         self.system.between(first, last)
-        if reason == BREAKPOINT:
+        reason = ReturnReason(returned)
+        if reason is ReturnReason.BREAKPOINT:
             run.remember(self._renewed(run.memory(), end))
-            reason = CHUNK_FULL
-        while reason == CHUNK_FULL:
+            reason = ReturnReason.CHUNK_FULL
+        while reason is ReturnReason.CHUNK_FULL:
             reason = run.advance()
-        if reason != FINISHED:
+        if reason is not ReturnReason.FINISHED:
             failure = why_stopped(reason, self.system, run)
             raise self._stopped(f" with step {run.h:.1e} s", failure.sentence)
 

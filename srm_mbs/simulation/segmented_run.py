@@ -272,7 +272,7 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
         Only with ``raise_on_failure``.
     """
     if isinstance(options.events, Iterator):  # they are looked at more than once
-        options = replace(options, events=list(options.events))
+        options = options._replace(events=list(options.events))
     checked = checked_options(mechanism, options)
     if acting(options.events):
         result = _run_segments(mechanism, checked, types)
@@ -292,17 +292,17 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
         mechanism = mechanism.with_state(
             mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
         )
-    here = replace(options, t_eval=None)
+    here = options._replace(t_eval=None)
     if options.sample_time is not None and options.controller is not None:
         period = positive(options.sample_time, "sample_time", " of seconds")
-        here = replace(here, controller=_Sampled(options.controller, period))
+        here = here._replace(controller=_Sampled(options.controller, period))
     parts: list[R] = []
     t = options.t0
     span = t_end - t
     status, message = RunStatus.RUNNING, ""
     while status is RunStatus.RUNNING:
         try:
-            asked = replace(here, events=[event.in_segment() for event in events])
+            asked = here._replace(events=[event.in_segment() for event in events])
             part = run_segment(mechanism, asked, types.plain)
             part.request = asked.repeatable()
             parts.append(part)
@@ -329,7 +329,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
             status = RunStatus.INTERRUPTED
             message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
-            here = replace(here, t0=t, q0=q, v0=v)
+            here = here._replace(t0=t, q0=q, v0=v)
             status = RunStatus.RUNNING if t_end - t > LEFT * span else RunStatus.FINISHED
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."

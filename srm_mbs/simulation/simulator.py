@@ -35,8 +35,6 @@ RESTART_GROWTH = 1e10
 start."""
 BREAKPOINT_ROUNDING = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
-_NO_OPTIONS = ("self", "mechanism")
-"""Parameters of :class:`Simulator` that are none of its options."""
 
 
 class Simulator:
@@ -75,7 +73,8 @@ class Simulator:
         placement: str = "automatic",
         backend: str = "auto",
     ) -> None:
-        given = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
+        given = locals()  # every other parameter is an option
+        del given["self"], given["mechanism"]
         check_mechanism(mechanism)
         options = checked_accuracy(mechanism, RunOptions(math.inf, **given), 0.0, math.inf)
         check_embedded(options.method.scheme, step)

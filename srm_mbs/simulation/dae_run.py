@@ -20,7 +20,7 @@ from srm_mbs.integration.methods.thesis.dae_stability import instability
 from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.simulation.dae_result import DaeResult
-from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
+from srm_mbs.simulation.monitoring import log_end, log_start
 from srm_mbs.simulation.options import (
     LOOSEST_RTOL,
     TIGHTEST_RTOL,
@@ -31,11 +31,9 @@ from srm_mbs.simulation.options import (
 )
 from srm_mbs.simulation.result import attempt_array
 from srm_mbs.simulation.runner import (
-    chosen_first_step,
     failed_start,
     finished,
     integrate_steps,
-    placed_control,
     settings,
     statistics,
 )
@@ -151,8 +149,6 @@ def run_dae(
     else:
         record.message += branch_changes(turned, "x' turned", MENDED)
     data = record.data(method.scheme, system.tangent_size)
-    placed = sum(wrapper.placed for wrapper in wrappers)
-    replaced = sum(wrapper.replaced for wrapper in wrappers)
     result = result_type(
         system,
         method,
@@ -164,7 +160,7 @@ def run_dae(
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message + method_messages(method, record.steps, norm),
-        stats=statistics(system, record, data, placed, replaced),
+        stats=statistics(system, record, data, wrappers),
     )
     log_end("DAE", result)
     return finished(result, options)
@@ -192,13 +188,7 @@ def _integrate(
                 remedy="Start beside that point",
             )
         first_sweeps = sweep_nodes(memory)
-        control, wrappers = placed_control(
-            system, options, lambda: chosen_first_step(system, norm, options, memory, state)
-        )
-        with progress_of(options.progress, system, options.t_end) as tick:
-            record = integrate_steps(
-                system, options, control, norm, memory, state, tick, watch, words=DAE
-            )
+        record, wrappers = integrate_steps(system, options, norm, memory, state, watch, words=DAE)
     except (EvaluationError, ControllerError) as error:
         record = failed_start(options.t0, state, error)
     return record, wrappers, first_sweeps

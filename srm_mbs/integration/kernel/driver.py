@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,22 +30,21 @@ class CompiledRecord(RunRecord):
     ----------
     run
         Holds the steps.
-    suspects
-        Ends (s) of steps that were accepted although they may have changed the branch.
     placed, replaced
         Numbers of steps that were placed around a singular configuration, and of attempts that
         were repeated for it.
     """
 
     run: Any = None
-    suspects: list[float] = field(default_factory=list)
     placed: int = 0
     replaced: int = 0
 
+    def suspect_times(self) -> list[float]:
+        """Ends (s) of steps that were accepted although they may have changed the branch."""
+        return list(self.run.suspect_times())
+
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        if self.run is None:
-            return super().data(scheme, tangent_size)
         return steps_from(self.run.take_records(self.t0, self.x0), self.stop)
 
 
@@ -110,7 +109,6 @@ def integrate(
     record.attempts = [
         driver.Attempt(t, h, ratio, DECISIONS[decision]) for t, h, ratio, decision in run.attempts()
     ]
-    record.suspects = run.suspect_times()
     record.placed, record.replaced = run.placed, run.replaced
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started

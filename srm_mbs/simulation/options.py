@@ -193,7 +193,13 @@ def finite(value: Any, what: str) -> float:
     """``value`` as a finite number of seconds."""
     if type(value) is float and math.isfinite(value):
         return value
-    (number,) = numbers([value], what, "Give a number of seconds").tolist()
+    number = finite_array(value, ())
+    if number is None:
+        raise InputError(
+            f"{what} = {value!r} is not a finite number",
+            element=what,
+            remedy="Give a number of seconds",
+        )
     return float(number)
 
 

@@ -326,6 +326,8 @@ def _one_segment(file: io.BytesIO, result_type: type[R]) -> R:
     """A run of one segment."""
     with np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
+    if "meta" not in arrays:
+        raise ValueError(f"it has the arrays {', '.join(arrays)} only")
     meta = json.loads(str(arrays.pop("meta")))
     _check_format("it has", meta["format"], FORMAT)
     mechanism = _mechanism(meta["mechanism"], arrays)

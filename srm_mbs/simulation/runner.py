@@ -239,6 +239,12 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
     return np.broadcast_to(array, (2 * nv,)).copy()
 
 
+def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
+    """The error norm with the tolerances of checked ``options``."""
+    atol = absolute_tolerance(mechanism, options.atol, options.rtol)
+    return ErrorNorm(atol, options.rtol, options.negligible)
+
+
 def initial_state(
     mechanism: Mechanism, t0: float, q0: Any, v0: Any
 ) -> tuple[Mechanism, FloatArray]:
@@ -315,8 +321,7 @@ def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
     check_avoidable(options.singular_times, intervals.ends, t_end - t0)
     on_kernel = uses_kernel(options.backend, method, options.placement, options.singular_times)
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
-    tolerance = absolute_tolerance(mechanism, options.atol, options.rtol)
-    norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+    norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
     system = make_system(mechanism, options.controller if held is None else held)
     mechanism.check_covers(t_end)

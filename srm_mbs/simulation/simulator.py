@@ -16,16 +16,16 @@ from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel.backend import uses_kernel
-from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import RunOptions, check_embedded, finite, positive
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
-    absolute_tolerance,
     check_consistent,
     check_mechanism,
     checked_accuracy,
+    error_norm,
 )
 
 NEGLIGIBLE_DT = 8.0
@@ -80,8 +80,7 @@ class Simulator:
         check_embedded(options.method.scheme, step)
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options
-        tolerance = absolute_tolerance(mechanism, atol, options.rtol)
-        self._norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+        self._norm = error_norm(mechanism, options)
         self._on_kernel = uses_kernel(
             backend, options.method, options.placement, options.singular_times
         )
@@ -178,7 +177,11 @@ class Simulator:
         if self._pending_start is not None:
             if not np.isfinite(force).all():
                 raise _bad_force(tau)
-            self._begin(*self._pending_start, force, dt)
+            try:
+                self._run.begin(*self._pending_start, force, dt)
+            except EvaluationError as error:
+                raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
+            self._pending_start = None
         run = self._run
         try:
             # Breakpoints at the ends count, too: forces just before and just after them differ.
@@ -217,14 +220,6 @@ class Simulator:
             forces_jumped = k > 0 or first > -math.inf
             grid = self._grid(until - self._run.t)
             self._run.go_on(until, first, last, force, forces_jumped, grid)
-
-    def _begin(self, t: float, state: FloatArray, force: FloatArray, dt: float) -> None:
-        """Start from where it was reset to."""
-        try:
-            self._run.begin(t, state, force, dt)
-        except EvaluationError as error:
-            raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
-        self._pending_start = None
 
     def reset(
         self, q: Any = None, v: Any = None, t: float = 0.0, *, project: bool = False
@@ -312,8 +307,7 @@ class Simulator:
             other._pending_start = self._pending_start[0], self._pending_start[1].copy()
         return other
 
-    def __copy__(self) -> Simulator:
-        return self.clone()
+    __copy__ = clone
 
     def __deepcopy__(self, memo: Any) -> Simulator:
         return self.clone()

@@ -42,17 +42,17 @@ Result = TypeVar("Result", bound=DaeResult)
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""
-MENDED = (
+TURN_REMEDY = (
     'Try a smaller rtol or step, restarted sweeps with T = "inverse" (restart=True, carry=True), '
     "or PSRM in its split form."
 )
 """What to do about a passage that may have changed the branch."""
-CARRIED = (
+CARRIED_Y_REMEDY = (
     'Use T = "inverse", which carries B y (SRM: with restart=True, carry=True), or PSRM in its '
     "split form."
 )
 """The same for sweeps that carry y, for which no shorter step does."""
-UNSTABLE = (
+INSTABILITY_REMEDY = (
     " Sweeps with T = I or (GB)^T are stable only while h |G B T|/eps is about 1 or less: try "
     'T = "inverse", or a larger eps.'
 )
@@ -147,7 +147,7 @@ def run_dae(
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)
     else:
-        record.message += branch_changes(turned, "x' turned", MENDED)
+        record.message += branch_changes(turned, "x' turned", TURN_REMEDY)
     data = record.data(method.scheme, system.tangent_size)
     result = result_type(
         system,
@@ -217,6 +217,6 @@ def _add_sweep_failure(
         if record.status is not RunStatus.FAILED:  # within the passage
             record.status = RunStatus.FAILED
             record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
-        record.message += " " + (CARRIED if carries_y else MENDED)
+        record.message += " " + (CARRIED_Y_REMEDY if carries_y else TURN_REMEDY)
     elif record.status is RunStatus.FAILED and carries_y:
-        record.message += UNSTABLE
+        record.message += INSTABILITY_REMEDY

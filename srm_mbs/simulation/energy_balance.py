@@ -1,4 +1,4 @@
-r"""Energy balance of a run: what kinetic and potential energy gained is the work of what acts.
+r"""Energy balance of a run: the energy gained is the work of controller, damping, forces, drives.
 
     K + V - (K + V)(t_0) = sum of the works W_i,   W_i' = tau_i . v,
 
@@ -132,7 +132,8 @@ def _joints(run: BalancedRun, system: _System) -> Powers:
 
 
 def _elements(run: BalancedRun, system: _System) -> Powers:
-    """Of springs and bushings what is left when their force at rest is taken off."""
+    """Power of force elements; of springs and bushings without their force at rest, which has a
+    potential."""
     mechanism = run.mechanism
     model, data = mechanism.model, workspace(mechanism.model)
     rest = np.zeros(model.nv)

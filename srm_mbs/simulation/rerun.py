@@ -11,7 +11,7 @@ from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.segmented_result import RESULTS
 from srm_mbs.simulation.segmented_run import run
 
-BEYOND = 0.1
+EXTENSION = 0.1
 """Extension of the rerun of a failed run, as a part of its length: the rerun may get further."""
 
 
@@ -64,7 +64,7 @@ def rerun(
     if solution.status == "interrupted":
         t_end = end
     elif solution.status == "failed":
-        t_end = min(t_end, end + BEYOND * max(end - start, BEYOND * (t_end - start)))
+        t_end = min(t_end, end + EXTENSION * max(end - start, EXTENSION * (t_end - start)))
     asked = settings.rtol if rtol is None else rtol
     backend = request.backend
     if settings.backend == "python" and backend == "auto":

@@ -160,17 +160,17 @@ def impact(
 
 log = logging.getLogger(__name__)
 
-MANY = 10
+CHATTER_ACTIONS = 10
 """Actions of an event after which it may chatter."""
-CHATTERS = 1e-8
-"""An event that occurs MANY times within this part of the run chatters."""
-HELD = 1e-9
-"""Rounding of an event that closures hold at zero, over its values before."""
-SNAPS = 1e-4
+CHATTER_SPAN = 1e-8
+"""An event that acts CHATTER_ACTIONS times within this part of the run chatters."""
+HELD_EVENT_ROUNDING = 1e-9
+"""Rounding of the value of an event that closures hold at zero, over its values before."""
+LARGEST_PROJECTION = 1e-4
 """Largest motion (units) onto the closures of another mechanism: more is an inconsistent state."""
-ON = 1e-13
+CLOSED_ROUNDING = 1e-13
 """Closure error that is rounding, in scaled rows, and over 1 + |v| that of rates."""
-LEFT = 1e-12
+NEGLIGIBLE_REST = 1e-12
 """Part of the run too short for another segment."""
 
 
@@ -197,7 +197,7 @@ class _RunEvent:
     acted: bool = False
     floor: float = 0.0
     start_tolerance: float | None = None
-    acted_at: deque[float] = field(default_factory=lambda: deque(maxlen=MANY))
+    acted_at: deque[float] = field(default_factory=lambda: deque(maxlen=CHATTER_ACTIONS))
 
     @property
     def name(self) -> str:
@@ -232,11 +232,11 @@ class _RunEvent:
         """Record an action at ``t`` (s); refuse too many within a part of the length ``span``."""
         self.acted_at.append(t)
         within = t - self.acted_at[0]
-        if len(self.acted_at) == MANY and within < CHATTERS * span:
+        if len(self.acted_at) == CHATTER_ACTIONS and within < CHATTER_SPAN * span:
             raise EventError(
-                f"the event {self.name!r} occurred {MANY} times within {within:.1e} s: it "
-                "chatters. Let its action hold what it hits (srm.Switch with a closure) when the "
-                "impact is slow"
+                f"the event {self.name!r} occurred {CHATTER_ACTIONS} times within {within:.1e} s: "
+                "it chatters. Let its action hold what it hits (srm.Switch with a closure) when "
+                "the impact is slow"
             )
 
 
@@ -330,7 +330,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
             message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
             here = here._replace(t0=t, q0=q, v0=v)
-            status = RunStatus.RUNNING if t_end - t > LEFT * span else RunStatus.FINISHED
+            status = RunStatus.RUNNING if t_end - t > NEGLIGIBLE_REST * span else RunStatus.FINISHED
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
     return types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
@@ -339,15 +339,18 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
 def _rounding(event: Callable[..., Any], solution: SimulationResult) -> float:
     """Size of the value of an event that new closures hold at zero."""
     rows = zip(solution.t, solution.q, solution.v)
-    return HELD * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
+    return HELD_EVENT_ROUNDING * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
 
 
 def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
-    """Whether ``x`` is on the closures to rounding.  Moving it onto them would gain nothing, and
-    next to a singular configuration take it off its branch by that rounding over sigma."""
+    """Whether ``x`` is on the closures to rounding.
+
+    A projection would then gain nothing, and next to a singular configuration it would move ``x``
+    off its branch by rounding over sigma.
+    """
     g, c = system.residuals(x, t)
     speed = 1.0 + float(np.abs(x[system.nq :]).max())
-    return bool((np.abs(g) < ON).all() and (np.abs(c) < ON * speed).all())
+    return bool((np.abs(g) < CLOSED_ROUNDING).all() and (np.abs(c) < CLOSED_ROUNDING * speed).all())
 
 
 def _after_actions(
@@ -403,8 +406,11 @@ def _after_actions(
 
 
 def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:
-    """The motions of the drives of ``new`` from ``t`` (s) on: those that ``old`` has go on, others
-    engage where they find their coordinate, unless they prescribe positions."""
+    """The motions of the drives of ``new`` from ``t`` (s) on.
+
+    Drives that ``old`` has continue; others begin at the present value of their coordinate, unless
+    they prescribe positions.
+    """
     found = positions(new.model, new.drives, new.q0)
     curves = {}
     for drive in new.drives:
@@ -431,7 +437,7 @@ def _switched(
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)
-    if system.position_norm(system.difference(given, x)) > SNAPS:
+    if system.position_norm(system.difference(given, x)) > LARGEST_PROJECTION:
         check_consistent(new, t)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

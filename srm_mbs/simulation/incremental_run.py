@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -34,6 +35,7 @@ from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import placed_control
 
 
+@dataclass(eq=False, repr=False)
 class IncrementalRun(ABC):
     """A run that continues call by call.
 
@@ -45,18 +47,15 @@ class IncrementalRun(ABC):
         Error norm and checked options.
     """
 
-    def __init__(
-        self,
-        system: OpenSystem | ClosedSystem,
-        held: HeldForce,
-        norm: ErrorNorm,
-        options: RunOptions,
-    ) -> None:
-        self.system, self.norm, self.options = system, norm, options
-        self.method: Method = options.method
-        self._held = held
-        self._evaluator: Any = system
-        self._systems: tuple[Any, ...] = (system,)
+    system: OpenSystem | ClosedSystem
+    held: HeldForce
+    norm: ErrorNorm
+    options: RunOptions
+
+    def __post_init__(self) -> None:
+        self.method: Method = self.options.method
+        self._evaluator: Any = self.system
+        self._systems: tuple[Any, ...] = (self.system,)
 
     @property
     @abstractmethod
@@ -85,7 +84,7 @@ class IncrementalRun(ABC):
 
     def _hold(self, t: float, force: FloatArray) -> None:
         """Let ``force`` (nv,) act from ``t`` (s) on."""
-        self._held.only(force)
+        self.held.only(force)
 
     @abstractmethod
     def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
@@ -160,14 +159,9 @@ class IncrementalRun(ABC):
 class KernelRun(IncrementalRun):
     """A run of the compiled kernel."""
 
-    def __init__(
-        self,
-        system: OpenSystem | ClosedSystem,
-        held: HeldForce,
-        norm: ErrorNorm,
-        options: RunOptions,
-    ) -> None:
-        super().__init__(system, held, norm, options)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        system, options = self.system, self.options
         self._kernel_system = make_kernel_system(system)
         self._evaluator = Evaluator(system, self._kernel_system)
         self._systems = (system, self._kernel_system)
@@ -175,7 +169,7 @@ class KernelRun(IncrementalRun):
         self._run = CompiledRun(
             self._kernel_system,
             options.method,
-            norm,
+            self.norm,
             IntegratorState(nothing, 1.0, nothing),
             np.zeros(system.nq + system.nv),
             smooth_intervals(nothing[:0], nothing[:0], 0.0, 1.0),
@@ -213,7 +207,7 @@ class KernelRun(IncrementalRun):
     ) -> None:
         run = self._run
         returned = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
-        self._held.only(force)  # clones need it, too
+        self.held.only(force)  # clones need it, too
         if returned == ReturnReason.FINISHED:
             return
         self.system.between(first, last)
@@ -229,7 +223,7 @@ class KernelRun(IncrementalRun):
 
     def go_on_from(self, other: Self) -> None:
         snapshot = other._run.snapshot()
-        self._hold(snapshot.t, other._held.values[-1])
+        self._hold(snapshot.t, other.held.values[-1])
         self._run.restore(snapshot)
 
     def _counts(self) -> tuple[int, int, int, int, int]:
@@ -278,8 +272,8 @@ class ReferenceRun(IncrementalRun):
     ) -> None:
         if force.shape != (self.system.nv,) or not np.isfinite(force).all():
             raise ValueError("not nv finite forces")
-        forces_jumped = forces_jumped or not np.array_equal(force, self._held.values[-1])
-        self._held.only(force)
+        forces_jumped = forces_jumped or not np.array_equal(force, self.held.values[-1])
+        self.held.only(force)
         self.system.between(first, last)
         if forces_jumped:
             self._memory = self._renewed(self._memory, end)
@@ -308,7 +302,7 @@ class ReferenceRun(IncrementalRun):
     def go_on_from(self, other: Self) -> None:
         self._t, self._state = other.t, other.state
         self._nearness = copy.copy(other._nearness)
-        self._hold(self._t, other._held.values[-1])
+        self._hold(self._t, other.held.values[-1])
         # Controls refer to what they are for: not to be copied, but to be exchanged.
         shared = {id(other.system): self.system, id(self.method.scheme): self.method.scheme}
         self._memory = copy.deepcopy(other._memory, dict(shared))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs.errors import InputError
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.segmented_result import RESULTS
 from srm_mbs.simulation.segmented_run import run
@@ -15,14 +16,14 @@ EXTENSION = 0.1
 """Extension of the rerun of a failed run, as a part of its length: the rerun may get further."""
 
 
-def unsupported_reason(solution: SimulationResult) -> str:
-    """Why ``solution`` cannot be made again; empty if it can."""
+def unsupported_reason(solution: SimulationResult) -> str | None:
+    """Why ``solution`` cannot be made again; None if it can."""
     request = solution.request
     if request is None:
         return "the file that it was loaded from does not hold how it was made"
     if request.lost:
         return f"saved runs hold no Python functions, and it had {', '.join(request.lost)}"
-    return ""
+    return None
 
 
 def rerun(
@@ -61,9 +62,9 @@ def rerun(
     settings = solution.settings
     start, end = solution.span
     t_end = request.t_end
-    if solution.status == "interrupted":
+    if solution.status is RunStatus.INTERRUPTED:
         t_end = end
-    elif solution.status == "failed":
+    elif solution.status is RunStatus.FAILED:
         t_end = min(t_end, end + EXTENSION * max(end - start, EXTENSION * (t_end - start)))
     asked = settings.rtol if rtol is None else rtol
     backend = request.backend

@@ -26,6 +26,7 @@ class StopReason(Enum):
         "closures that seemed to follow from the others open: no motion was found that keeps all "
         "loops closed and follows all drives, the mechanism is locked there"
     )
+    UNSTABLE_SWEEPS = "the sweeps do not damp their constraint errors"
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ alike.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,7 @@ class AvoidTimes(ControlWrapper):
         return float(next(x for x in candidates if x <= h and self._clear(x, distances)))
 
 
-def suspected(wrappers: Sequence[ControlWrapper]) -> list[float]:
+def suspected(wrappers: Sequence[Any]) -> list[float]:
     """Times (s) up to which the motion may have changed its branch, by the branch guard among the
     ``wrappers``."""
     return [t for wrapper in wrappers for t in wrapper.suspect_times()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 import srm_mbs as srm
@@ -25,6 +27,7 @@ from srm_mbs.visualization.animation.overlays import (
 )
 from srm_mbs.visualization.animation.page import make_page, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
+from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import opened
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
@@ -543,6 +546,17 @@ def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.So
     assert re.fullmatch(r"the picture goes along with .* which travels \d+ m", note["text"])
 
 
+@pytest.mark.parametrize("t", [0.05, 2.0])
+def test_the_snapshot_of_a_mechanism_that_travels_far_shows_it_at_any_time(
+    flight: srm.Solution, t: float
+) -> None:
+    with Image.open(io.BytesIO(draw_snapshot(flight, t))) as picture:
+        drawn = (np.asarray(picture.convert("RGB")) < 250).any(axis=2)
+    rows, columns = np.nonzero(drawn)
+    assert max(np.ptp(columns) / 900.0, np.ptp(rows) / 600.0) > 0.3
+    assert 0 < columns.min() < columns.max() < 899
+
+
 def test_the_picture_stands_still_where_a_joint_holds_to_the_ground_or_little_is_gained(
     slider_crank: srm.Solution,
 ) -> None:
@@ -591,10 +605,8 @@ def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
 
 
 def test_names_do_not_end_the_script_of_a_page() -> None:
-    from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
-
     about = {"notes": [{"text": "</script><script>alert(1)</script>"}]}
-    page = make_page(import_meshcat(), "a</title>b", about, [])
+    page = make_page("a</title>b", about, [])
     assert "</script><script>alert(1)" not in page
     assert "a</title>b" not in page
 

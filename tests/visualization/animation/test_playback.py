@@ -17,7 +17,14 @@ import srm_mbs as srm
 from srm_mbs.visualization.animation import scene, trajectory
 from srm_mbs.visualization.animation.playback import close, export_html, play
 from srm_mbs.visualization.animation.scene import choose_view
-from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Sphere, visuals_of
+from srm_mbs.visualization.animation.shapes import (
+    Box,
+    Cylinder,
+    Mesh,
+    Sphere,
+    bounding_box,
+    visuals_of,
+)
 from srm_mbs.visualization.animation.trajectory import sample_motion
 from tests.support.browsing import bodies_in, opened, placements
 from tests.support.bundled import load
@@ -296,7 +303,7 @@ def test_mesh_files_are_found_beside_the_urdf_and_in_packages(tmp_path: Path, na
     mesh = visuals_of(mechanism)[-1].shape
     assert isinstance(mesh, Mesh)
     assert len(mesh.faces) == 4
-    assert np.allclose(mesh.extent(), [[0.0, 0.0, 0.0], [0.1, 0.1, 0.4]])
+    assert np.allclose(bounding_box(mesh), [[0.0, 0.0, 0.0], [0.1, 0.1, 0.4]])
 
 
 def test_a_missing_mesh_is_left_out_with_a_warning_that_names_it(

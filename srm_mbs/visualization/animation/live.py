@@ -104,8 +104,7 @@ class LiveView:
         data["live"] = [names[joint] for joint in self._joints]
         page = make_page(mechanism.name, data, None)
         self.visualizer = serve(page, picture)
-        self._mechanism = mechanism
-        self._model, self._data = mechanism.model, workspace(mechanism.model)
+        self._mechanism, self._data = mechanism, workspace(mechanism.model)
         self._node = self.visualizer["/live"]
         self._began = self._last = 0.0
         self.spent, self.shown, self.stride = 0.0, 0, 1
@@ -155,8 +154,9 @@ class LiveView:
         self._send(t, state, PATIENCE)
 
     def _send(self, t: float, state: FloatArray, patience: float) -> None:
-        q, v = np.split(state, [self._model.nq])
-        pin.forwardKinematics(self._model, self._data, q)
+        model = self._mechanism.model
+        q, v = np.split(state, [model.nq])
+        pin.forwardKinematics(model, self._data, q)
         energy = self._system.energy(state)
         if math.isnan(self._energy):
             self._energy = energy

@@ -33,16 +33,9 @@ def executed(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     """The code cells, each with what it gave."""
     folder = tmp_path_factory.mktemp("notebook")
     names = ("HOME", "IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR")
+    target = folder / "run"
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "jupyter",
-            "execute",
-            "--output",
-            str(folder / "run"),
-            str(NOTEBOOK),
-        ],
+        [sys.executable, "-m", "jupyter", "execute", "--output", str(target), str(NOTEBOOK)],
         cwd=folder,
         capture_output=True,
         text=True,

@@ -80,37 +80,16 @@ ARM = """<robot name="arm">
 </robot>
 """
 
-TETRAHEDRON = """solid t
-facet normal 0 0 0
-outer loop
-vertex 0 0 0
-vertex 0 1 0
-vertex 1 0 0
-endloop
-endfacet
-facet normal 0 0 0
-outer loop
-vertex 0 0 0
-vertex 1 0 0
-vertex 0 0 2
-endloop
-endfacet
-facet normal 0 0 0
-outer loop
-vertex 0 0 0
-vertex 0 0 2
-vertex 0 1 0
-endloop
-endfacet
-facet normal 0 0 0
-outer loop
-vertex 1 0 0
-vertex 0 1 0
-vertex 0 0 2
-endloop
-endfacet
-endsolid t
-"""
+
+def facet(*corners: str) -> str:
+    """A triangle of an STL file."""
+    loop = "".join(f"vertex {corner}\n" for corner in corners)
+    return f"facet normal 0 0 0\nouter loop\n{loop}endloop\nendfacet\n"
+
+
+CORNER, X, Y, Z = "0 0 0", "1 0 0", "0 1 0", "0 0 2"
+SIDES = ((CORNER, Y, X), (CORNER, X, Z), (CORNER, Z, Y), (X, Y, Z))
+TETRAHEDRON = f"solid t\n{''.join(facet(*side) for side in SIDES)}endsolid t\n"
 
 
 def arm(folder: Path, description: str = "", tip: str = '<sphere radius="0.03"/>') -> srm.Mechanism:
@@ -306,25 +285,18 @@ def test_mesh_files_are_found_beside_the_urdf_and_in_packages(tmp_path: Path, na
     assert np.allclose(bounding_box(mesh), [[0.0, 0.0, 0.0], [0.1, 0.1, 0.4]])
 
 
-def test_a_missing_mesh_is_left_out_with_a_warning_that_names_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("name", ["package://robot/gone.stl", "tip.stl"])
+def test_a_missing_or_unreadable_mesh_is_left_out_with_a_warning_that_names_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    mechanism = arm(tmp_path, tip='<mesh filename="package://robot/gone.stl"/>')
+    mechanism = arm(tmp_path, tip=f'<mesh filename="{name}"/>')
+    (tmp_path / "tip.stl").write_text("this is no mesh")
     with caplog.at_level(logging.WARNING):
         visuals = visuals_of(mechanism)
     assert len(visuals) == 4
-    assert "package://robot/gone.stl" in caplog.text
+    assert name in caplog.text
     assert "'tip'" in caplog.text
     export_html(srm.simulate(mechanism, 0.1), tmp_path / "page.html")
-
-
-def test_an_unreadable_mesh_is_left_out_with_a_warning_that_names_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    mechanism = arm(tmp_path, tip='<mesh filename="tip.stl"/>')
-    (tmp_path / "tip.stl").write_text("this is no mesh")
-    assert len(visuals_of(mechanism)) == 4
-    assert "tip.stl" in caplog.text
 
 
 def test_without_visuals_bars_join_the_joints_and_reach_the_anchors_of_the_loops() -> None:

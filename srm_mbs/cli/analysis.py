@@ -17,6 +17,7 @@ from srm_mbs.cli.output import (
     check_output,
     reported,
     say_written,
+    several,
     table,
 )
 from srm_mbs.errors import InputError
@@ -27,11 +28,7 @@ if TYPE_CHECKING:
 
 Hold = Annotated[
     list[str] | None,
-    typer.Option(
-        "--hold",
-        metavar="JOINT[=VALUE]",
-        help="Keep a joint at VALUE (rad, m), or where it starts. May be given several times.",
-    ),
+    several("--hold", "JOINT[=VALUE]", "Keep a joint at VALUE (rad, m), or where it starts."),
 ]
 
 
@@ -72,7 +69,7 @@ def _write_page(html: Path | None, motion: Callable[[], JointMotion]) -> None:
         say_written(html)
 
 
-@reported()
+@reported
 def modes(
     model: Model,
     hold: Hold = None,
@@ -103,7 +100,7 @@ def modes(
     table(mode_rows(mechanism, found), ("mode", "found", "", *mechanism.joint_names))
 
 
-@reported()
+@reported
 def equilibrium(
     model: Model,
     hold: Hold = None,
@@ -127,7 +124,7 @@ def equilibrium(
     table(position_rows(mechanism, found.q), ("joint", "position"))
 
 
-@reported()
+@reported
 def linearise(
     model: Model,
     at: Annotated[
@@ -140,20 +137,13 @@ def linearise(
     ] = "initial",
     actuated: Annotated[
         list[str] | None,
-        typer.Option(
-            "--input",
-            metavar="JOINT",
-            help="Joint whose force is an input of B. May be given several times.",
-            show_default="all joints",
+        several(
+            "--input", "JOINT", "Joint whose force is an input of B.", show_default="all joints"
         ),
     ] = None,
     coordinate: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="JOINT",
-            help="Joint that is a coordinate. May be given several times.",
-            show_default="chosen",
-        ),
+        several("--coordinate", "JOINT", "Joint that is a coordinate.", show_default="chosen"),
     ] = None,
     mode: Annotated[
         int | None,
@@ -171,8 +161,7 @@ def linearise(
             element="--mode",
             remedy="Give --html, or leave it out",
         )
-    if html is not None:
-        check_output(html, "--html", HTML_SUFFIXES)
+    check_output(html, "--html", HTML_SUFFIXES)
     mechanism = srm_mbs.load(model)
     state = _state(mechanism, at)
     found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
@@ -199,7 +188,7 @@ def _state(mechanism: Mechanism, at: str) -> tuple[Any, ...]:
     )
 
 
-@reported()
+@reported
 def drag(
     model: Model,
     values: Annotated[
@@ -219,8 +208,7 @@ def drag(
     """
     from srm_mbs.cli.tables import path_rows, position_rows
 
-    if html is not None:
-        check_output(html, "--html", HTML_SUFFIXES)
+    check_output(html, "--html", HTML_SUFFIXES)
     mechanism = srm_mbs.load(model)
     targets, bare = _values(values, "JOINT=VALUE")
     if bare:

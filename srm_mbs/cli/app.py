@@ -33,6 +33,7 @@ from srm_mbs.cli.output import (
     check_output,
     reported,
     say_written,
+    several,
     table,
     write_files,
 )
@@ -100,7 +101,7 @@ def _global_options(
 
 
 @app.command()
-@reported()
+@reported
 def simulate(
     model: Model,
     t_end: Annotated[
@@ -176,16 +177,13 @@ def simulate(
     """
     from srm_mbs.analysis.summary import run_rows
 
-    if out is not None:
-        check_output(out, "--out", (".npz",))
+    check_output(out, "--out", (".npz",))
     if plot is not None:
         from srm_mbs.visualization.plotting.figure import FORMATS
 
         check_output(plot, "--plot", FORMATS)
-    if csv is not None:
-        check_output(csv, "--csv", (".csv",))
-    if html is not None:
-        check_output(html, "--html", HTML_SUFFIXES)
+    check_output(csv, "--csv", (".csv",))
+    check_output(html, "--html", HTML_SUFFIXES)
     check_pictures(image, at, video)
 
     mechanism = srm_mbs.load(model)
@@ -237,16 +235,13 @@ def _first(*values: float | None) -> float:
 
 
 @app.command()
-@reported()
+@reported
 def convert(
     model: Model,
     out: Annotated[
         Path, typer.Argument(metavar="OUT.toml", help="The description; its URDF goes beside it.")
     ],
-    cut: Annotated[
-        list[str] | None,
-        typer.Option(metavar="JOINT", help="Cut a loop at this joint. May be given several times."),
-    ] = None,
+    cut: Annotated[list[str] | None, several("--cut", "JOINT", "Cut a loop at this joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
 ) -> None:
     """Write a file of any format as a TOML description and a URDF."""
@@ -260,12 +255,13 @@ def convert(
 
 
 @app.command()
-@reported()
+@reported
 def info(model: Model) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
     """
+    from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (
         drive_rows,
         force_rows,
@@ -276,22 +272,18 @@ def info(model: Model) -> None:
 
     mechanism = srm_mbs.load(model)
     table(mechanism_rows(mechanism))
-    typer.echo()
-    table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
-    if mechanism.loops:
-        typer.echo()
-        table(loop_rows(mechanism), ("loop", "type", "a", "b", "gap at the start"))
-    if mechanism.forces:
-        typer.echo()
-        table(force_rows(mechanism), ("force", "type", "acts on", "values"))
-    if mechanism.drives:
-        typer.echo()
-        table(drive_rows(mechanism), ("drive", "law", "moves", "values"))
-    notes = (*mechanism.notes, *mechanism.structure.notes)
-    from srm_mbs._kernel import missing, remedy
-
+    for header, rows in (
+        (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),
+        (("loop", "type", "a", "b", "gap at the start"), loop_rows(mechanism)),
+        (("force", "type", "acts on", "values"), force_rows(mechanism)),
+        (("drive", "law", "moves", "values"), drive_rows(mechanism)),
+    ):
+        if listed := list(rows):
+            typer.echo()
+            table(listed, header)
+    notes = [*mechanism.notes, *mechanism.structure.notes]
     if missing:
-        notes = (*notes, f"the compiled kernel is not available: {missing}. {remedy}")
+        notes.append(f"the compiled kernel is not available: {missing}. {remedy}")
     if notes:
         typer.echo()
     for note in notes:
@@ -299,7 +291,7 @@ def info(model: Model) -> None:
 
 
 @app.command()
-@reported()
+@reported
 def models() -> None:
     """List the mechanisms that come with the package."""
     from srm_mbs.formats.load import largest_n, models_folder
@@ -318,13 +310,11 @@ def _first_sentence(path: Path) -> str:
     return re.split(r"(?<!\b[A-Z])\.(?:\s|$)", text, maxsplit=1)[0]
 
 
-app.command()(playback.play)
-
-
-app.command()(plot_report.plot)
-
-
-app.command()(plot_report.report)
+for command in (
+    *(playback.play, plot_report.plot, plot_report.report),
+    *(analysis.modes, analysis.equilibrium, analysis.linearise, analysis.drag),
+):
+    app.command()(command)
 
 
 @app.command(
@@ -332,7 +322,7 @@ app.command()(plot_report.report)
     options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...] [--backend python]",
     add_help_option=False,
 )
-@reported()
+@reported
 def benchmark(context: typer.Context) -> None:
     """Compare run time and error with other simulators.
 
@@ -351,19 +341,8 @@ def benchmark(context: typer.Context) -> None:
             remedy="Run it at the top of a checkout of the source",
         )
     # A new process, which reads the number of threads before it loads NumPy.
-    command = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
-    status = subprocess.run(command, check=False).returncode
-    if status:
-        raise typer.Exit(status)
-
-
-for command in (
-    analysis.modes,
-    analysis.equilibrium,
-    analysis.linearise,
-    analysis.drag,
-):
-    app.command()(command)
+    arguments = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
+    raise typer.Exit(subprocess.run(arguments, check=False).returncode)
 
 
 def main() -> None:

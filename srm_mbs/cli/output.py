@@ -34,6 +34,15 @@ Model = Annotated[
 Html = Annotated[
     Path | None, typer.Option(metavar="FILE.html", help="Write the animation as one page.")
 ]
+
+
+def several(option: str, metavar: str, help: str, **shown: Any) -> Any:
+    """An option that may be given several times, for a parameter of type ``list[str] | None``."""
+    return typer.Option(
+        option, metavar=metavar, help=f"{help} May be given several times.", **shown
+    )
+
+
 HTML_SUFFIXES = (".html", ".htm")
 
 
@@ -49,32 +58,30 @@ class Lines(logging.Handler):
         say(record.levelname.lower(), record.getMessage())
 
 
-def reported() -> Callable[[Callable[Given, None]], Callable[Given, None]]:
+def reported(command: Callable[Given, None]) -> Callable[Given, None]:
     """Decorator of commands: warnings and expected errors become single lines, errors exit with 2.
 
     Errors name an option as on the command line: ``--t-end``, not ``t_end``.
     """
 
-    def decorate(command: Callable[Given, None]) -> Callable[Given, None]:
-        @wraps(command)
-        def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
-            try:
-                with _warnings_as_lines():
-                    command(*args, **kwargs)
-            except BrokenPipeError:
-                raise  # the reader of a pipe has ended: typer exits silently
-            except SrmError as error:
-                if isinstance(error, InputError) and error.element is not None:
-                    error.element = _as_written(error.element, command)
-                say("error", error)
-                raise typer.Exit(BAD_INPUT) from error
-            except OSError as error:
-                say("error", os_problem(error))
-                raise typer.Exit(BAD_INPUT) from error
+    @wraps(command)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
+        try:
+            with _warnings_as_lines():
+                command(*args, **kwargs)
+        except BrokenPipeError:
+            raise  # the reader of a pipe has ended: typer exits silently
+        except SrmError as error:
+            if isinstance(error, InputError) and error.element is not None:
+                error.element = _as_written(error.element, command)
+            say("error", error)
+            raise typer.Exit(BAD_INPUT) from error
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            say("error", f"{where}{error.strerror or error}")
+            raise typer.Exit(BAD_INPUT) from error
 
-        return run
-
-    return decorate
+    return run
 
 
 @contextmanager
@@ -98,12 +105,6 @@ def _as_written(element: str, command: Callable[..., None]) -> str:
     return element
 
 
-def os_problem(error: OSError) -> str:
-    """File and reason of ``error``."""
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}"
-
-
 def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
     """Aligned columns on standard output; wrapped on a terminal, never in a pipe."""
     from rich.console import Console
@@ -125,14 +126,16 @@ def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
 # -- output files -----------------------------------------------------------------------------
 
 
-def check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse a file that cannot be written, before a long run.
+def check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+    """Refuse a file that cannot be written, before a long run; None is no file.
 
     Raises
     ------
     InputError
         If its suffix is not one of ``suffixes``, or it cannot be written.
     """
+    if path is None:
+        return
     problem = remedy = ""
     folder = path.parent
     if path.suffix.lower() not in suffixes:

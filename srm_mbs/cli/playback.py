@@ -19,6 +19,7 @@ from srm_mbs.cli.output import (
     check_output,
     reported,
     say_written,
+    several,
     write_files,
 )
 from srm_mbs.errors import InputError
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.visualization.animation.live import LiveView
 
+POINT = "LINK:X,Y,Z"
+"""Form of a point of a link; coordinates in m, in the link's frame."""
 Image = Annotated[
     Path | None,
     typer.Option(metavar="FILE.png", help="Write a picture of the run at the time --at."),
@@ -44,12 +47,7 @@ Video = Annotated[
 ]
 Trace = Annotated[
     list[str] | None,
-    typer.Option(
-        "--trace",
-        metavar="LINK:X,Y,Z",
-        help="Draw the path of a point of a link (m, in the link's frame). May be given several "
-        "times.",
-    ),
+    several("--trace", POINT, "Draw the path of a point of a link (m, in the link's frame)."),
 ]
 Gaps = Annotated[bool, typer.Option("--gaps", help="Draw the gaps of the closures, exaggerated.")]
 Live = Annotated[
@@ -71,9 +69,8 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
     """
     from srm_mbs.visualization.animation.video import FILMS, encoder_of
 
-    if image is not None:
-        check_output(image, "--image", (".png",))
-    elif at is not None:
+    check_output(image, "--image", (".png",))
+    if image is None and at is not None:
         raise InputError(
             "it is the time of a picture, and none is asked for",
             element="--at",
@@ -173,7 +170,7 @@ def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
     return found
 
 
-@reported()
+@reported
 def play(
     run: Run,
     image: Image = None,

@@ -8,15 +8,20 @@ from typing import Annotated, Any
 import typer
 
 import srm_mbs
-from srm_mbs.cli.output import HTML_SUFFIXES, Run, check_output, reported, say_written, table
-from srm_mbs.cli.playback import given_points
+from srm_mbs.cli.output import (
+    HTML_SUFFIXES,
+    Run,
+    check_output,
+    reported,
+    say_written,
+    several,
+    table,
+)
+from srm_mbs.cli.playback import POINT, given_points
 from srm_mbs.errors import InputError
 
-OPTIONS = {"joints": "--joint", "loops": "--loop", "rows": "--rows", "points": "--point"}
-"""Options of plots in Python, and on the command line."""
 
-
-@reported()
+@reported
 def plot(
     run: Run,
     out: Annotated[
@@ -36,33 +41,18 @@ def plot(
             "over position), path (of points in space).",
         ),
     ] = "run",
-    joint: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--joint",
-            metavar="NAME",
-            help="Draw this joint, with state and phase. May be given several times.",
-        ),
+    joints: Annotated[
+        list[str] | None, several("--joint", "NAME", "Draw this joint, with state and phase.")
     ] = None,
-    loop: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--loop",
-            metavar="NAME",
-            help="Draw this closure, with reactions. May be given several times.",
-        ),
+    loops: Annotated[
+        list[str] | None, several("--loop", "NAME", "Draw this closure, with reactions.")
     ] = None,
     rows: Annotated[
         bool, typer.Option("--rows", help="Draw the multiplier of each row, with reactions.")
     ] = False,
-    point: Annotated[
+    points: Annotated[
         list[str] | None,
-        typer.Option(
-            "--point",
-            metavar="LINK:X,Y,Z",
-            help="Draw this point of a link (m, in the link's frame), with path. "
-            "May be given several times.",
-        ),
+        several("--point", POINT, "Draw this point of a link (m, in the link's frame), with path."),
     ] = None,
 ) -> None:
     """Draw a picture of a saved run."""
@@ -70,29 +60,22 @@ def plot(
     from srm_mbs.visualization.plotting.figure import FORMATS
 
     wanted: dict[str, Any] = {
-        "joints": joint,
-        "loops": loop,
-        "rows": rows or None,
-        "points": given_points(point, "--point") if point else None,
+        "joints": joints,
+        "loops": loops,
+        "rows": rows,
+        "points": points and given_points(points, "--point"),
     }
-    options = {name: value for name, value in wanted.items() if value is not None}
-    try:
-        check_options(kind, options)
-        solution = srm_mbs.load_solution(run)
-        path = out
-        if path is None:
-            name = run.stem if kind == "run" else f"{run.stem}_{kind}"
-            path = run.with_name(f"{name}.png")
-        check_output(path, "--out", FORMATS)
-        solution.plot(path, kind, **options)
-    except InputError as error:
-        if error.element in ("kind", *OPTIONS):
-            error.element = OPTIONS.get(error.element, "--kind")
-        raise
+    options = {name: value for name, value in wanted.items() if value}
+    check_options(kind, options)
+    solution = srm_mbs.load_solution(run)
+    name = run.stem if kind == "run" else f"{run.stem}_{kind}"
+    path = run.with_name(f"{name}.png") if out is None else out
+    check_output(path, "--out", FORMATS)
+    solution.plot(path, kind, **options)
     say_written(path)
 
 
-@reported()
+@reported
 def report(
     run: Run,
     out: Annotated[

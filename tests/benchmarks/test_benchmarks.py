@@ -328,7 +328,7 @@ def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]
     chosen += ["--backend", srm.backend()]
     run = subprocess.run(
-        [sys.executable, "-m", "srm_mbs.cli", "benchmark", *arguments, *chosen],
+        [sys.executable, "-m", "srm_mbs", "benchmark", *arguments, *chosen],
         cwd=ROOT,
         capture_output=True,
         text=True,

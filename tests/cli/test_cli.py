@@ -40,7 +40,7 @@ def run(*args: object, status: int = 0) -> str:
 
 
 def command(*args: object) -> list[str]:
-    return [sys.executable, "-m", "srm_mbs.cli", *map(str, args)]
+    return [sys.executable, "-m", "srm_mbs", *map(str, args)]
 
 
 def run_apart(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:

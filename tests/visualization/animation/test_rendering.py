@@ -219,7 +219,7 @@ def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: 
     saved, first, second = (str(tmp_path / name) for name in ("run.npz", "a.png", "b.png"))
     options = ["--t-end", "1.5", "--out", saved, "--image", first, "--at", "0.4"]
     # In a process of its own, which launches its browser.
-    command = [sys.executable, "-m", "srm_mbs.cli", "simulate", "simple_pendulum", *options]
+    command = [sys.executable, "-m", "srm_mbs", "simulate", "simple_pendulum", *options]
     alone = subprocess.run(command, capture_output=True, text=True, check=False)
     assert alone.returncode == 0, alone.stderr
     done = CliRunner().invoke(app, ["play", saved, "--image", second, "--at", "0.4"])

@@ -166,10 +166,8 @@ def test_every_public_function_and_class_is_documented_with_its_members(name: st
 
 @pytest.mark.parametrize("name", [name for name in srm.__all__ if not callable(getattr(srm, name))])
 def test_every_public_table_is_documented_in_its_module(name: str) -> None:
-    (home,) = re.findall(
-        rf'^    "{name}": "([\w.]+)",$', (SOURCE / "__init__.py").read_text(), re.M
-    )
-    body = ast.parse((SOURCE / f"{home.replace('.', '/')}.py").read_text(encoding="utf-8")).body
+    home = SOURCE / f"{srm._HOME[name].replace('.', '/')}.py"
+    body = ast.parse(home.read_text(encoding="utf-8")).body
     after = next(
         b for a, b in pairwise(body) if getattr(getattr(a, "target", None), "id", "") == name
     )

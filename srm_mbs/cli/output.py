@@ -99,7 +99,9 @@ def _as_written(element: str, command: Callable[..., None]) -> str:
     hint = get_type_hints(command, include_extras=True).get(element)
     for given in getattr(hint, "__metadata__", ()):
         if isinstance(given, OptionInfo):
-            return (given.param_decls or ("--" + element.replace("_", "-"),))[0]
+            # Within Annotated the first argument of typer.Option is its name, if any is given.
+            name = given.default
+            return name if isinstance(name, str) else "--" + element.replace("_", "-")
         if isinstance(given, ArgumentInfo):
             return str(given.metavar)
     return element

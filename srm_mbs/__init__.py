@@ -73,7 +73,8 @@ _NAMES = {
     "api": "DaeSolution Solution load_solution simulate solve_dae",
     "assembly.assemble": "Assembly assemble",
     "dynamics.mechanism": "Mechanism",
-    "errors": "__version__ AnalysisError AssemblyError InputError SimulationError SrmError SrmWarning",
+    "errors": "__version__ AnalysisError AssemblyError InputError SimulationError SrmError "
+    "SrmWarning",
     "formats.convert": "convert",
     "formats.load": "bundled_models load n_four_bar",
     "integration.kernel.backend": "backend",

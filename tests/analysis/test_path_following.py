@@ -7,7 +7,6 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
-from tests.support.mechanisms import floating_ring
 
 
 def gaps(path: srm.FollowedPath) -> float:
@@ -98,26 +97,3 @@ def test_a_path_can_be_played() -> None:
     motion = path.motion(2.0)
     np.testing.assert_array_equal(motion(0.0)[0], path.path[0])
     np.testing.assert_allclose(motion(2.0)[0], path.q[-1])
-    with pytest.raises(srm.InputError, match="duration = 0"):
-        path.motion(0)
-
-
-def test_what_cannot_be_dragged_is_refused() -> None:
-    mechanism = srm.load("four_bar")
-    for values, what in (
-        ({"wheel": 1.0}, "no joint 'wheel'"),
-        ({"crank": np.nan}, "cannot be dragged along"),
-        ({"crank": "up"}, "cannot be dragged along"),
-        ({"crank": [1.0, 2.0], "rocker": [1.0]}, r"have \[2, 1\] values"),
-        ({}, r"have \[\] values"),
-        ({"crank": 1.0, "rocker": 1.4}, "independently"),
-    ):
-        with pytest.raises(srm.InputError, match=what):
-            srm.follow(mechanism, values)
-    with pytest.raises(srm.InputError, match="without loops"):
-        srm.follow(srm.load("pendulum_chain"), {"link_0": 1.0})
-    with pytest.raises(srm.InputError, match="starts on a singular"):
-        srm.follow(srm.load("slider_crank"), {"crank": 1.0}, [0.5 * np.pi, -np.pi])
-    ring = floating_ring()
-    with pytest.raises(srm.InputError, match="cannot be dragged along"):
-        srm.follow(ring, {"b": 1.0})

@@ -411,28 +411,7 @@ def test_event_actions_that_a_saved_run_has_lost_are_named(tmp_path: Path) -> No
     assert finding(certificate, "energy balance").grade == "good"
 
 
-# --- bad input, and what is printed --------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "rtol", "words"),
-    [
-        ({"rtol": 1e-6}, 1e-6, "two runs alike"),
-        ({"rtol": 1e-6}, -1.0, "not a positive number"),
-        ({"step": 0.01}, 1e-8, "fixed steps"),
-    ],
-)
-def test_a_tolerance_that_tells_nothing_is_refused(
-    options: dict[str, Any], rtol: float, words: str
-) -> None:
-    solution = srm.simulate(load("four_bar"), 0.1, **options)
-    with pytest.raises(srm.InputError, match=words):
-        srm.certify(solution, rtol=rtol)
-
-
-def test_what_is_no_run_has_no_certificate() -> None:
-    with pytest.raises(srm.InputError, match="Mechanism is not a run"):
-        srm.certify(load("four_bar"))  # type: ignore[arg-type]
+# --- what is printed -----------------------------------------------------------------------------
 
 
 def test_a_certificate_reads_as_sentences() -> None:

@@ -425,11 +425,6 @@ def test_the_command_refuses_what_it_cannot_do(saved: Path, options: list[str], 
     assert words in done.output
 
 
-def test_pictures_that_reports_do_not_have_are_refused(run: srm.Solution, tmp_path: Path) -> None:
-    with pytest.raises(srm.InputError, match=r"'phase'.*Known: run, state, balance"):
-        run.report(tmp_path / "report.html", pictures=["phase"])
-
-
 def test_a_picture_that_a_loaded_run_has_not_is_named_in_the_page(tmp_path: Path) -> None:
     controlled = srm.simulate(load("four_bar"), 0.1, controller=lambda t, q, v: 0.0 * v)
     controlled.save(tmp_path / "run.npz")

@@ -13,7 +13,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 import srm_mbs as srm
 from benchmarks.work_precision import (
@@ -38,11 +37,9 @@ from benchmarks.work_precision.reliability import measure_reliability, summary
 from benchmarks.work_precision.scaling import measure_scaling
 from benchmarks.work_precision.skip import ITEMS, measure_unneeded
 from benchmarks.work_precision.trees import Equations
-from srm_mbs.cli.app import app
 from srm_mbs.dynamics.multibody import make_system
 from tests.support.bundled import problem as shared
-
-ROOT = Path(__file__).parents[2]
+from tests.support.commands import ROOT, run, run_apart
 
 
 def quiet(text: str) -> None:
@@ -315,29 +312,18 @@ def test_a_repeat_that_takes_too_long_ends_the_sweep_and_not_the_benchmark() -> 
 
 def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["benchmark", "--out", "x"])
-    assert result.exit_code == 2
-    assert "checkout" in result.output
-    result = CliRunner().invoke(app, ["benchmark", "--help"])
-    assert result.exit_code == 0
-    assert "--peers" in result.output
+    assert "checkout" in run("benchmark", "--out", "x", status=2)
+    assert "--peers" in run("benchmark", "--help")
 
 
 def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]
     chosen += ["--backend", srm.backend()]
-    run = subprocess.run(
-        [sys.executable, "-m", "srm_mbs", "benchmark", *arguments, *chosen],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240,
-    )
-    assert run.returncode == 0, run.stderr
-    assert "[1/1]" in run.stdout
-    assert "written:" in run.stdout
+    done = run_apart("benchmark", *arguments, *chosen)
+    assert done.returncode == 0, done.stderr
+    assert "[1/1]" in done.stdout
+    assert "written:" in done.stdout
     results = records.load(tmp_path / "results.json")
     assert {row.peer for row in results.measurements} == {"ours", "pinocchio_dop853"}
     assert (tmp_path / "work_precision_pendulum_chain.png").is_file()

@@ -309,21 +309,6 @@ def test_verbose_shows_the_log_and_without_it_nothing_of_it_is_seen() -> None:
     assert quiet.stderr == ""
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--t-end", "0"], "error: --t-end: t_end = 0.0 is not"),
-        (["--rtol", "-1"], "error: --rtol: rtol = -1.0 is not"),
-        (["--tableau", "rk5"], "error: --tableau: there is no tableau 'rk5'. Known: "),
-        (["--trace", "rod"], "error: --trace: 'rod' is not a point of a link"),
-    ],
-)
-def test_errors_name_options_as_they_are_written(options: list[str], words: str) -> None:
-    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
-    assert done.exit_code == 2
-    assert done.stderr.startswith(words)
-
-
 PAGES = (PACKAGE.parent / "README.md", *sorted((PACKAGE.parent / "docs").glob("*.md")))
 
 

@@ -14,18 +14,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs.analysis.report.report import report_page
 from srm_mbs.analysis.report.sections import pictures_data
-from srm_mbs.cli.app import app
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.visualization.animation.shapes import ANCHOR_COLOUR
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import LARGE, opened
 from tests.support.bundled import load
+from tests.support.commands import run as run_command
 
 VOID = {"meta", "link", "img", "br", "input", "hr"}
 MEGABYTES = 1_000_000
@@ -400,29 +399,14 @@ def test_the_command_writes_the_page_beside_the_run(
     monkeypatch.setattr(
         "srm_mbs.analysis.report.report.pictures_data", lambda *_: {"images": [], "missing": []}
     )  # they take a second
-    done = CliRunner().invoke(app, ["report", str(saved), "--no-animation"])
-    assert done.exit_code == 0, done.output
+    output = run_command("report", saved, "--no-animation")
     path = saved.with_name(f"{saved.stem}_report.html")
-    assert f"written: {path}" in done.output
-    assert re.search(r"^estimated error +good +No joint is off", done.output, re.MULTILINE)
-    assert "making the run again" in done.output
+    assert f"written: {path}" in output
+    assert re.search(r"^estimated error +good +No joint is off", output, re.MULTILINE)
+    assert "making the run again" in output
     page = Page(path.read_text(encoding="utf-8"))
     assert page.srcdoc == ""
     assert "iframe" not in path.read_text(encoding="utf-8").split("</style>")[1]
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--out", "report.pdf"], "the suffix '.pdf' is not known here"),
-        (["--rtol", "1e-6"], "two runs alike"),
-        (["--rtol", "1e-8", "--no-second-run"], "--rtol: it is the tolerance of the second run"),
-    ],
-)
-def test_the_command_refuses_what_it_cannot_do(saved: Path, options: list[str], words: str) -> None:
-    done = CliRunner().invoke(app, ["report", str(saved), *options])
-    assert done.exit_code == 2
-    assert words in done.output
 
 
 def test_a_picture_that_a_loaded_run_has_not_is_named_in_the_page(tmp_path: Path) -> None:

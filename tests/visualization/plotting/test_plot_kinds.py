@@ -19,8 +19,8 @@ from srm_mbs.visualization.plotting import figure as style
 from srm_mbs.visualization.plotting import joints as phase
 from srm_mbs.visualization.plotting import joints as state
 from srm_mbs.visualization.plotting.joints import rotation_vectors
-from tests.cli.test_cli import error_line, run
 from tests.support.bundled import load
+from tests.support.commands import error_line, run
 from tests.support.daes import START_TWO, problem_two, solution_two
 from tests.support.mechanisms import floating_ring
 from tests.visualization.plotting.test_plots import fails_at, legend, line, marked_times, titles

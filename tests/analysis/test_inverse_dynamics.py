@@ -48,6 +48,7 @@ def terms(mechanism: srm.Mechanism, q: np.ndarray, v: np.ndarray):
         ("spatial_four_bar", ["crank"]),
         ("slider_crank", ["crank"]),
         ("pendulum_chain", ["link_0", "link_1", "link_2"]),
+        ("differential", ["left_shaft", "pinion"]),
     ],
 )
 def test_the_torques_of_a_controller_are_recovered(name: str, names: list[str]) -> None:
@@ -55,8 +56,13 @@ def test_the_torques_of_a_controller_are_recovered(name: str, names: list[str]) 
     found = srm.inverse_dynamics(mechanism, run, names)
     assert found.actuated == tuple(names)
     np.testing.assert_allclose(found.torques, given, atol=1e-8)
-    for loop, wrench in run.reactions.items():
-        np.testing.assert_allclose(found.reactions[loop], wrench, atol=1e-6, rtol=1e-8)
+    for of_run, own in (
+        (run.reactions, found.reactions),
+        (run.reaction_multipliers, found.reaction_multipliers),
+    ):
+        assert own.keys() == of_run.keys()
+        for loop, values in of_run.items():
+            np.testing.assert_allclose(own[loop], values, atol=1e-6, rtol=1e-8)
 
 
 def test_the_power_of_the_torques_is_what_the_energy_gains() -> None:
@@ -137,4 +143,6 @@ def test_a_prescribed_crank_turns_uniformly() -> None:
 def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:
     mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
     for motion in (run, lambda t: (run.q[0], run.v[0], run.accelerations[0])):
-        assert srm.inverse_dynamics(mechanism, motion, "crank", t=[]).torques.shape == (0, 1)
+        found = srm.inverse_dynamics(mechanism, motion, "crank", t=[])
+        assert found.torques.shape == (0, 1)
+        assert found.reactions["pin"].shape == (0, 6)

@@ -216,8 +216,8 @@ def test_the_page_of_many_loops_leaves_out_what_takes_minutes_and_says_so() -> N
     page = Page(report_page(run, srm.certify(run, again=False), animation=False, pictures=()))
     passages = next(table for table in page.tables if table[0][0] == "time (s)")
     assert passages[1][0] == f"{crossing.time:.9g}"
-    assert (passages[1][1], passages[1][3]) == ("not told", "not told")
-    assert "takes minutes to find out" in page.text
+    assert (passages[1][1], passages[1][3]) == ("not computed", "not computed")
+    assert "takes minutes to compute" in page.text
     # They were not asked for: one passage takes 9 s.
     assert not {"participants", "_tangents", "singular"} & vars(crossing).keys()
 

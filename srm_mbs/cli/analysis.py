@@ -15,6 +15,7 @@ from srm_mbs.cli.output import (
     Html,
     Model,
     check_output,
+    option,
     reported,
     say_written,
     several,
@@ -32,7 +33,7 @@ Hold = Annotated[
 ]
 
 
-def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]], list[str]]:
+def _values(given: list[str] | None, element: str) -> tuple[dict[str, list[float]], list[str]]:
     """Joints with values (``JOINT=VALUE,...``), and those without."""
     values: dict[str, list[float]] = {}
     names = []
@@ -40,7 +41,7 @@ def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]
         name, equals, numbers = text.partition("=")
         if name in values or name in names:
             raise InputError(
-                f"joint {name!r} is given twice", element=option, remedy="Give each joint once"
+                f"joint {name!r} is given twice", element=element, remedy="Give each joint once"
             )
         if not equals:
             names.append(name)
@@ -49,7 +50,7 @@ def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]
             values[name] = [float(number) for number in numbers.split(",")]
         except ValueError:
             raise InputError(
-                f"{text!r} is not a joint with a value", element=option, remedy="Write crank=1.5"
+                f"{text!r} is not a joint with a value", element=element, remedy="Write crank=1.5"
             ) from None
     return values, names
 
@@ -74,9 +75,9 @@ def modes(
     model: Model,
     hold: Hold = None,
     starts: Annotated[
-        int, typer.Option(metavar="N", help="Number of configurations from which closing starts.")
+        int, option("N", "Number of configurations from which closing starts.")
     ] = 200,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the random ones among them.")] = 0,
+    seed: Annotated[int, option("N", "Seed of the random ones among them.")] = 0,
 ) -> None:
     """List the assembly modes, the ways in which loops close.
 
@@ -129,9 +130,9 @@ def linearise(
     model: Model,
     at: Annotated[
         str,
-        typer.Option(
-            metavar="initial|rest|equilibrium|nearest",
-            help="Where: the initial state, the initial configuration at rest, a stable "
+        option(
+            "initial|rest|equilibrium|nearest",
+            "Where: the initial state, the initial configuration at rest, a stable "
             "equilibrium, or the nearest one.",
         ),
     ] = "initial",
@@ -146,8 +147,7 @@ def linearise(
         several("--coordinate", "JOINT", "Joint that is a coordinate.", show_default="chosen"),
     ] = None,
     mode: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=0, help="Mode that --html shows.", show_default="0"),
+        int | None, option("N", "Mode that --html shows.", min=0, show_default="0")
     ] = None,
     html: Html = None,
 ) -> None:
@@ -198,9 +198,7 @@ def drag(
         ),
     ],
     html: Html = None,
-    duration: Annotated[
-        float, typer.Option(metavar="S", help="Length of the animation (s).")
-    ] = 3.0,
+    duration: Annotated[float, option("S", "Length of the animation (s).")] = 3.0,
 ) -> None:
     """Drag joints through positions, on one branch.
 

@@ -31,26 +31,12 @@ from srm_mbs.cli.output import (
     Lines,
     Model,
     check_output,
+    option,
     reported,
     say_written,
     several,
     table,
     write_files,
-)
-from srm_mbs.cli.playback import (
-    At,
-    Gaps,
-    Image,
-    Live,
-    Reactions,
-    Trace,
-    Video,
-    check_overlays,
-    check_pictures,
-    check_time,
-    live_view,
-    overlay_options,
-    play_run,
 )
 from srm_mbs.errors import InputError
 
@@ -106,69 +92,57 @@ def simulate(
     model: Model,
     t_end: Annotated[
         float | None,
-        typer.Option(
-            metavar="S",
-            help="End of the run (s).",
-            show_default=f"the description's, else {T_END:g}",
-        ),
+        option("S", "End of the run (s).", show_default=f"the description's, else {T_END:g}"),
     ] = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help="Integration method.")] = "psrm",
+    method: Annotated[str, option("NAME", "Integration method.")] = "psrm",
     tableau: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Runge-Kutta scheme of the method.",
+        option(
+            "NAME",
+            "Runge-Kutta scheme of the method.",
             show_default="the method's: dop853 with psrm, tvd32 with srm",
         ),
     ] = None,
     rtol: Annotated[
         float | None,
-        typer.Option(
-            metavar="R",
-            help="Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
+        option(
+            "R",
+            "Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
             "1e-4 with srm).",
             show_default="the description's, else 1e-6",
         ),
     ] = None,
     atol: Annotated[
         float | None,
-        typer.Option(
-            metavar="A",
-            help="Absolute tolerance of every coordinate.",
+        option(
+            "A",
+            "Absolute tolerance of every coordinate.",
             show_default="the description's, else rtol times the unit of each coordinate",
         ),
     ] = None,
     step: Annotated[
-        float | None,
-        typer.Option(metavar="H", help="Fixed step (s) instead of step-size control."),
+        float | None, option("H", "Fixed step (s) instead of step-size control.")
     ] = None,
     backend: Annotated[
-        str,
-        typer.Option(metavar="auto|python|kernel", help="Backend that computes the run."),
+        str, option("auto|python|kernel", "Backend that computes the run.")
     ] = "auto",
-    out: Annotated[
-        Path | None, typer.Option(metavar="RUN.npz", help="Save the run, for plot and play.")
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Plot the run as .png, .pdf or .svg."),
-    ] = None,
+    out: Annotated[Path | None, option("RUN.npz", "Save the run, for plot and play.")] = None,
+    plot: Annotated[Path | None, option("FILE", "Plot the run as .png, .pdf or .svg.")] = None,
     csv: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.csv", help="Write the motion at the steps as a table."),
+        Path | None, option("FILE.csv", "Write the motion at the steps as a table.")
     ] = None,
     html: Html = None,
-    image: Image = None,
-    at: At = None,
-    video: Video = None,
-    trace: Trace = None,
-    gaps: Gaps = False,
-    reactions: Reactions = False,
+    image: playback.Image = None,
+    at: playback.At = None,
+    video: playback.Video = None,
+    trace: playback.Trace = None,
+    gaps: playback.Gaps = False,
+    reactions: playback.Reactions = False,
     balance: Annotated[
         bool, typer.Option("--balance", help="Print the energy balance of the run.")
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
-    live: Live = False,
+    live: playback.Live = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -184,15 +158,15 @@ def simulate(
         check_output(plot, "--plot", FORMATS)
     check_output(csv, "--csv", (".csv",))
     check_output(html, "--html", HTML_SUFFIXES)
-    check_pictures(image, at, video)
+    playback.check_pictures(image, at, video)
 
     mechanism = srm_mbs.load(model)
-    overlays = overlay_options(mechanism, trace, gaps, reactions)
-    check_overlays(trace, gaps, reactions, (html, image, video, play, live))
+    overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
+    playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
-    check_time(at, t_end)
-    view = live_view(mechanism) if live else None
+    playback.check_time(at, t_end)
+    view = playback.live_view(mechanism) if live else None
     solution = srm_mbs.simulate(
         mechanism,
         t_end,
@@ -222,7 +196,7 @@ def simulate(
         table(balance_rows(solution.energy_balance))
     typer.echo(solution.message, err=not solution.success)
     if play or view:
-        play_run(solution, overlays, view)
+        playback.play_run(solution, overlays, view)
     if failed:
         raise typer.Exit(BAD_INPUT)
     if not solution.success:

@@ -20,6 +20,18 @@ from srm_mbs.errors import CHECK_WRITING, InputError, SrmError, SrmWarning
 RUN_FAILED, BAD_INPUT = 1, 2
 """Exit status."""
 Given = ParamSpec("Given")
+
+
+def option(metavar: str, help: str, **more: Any) -> Any:
+    """An option that takes a value; ``more`` are further arguments of ``typer.Option``."""
+    return typer.Option(metavar=metavar, help=help, **more)
+
+
+def several(name: str, metavar: str, help: str, **more: Any) -> Any:
+    """An option that may be given several times, for a parameter of type ``list[str] | None``."""
+    return typer.Option(name, metavar=metavar, help=f"{help} May be given several times.", **more)
+
+
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
 ]
@@ -31,18 +43,7 @@ Model = Annotated[
         "another format, which its content tells (docs/formats.md).",
     ),
 ]
-Html = Annotated[
-    Path | None, typer.Option(metavar="FILE.html", help="Write the animation as one page.")
-]
-
-
-def several(option: str, metavar: str, help: str, **shown: Any) -> Any:
-    """An option that may be given several times, for a parameter of type ``list[str] | None``."""
-    return typer.Option(
-        option, metavar=metavar, help=f"{help} May be given several times.", **shown
-    )
-
-
+Html = Annotated[Path | None, option("FILE.html", "Write the animation as one page.")]
 HTML_SUFFIXES = (".html", ".htm")
 
 

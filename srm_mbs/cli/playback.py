@@ -17,6 +17,7 @@ from srm_mbs.cli.output import (
     BAD_INPUT,
     Run,
     check_output,
+    option,
     reported,
     say_written,
     several,
@@ -31,20 +32,11 @@ if TYPE_CHECKING:
 
 POINT = "LINK:X,Y,Z"
 """Form of a point of a link; coordinates in m, in the link's frame."""
-Image = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.png", help="Write a picture of the run at the time --at."),
-]
+Image = Annotated[Path | None, option("FILE.png", "Write a picture of the run at the time --at.")]
 At = Annotated[
-    float | None,
-    typer.Option(
-        "--at", metavar="S", help="Time of the picture in the run (s).", show_default="the end"
-    ),
+    float | None, option("S", "Time of the picture in the run (s).", show_default="the end")
 ]
-Video = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Write a film of the run as .gif or .mp4."),
-]
+Video = Annotated[Path | None, option("FILE", "Write a film of the run as .gif or .mp4.")]
 Trace = Annotated[
     list[str] | None,
     several("--trace", POINT, "Draw the path of a point of a link (m, in the link's frame)."),
@@ -116,11 +108,11 @@ def check_overlays(
     """
     if any(animations):
         return
-    for option, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
+    for name, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
         if given:
             raise InputError(
                 "it is drawn in the animation, and none is asked for",
-                element=option,
+                element=name,
                 remedy="Give --html, --image, --video, --play or --live too",
             )
 
@@ -143,8 +135,8 @@ def overlay_options(
     return {"trace": anchors, "gaps": gaps, "reactions": reactions}
 
 
-def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
-    """The points LINK:X,Y,Z of ``option``.
+def given_points(texts: list[str], element: str) -> list[srm_mbs.Anchor]:
+    """The points LINK:X,Y,Z of the argument ``element``.
 
     Raises
     ------
@@ -163,7 +155,7 @@ def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
         if not colon:
             raise InputError(
                 f"{text!r} is not a point of a link",
-                element=option,
+                element=element,
                 remedy="Write LINK:X,Y,Z, for example rod:0.5,0,0",
             )
         found.append(srm_mbs.Anchor(link, xyz=(x, y, z)))

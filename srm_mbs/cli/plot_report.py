@@ -12,6 +12,7 @@ from srm_mbs.cli.output import (
     HTML_SUFFIXES,
     Run,
     check_output,
+    option,
     reported,
     say_written,
     several,
@@ -26,17 +27,17 @@ def plot(
     run: Run,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Write the picture to this .png, .pdf or .svg.",
+        option(
+            "FILE",
+            "Write the picture to this .png, .pdf or .svg.",
             show_default="RUN.png, or RUN_KIND.png for other kinds than run",
         ),
     ] = None,
     kind: Annotated[
         str,
-        typer.Option(
-            metavar="KIND",
-            help="Kind of picture: run (drift, energy, sigma, steps), state (joints over time), "
+        option(
+            "KIND",
+            "Kind of picture: run (drift, energy, sigma, steps), state (joints over time), "
             "balance (energies and works), reactions, sigma (with all kinds of steps), phase (rate "
             "over position), path (of points in space).",
         ),
@@ -80,11 +81,7 @@ def report(
     run: Run,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="OUT.html",
-            help="Write the page to this file.",
-            show_default="RUN_report.html",
-        ),
+        option("OUT.html", "Write the page to this file.", show_default="RUN_report.html"),
     ] = None,
     no_animation: Annotated[
         bool,
@@ -92,9 +89,9 @@ def report(
     ] = False,
     rtol: Annotated[
         float | None,
-        typer.Option(
-            metavar="R",
-            help="Relative tolerance of the second run, for the error estimate; runs with fixed "
+        option(
+            "R",
+            "Relative tolerance of the second run, for the error estimate; runs with fixed "
             "steps are made again with smaller ones.",
             show_default="a hundredth of the run's",
         ),

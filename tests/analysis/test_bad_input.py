@@ -77,7 +77,7 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "certify: the same tolerance": lambda: srm.certify(run, rtol=1e-6),
         "certify: negative tolerance": lambda: srm.certify(run, rtol=-1.0),
         "certify: fixed steps": lambda: srm.certify(fixed, rtol=1e-8),
-        "certify: no run": lambda: srm.certify(four),  # type: ignore[arg-type]
+        "certify: no run": lambda: srm.certify(four),
         "report: picture": lambda: run.report(tmp_path / "report.html", pictures=["phase"]),
     }
     check_messages("analysis", {case: refused(call) for case, call in calls.items()})

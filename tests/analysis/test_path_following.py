@@ -44,7 +44,6 @@ def test_a_rocker_stops_where_crank_and_coupler_are_in_line(to: float) -> None:
     assert len(path.q) == 0
     reach = 3.0 if to < 0.0 else 1.0
     angle = np.pi - np.arccos((1.5**2 + 2.2**2 - reach**2) / (2.0 * 1.5 * 2.2))
-    assert path.limit is not None
     np.testing.assert_allclose(path.limit.values["rocker"], angle, atol=1e-12)
     np.testing.assert_allclose(np.abs(np.sin(path.limit.q[1])), 0.0, atol=1e-7)
     assert path.branch_kept
@@ -77,7 +76,6 @@ def test_two_cranks_are_dragged_together_and_stop_together() -> None:
     assert path.complete
     np.testing.assert_allclose(path.q[0][[0, 2]], list(both.values()), atol=1e-14)
     stopped = srm.follow(mechanism, {"crank_left": 5.0, "crank_right": start[1]})
-    assert stopped.limit is not None
     assert stopped.limit.values["crank_right"] == pytest.approx(start[1], abs=1e-12)
     # the two couplers are in line there: their directions, sums of the angles of each side
     left, right = stopped.limit.q[:2].sum(), stopped.limit.q[2:].sum()

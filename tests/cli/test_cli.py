@@ -28,6 +28,27 @@ POSIX = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 pytestmark = pytest.mark.filterwarnings("ignore:zmq.eventloop:DeprecationWarning")
 
 
+def started(*args: object) -> subprocess.Popen[str]:
+    """A command that goes on beside the test, in a process that a signal interrupts."""
+    return subprocess.Popen(
+        command(*args),
+        cwd=ROOT,
+        env=os.environ | {"BROWSER": "true"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A test run in the background of a shell would ignore the signal.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+def runs_written(folder: Path, *suffixes: str) -> tuple[list[object], list[Path]]:
+    """Options that write a run to files with these suffixes, and the files."""
+    names = {"npz": "--out", "csv": "--csv", "html": "--html"}
+    paths = [folder / f"run.{suffix}" for suffix in suffixes]
+    return [x for path in paths for x in (names.get(path.suffix[1:], "--plot"), path)], paths
+
+
 @pytest.fixture(scope="module")
 def saved_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("saved") / "run.npz"
@@ -57,16 +78,7 @@ def test_every_command_has_help_on_its_arguments_and_options(name: str, words: s
 
 def test_help_lists_the_commands_and_the_exit_status() -> None:
     output = run("--help")
-    for word in (
-        "simulate",
-        "info",
-        "models",
-        "play",
-        "plot",
-        "benchmark",
-        "--verbose",
-        "--version",
-    ):
+    for word in ("simulate", "info", "models", "play", "plot", "benchmark", "--verbose"):
         assert word in output
     assert "2 for bad input" in output
 
@@ -161,10 +173,9 @@ def test_brackets_in_names_are_printed_as_they_are(describe: Describe) -> None:
 
 
 def test_simulate_prints_a_summary_and_writes_every_file(tmp_path: Path) -> None:
-    out, plot, csv, html = (tmp_path / f"run.{suffix}" for suffix in ("npz", "png", "csv", "html"))
-    files = ("--out", out, "--plot", plot, "--csv", csv, "--html", html)
+    files, paths = runs_written(tmp_path, "npz", "png", "csv", "html")
     output = run("simulate", "slider_crank", "--t-end", 5, *files)
-    solution = srm.load_solution(out)
+    solution = srm.load_solution(paths[0])
     assert row(output, "status") == "finished"
     assert row(output, "end time") == "5 s"
     assert row(output, "steps") == f"{solution.stats.steps}"
@@ -173,29 +184,28 @@ def test_simulate_prints_a_summary_and_writes_every_file(tmp_path: Path) -> None
     assert row(output, "largest ||g||") == f"{solution.drift[:, 0].max():.2e} (m, rad)"
     for name in ("rejected steps", "placements", "zone steps", "energy change", "wall time"):
         assert row(output, name)
-    for path in (out, plot, csv, html):
+    for path in paths:
         assert f"written            {path}" in output
         assert path.stat().st_size > 5000
     assert "The run reached t = 5 s." in output
 
 
-def test_simulate_takes_its_defaults_from_the_description(
-    describe: Describe, tmp_path: Path
+@pytest.mark.parametrize(
+    ("options", "end", "tableau", "rtol", "atol"),
+    [
+        ("", "0.25 s", "dop853", 1e-7, 1e-9),
+        ("--t-end 0.5 --rtol 1e-5 --atol 1e-6 --tableau dopr54", "0.5 s", "dopr54", 1e-5, 1e-6),
+    ],
+)
+def test_options_override_the_defaults_of_the_description(
+    describe: Describe, options: str, end: str, tableau: str, rtol: float, atol: float
 ) -> None:
     path = describe(("t_end = 10.0", "t_end = 0.25\nrtol = 1e-7\natol = 1e-9"))
-    out = tmp_path / "run.npz"
-    assert row(run("simulate", path, "--out", out), "end time") == "0.25 s"
+    out = path.with_name("run.npz")
+    output = run("simulate", path, *options.split(), "--out", out)
+    assert row(output, "end time") == end
     settings = srm.load_solution(out).settings
-    assert (settings.rtol, set(settings.atol)) == (1e-7, {1e-9})
-
-
-def test_options_override_the_description(describe: Describe, tmp_path: Path) -> None:
-    path = describe(("t_end = 10.0", "t_end = 0.25\nrtol = 1e-7\natol = 1e-9"))
-    out = tmp_path / "run.npz"
-    options = ("--t-end", 0.5, "--rtol", 1e-5, "--atol", 1e-6, "--tableau", "dopr54")
-    assert row(run("simulate", path, *options, "--out", out), "end time") == "0.5 s"
-    settings = srm.load_solution(out).settings
-    assert (settings.tableau, settings.rtol, set(settings.atol)) == ("dopr54", 1e-5, {1e-6})
+    assert (settings.tableau, settings.rtol, set(settings.atol)) == (tableau, rtol, {atol})
 
 
 def test_simulate_uses_the_tableau_of_the_method_where_none_is_given(tmp_path: Path) -> None:
@@ -217,25 +227,21 @@ def test_open_chain_has_no_constraint_rows_in_its_summary() -> None:
 
 
 def test_run_that_fails_keeps_what_it_has_and_exits_with_1(tmp_path: Path) -> None:
-    out, plot, html = (tmp_path / name for name in ("run.npz", "run.svg", "run.html"))
-    files = ("--out", out, "--plot", plot, "--html", html)
+    files, paths = runs_written(tmp_path, "npz", "svg", "html")
     output = run("simulate", "pendulum_chain", "--step", 1, *files, status=1)
     assert row(output, "status") == "failed"
     assert "Stopped at t = " in output
-    for path in (out, plot, html):
-        assert path.stat().st_size > 5000
-    solution = srm.load_solution(out)
+    assert all(path.stat().st_size > 5000 for path in paths)
+    solution = srm.load_solution(paths[0])
     assert not solution.success
     assert solution.stats.steps > 0
 
 
 def test_run_that_fails_at_the_start_exits_with_1(tmp_path: Path) -> None:
-    out, plot, html = (tmp_path / name for name in ("run.npz", "run.png", "run.html"))
-    files = ("--out", out, "--plot", plot, "--html", html)
+    files, paths = runs_written(tmp_path, "npz", "png", "html")
     output = run("simulate", "pendulum_chain", "--step", 100, "--t-end", 1000, *files, status=1)
     assert row(output, "steps") == "0"
-    for path in (out, plot, html):
-        assert path.exists()
+    assert all(path.exists() for path in paths)
 
 
 def test_warnings_are_single_lines() -> None:
@@ -260,16 +266,7 @@ def test_interrupted_run_is_written_and_exits_with_1(tmp_path: Path) -> None:
     out, plot = tmp_path / "run.npz", tmp_path / "run.png"
     # One of many bodies and no singular passages: few steps in this time, and little to write.
     args = ("simulate", "jansen_walker", "--t-end", 1e6, "--out", out, "--plot", plot)
-    process = subprocess.Popen(
-        command("-v", *args),
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # A test run in the background of a shell would ignore the signal.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    with process:
+    with started("-v", *args) as process:
         next(line for line in process.stderr if "from t = 0 to 1e+06 s" in line)  # about to begin
         # The first step is made within some ms of its CPU time, however busy the machine is.
         work = psutil.Process(process.pid)
@@ -323,15 +320,7 @@ def test_plot_writes_beside_the_run_unless_told_otherwise(saved_run: Path, tmp_p
 
 @POSIX
 def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> None:
-    process = subprocess.Popen(
-        command("play", saved_run),
-        cwd=ROOT,
-        env=os.environ | {"BROWSER": "true"},
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    with process:
+    with started("play", saved_run) as process:
         next(line for line in process.stderr if "slider_crank is played at http://" in line)
         process.send_signal(signal.SIGINT)
         messages = process.communicate(timeout=120)[1]

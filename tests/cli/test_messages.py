@@ -120,7 +120,7 @@ def test_every_remedy_is_an_imperative_or_a_list_of_what_is_known() -> None:
 
 def test_an_error_needs_a_remedy() -> None:
     with pytest.raises(TypeError, match="remedy"):
-        srm.InputError("there is no such thing")  # type: ignore[call-arg]
+        srm.InputError("there is no such thing")
     error = srm.InputError("there is no such thing", file="a.toml", element="b", remedy="Add it")
     assert str(error) == "a.toml: b: there is no such thing. Add it"
 
@@ -276,7 +276,7 @@ def test_files_sweeps_equilibria_and_daes_are_logged(logged: Any, tmp_path: Path
 
 def commands() -> dict[str, Any]:
     group = typer.main.get_command(app)
-    return {"srm-mbs": group, **group.commands}  # type: ignore[attr-defined]
+    return {"srm-mbs": group, **group.commands}
 
 
 def texts(name: str) -> Iterator[tuple[str, str]]:

@@ -185,7 +185,7 @@ def inverse_dynamics(
         basis, _ = tangent_basis(geometry, q[i], np.arange(nv))
         if basis.shape[1] != free:
             raise InputError(
-                f"at t = {time:.6g} s the motion stands on a singular configuration, where the "
+                f"at t = {time:.6g} s the motion is on a singular configuration, where the "
                 "forces of the actuators are not determined",
                 element="motion",
                 remedy="Leave this time out",

@@ -40,7 +40,7 @@ Model = Annotated[
     typer.Argument(
         metavar="MODEL",
         help="A bundled mechanism (see 'srm-mbs models'), a .toml description, or a file of "
-        "another format, which its content tells (docs/formats.md).",
+        "another format, recognised by its content (docs/formats.md).",
     ),
 ]
 Html = Annotated[Path | None, option("FILE.html", "Write the animation as one page.")]

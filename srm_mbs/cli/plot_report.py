@@ -92,7 +92,7 @@ def report(
         option(
             "R",
             "Relative tolerance of the second run, for the error estimate; runs with fixed "
-            "steps are made again with smaller ones.",
+            "steps are repeated with smaller ones.",
             show_default="a hundredth of the run's",
         ),
     ] = None,
@@ -103,7 +103,7 @@ def report(
 ) -> None:
     """Write one page about a saved run.
 
-    It has the mechanism, motion, settings, accuracy and plots.  The run is made again at tighter
+    It has the mechanism, motion, settings, accuracy and plots.  The run is repeated at tighter
     tolerances, to estimate its error.
     """
     from srm_mbs.analysis.report.report import write_report
@@ -118,7 +118,7 @@ def report(
         )
     solution = srm_mbs.load_solution(run)
     if not no_second_run:
-        typer.echo("making the run again, to estimate its error", err=True)
+        typer.echo("repeating the run, to estimate its error", err=True)
     certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)
     write_report(solution, path, animation=not no_animation, certificate=certificate)
     table((found.topic, found.grade, found.text) for found in certificate.findings)

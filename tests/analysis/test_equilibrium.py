@@ -104,7 +104,7 @@ def test_a_loop_rests_where_its_potential_energy_is_least(mechanism, joint: str)
     assert found.stable
     assert not found.neutral
     assert not found.singular
-    # omega^2 as the linearisation has it, which knows nothing of potentials
+    # omega^2 of the linearisation, which does not use potentials
     twice = srm.linearise(mechanism, found.q).eigenvalues
     np.testing.assert_allclose(np.sqrt(found.eigenvalues[0]), np.abs(twice), rtol=1e-7)
 

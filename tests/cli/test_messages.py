@@ -35,33 +35,27 @@ PROPER = {"G", "Pinocchio", "SDF", "SRM", "T"}
 """With which problems may begin in upper case: names, and letters of the notation."""
 
 
-def beginnings(node: ast.expr | None) -> list[str]:
-    """The literal texts with which the value of an expression can begin; none where it is not
-    literal."""
+def literal_ends(node: ast.expr | None, which: int) -> list[str]:
+    """The literal texts with which the value of an expression can begin (``which`` = 0) or end
+    (-1); none where it is not literal."""
     match node:
         case ast.Constant(value=str(text)):
             return [text]
-        case ast.JoinedStr(values=[ast.Constant(value=str(text)), *_]):
-            return [text]
+        case ast.JoinedStr(values=[_, *_] as values):
+            return literal_ends(values[which], which)
         case ast.IfExp(body=body, orelse=orelse):
-            return beginnings(body) + beginnings(orelse)
-        case ast.BinOp(left=left):
-            return beginnings(left)
+            return literal_ends(body, which) + literal_ends(orelse, which)
+        case ast.BinOp(left=left, right=right):
+            return literal_ends((left, right)[which], which)
     return []
+
+
+def beginnings(node: ast.expr | None) -> list[str]:
+    return literal_ends(node, 0)
 
 
 def endings(node: ast.expr | None) -> list[str]:
-    """The same of how it can end."""
-    match node:
-        case ast.Constant(value=str(text)):
-            return [text]
-        case ast.JoinedStr(values=[*_, ast.Constant(value=str(text))]):
-            return [text]
-        case ast.IfExp(body=body, orelse=orelse):
-            return endings(body) + endings(orelse)
-        case ast.BinOp(right=right):
-            return endings(right)
-    return []
+    return literal_ends(node, -1)
 
 
 def calls() -> Iterator[tuple[str, str, ast.Call]]:

@@ -81,7 +81,7 @@ def assess_status(solution: SimulationResult) -> Assessment:
     if end <= start:
         return Assessment(topic, "poor", f"It {word} at its start: there is no motion to judge.")
     asked = "" if solution.request is None else f" of {solution.request.t_end:.6g} s"
-    text = f"It {word} at t = {end:.6g} s{asked}; all assessments refer to the time up to there."
+    text = f"It {word} at t = {end:.6g} s{asked}; all assessments refer to the time until then."
     return Assessment(topic, "poor", text)
 
 
@@ -150,21 +150,21 @@ def _error(solution: SimulationResult, estimate: ErrorEstimate) -> tuple[Grade, 
     sizes = " and ".join(f"{value:.1e} {unit}" for unit, value in largest.items())
     if estimate.branch is not None:
         return "poor", (
-            f"The run and the one beside it pass the singular configuration at "
-            f"t = {estimate.branch:.6g} s on different branches, and are different motions "
-            "from there: at least one of them is wrong, and they do not tell which."
+            f"The run and the comparison run pass the singular configuration at "
+            f"t = {estimate.branch:.6g} s on different branches, and are different motions from "
+            "there: at least one of them is wrong; the comparison does not show which."
         )
     if estimate.apart is not None:
         return "poor", (
-            f"From t = {estimate.apart:.4g} s on the run and the one beside it are too far apart "
-            "to tell where the mechanism is: what the run says later is a motion that could be, "
-            f"not the one that follows from the start. Before that they differ by at most {sizes}."
+            f"From t = {estimate.apart:.4g} s on the run and the comparison run disagree about the "
+            "position of the mechanism: the rest of the run is a possible motion, not the one that "
+            f"follows from the start. Before that they differ by at most {sizes}."
         )
     grade = _grade(estimate.size, ERROR_LIMITS)
     if estimate.bound:
         return grade, (
-            f"The run beside it is looser and differs by {sizes}: the error of this run should be "
-            "smaller, but there is no tighter one to show by how much."
+            f"The comparison run is looser and differs by {sizes}: the error of this run should be "
+            "smaller, but there is no tighter run to show by how much."
         )
     end = min(solution.span[1], float(estimate.comparison.t[-1]))
     return grade, (

@@ -154,8 +154,6 @@ class DaeSolution(DaeResult):
         return plot_dae(self, path, kind)
 
 
-_NO_OPTIONS = ("mechanism", "problem", "t_span", "x0")
-"""Parameters of :func:`simulate` and :func:`solve_dae` that are none of their options."""
 SOLUTIONS = ResultTypes(Solution, SegmentedSolution)
 """Classes of the results of :func:`simulate` and :func:`load_solution`."""
 
@@ -263,7 +261,8 @@ def simulate(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
+    options = locals()  # every other parameter is one
+    del options["mechanism"]
     return run(mechanism, RunOptions(**options), SOLUTIONS)
 
 
@@ -351,7 +350,9 @@ def solve_dae(
     SimulationError
         Only with ``raise_on_failure``.
     """
-    options = {name: value for name, value in locals().items() if name not in _NO_OPTIONS}
+    options = locals()  # every other parameter is one
+    for name in ("problem", "t_span", "x0"):
+        del options[name]
     return run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,8 +48,7 @@ METHODS: dict[str, Callable[..., Method]] = {
 control do not go together (:class:`srm_mbs.SRM`)."""
 
 
-@dataclass(frozen=True, eq=False)
-class RunOptions:
+class RunOptions(NamedTuple):
     """Options of a run; :func:`srm_mbs.simulate` explains each.
 
     As the caller gave them, until :meth:`checked` replaces them by values of their final types.
@@ -120,8 +118,7 @@ class RunOptions:
             if getattr(self, name) is not None:
                 positive(getattr(self, name), name, unit)
         check_progress(self.progress, arguments)
-        return replace(
-            self,
+        return self._replace(
             t0=t0,
             t_end=t_end,
             placement=checked_placement(self.placement),
@@ -147,8 +144,7 @@ class RunOptions:
 
         Results keep these, so that they hold neither progress functions nor further arrays.
         """
-        kept = {name: getattr(self, name) for name in REPEATED}
-        return RunOptions(self.t_end, **kept, lost=self.lost)
+        return self._replace(**_NOT_REPEATED)
 
 
 REPEATED = (
@@ -156,6 +152,11 @@ REPEATED = (
     *("breakpoints", "placement", "singular_times", "backend"),
 )
 """Options that a rerun takes over; start, accuracy and output come from elsewhere."""
+_NOT_REPEATED = {
+    name: default
+    for name, default in RunOptions._field_defaults.items()
+    if name not in (*REPEATED, "lost")
+}
 
 
 def positive(value: Any, what: str, unit: str = "") -> float:

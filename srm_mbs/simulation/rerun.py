@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -70,8 +69,7 @@ def rerun(
     backend = request.backend
     if settings.backend == "python" and backend == "auto":
         backend = "python"
-    options = replace(
-        request,
+    options = request._replace(
         t_end=t_end,
         rtol=asked,
         atol=np.array(settings.atol) * (asked / settings.rtol),

@@ -8,7 +8,7 @@ run with event actions, a rerun with another accuracy; :func:`srm_mbs.solve_dae`
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -383,49 +383,42 @@ def integrate_problem(problem: Problem) -> tuple[RunRecord, Sequence[ControlWrap
 
     Whatever happens on the way ends in the record: a start that cannot be evaluated, too.
     """
-    system, options, state = problem.system, problem.options, problem.state
-    method, t0 = options.method, options.t0
     kernel_system: Any = None
-    workspaces = ExitStack()  # stays open if the run raises: its workspace is then not used again
     try:
-        evaluator: Any = system
-        if problem.on_kernel:
-            kernel_system = workspaces.enter_context(workspace(system))
-            evaluator = Evaluator(system, kernel_system)
-        handler = BreakpointHandler(problem.intervals, system, method, problem.norm, evaluator)
-        if problem.held is not None:
-            handler.sample = sampler(system, problem.held, options.controller, kernel_system)
-            handler.sample(t0, state)
-        memory = start(system, method, t0, state, problem.norm, options.t_end, evaluator)
-
-        def first_step() -> float:
-            return chosen_first_step(evaluator, problem.norm, options, memory, state)
-
-        with progress_of(options.progress, system, options.t_end) as tick:
-            if kernel_system is not None:
-                run = kernel_run(problem, kernel_system, memory, handler.arrivals, first_step)
-                wrappers: Sequence[ControlWrapper] = ()
-                record: RunRecord = kernel_driver.integrate(
-                    system, run, tick=tick, events=problem.watch, passing=handler
-                )
-            else:
-                control, wrappers = placed_control(system, options, first_step, handler.arrivals)
-                record = integrate_steps(
-                    system,
-                    options,
-                    control,
-                    problem.norm,
-                    memory,
-                    state,
-                    tick,
-                    problem.watch,
-                    handler,
-                )
-        handler.done()
-        workspaces.close()
+        with workspace(problem.system) if problem.on_kernel else nullcontext() as kernel_system:
+            record, wrappers = _integrate(problem, kernel_system)
     except (EvaluationError, ControllerError) as error:
-        return failed_start(t0, state, error, " s"), (), kernel_system
+        return failed_start(problem.options.t0, problem.state, error, " s"), (), kernel_system
     return record, wrappers, kernel_system
+
+
+def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Sequence[ControlWrapper]]:
+    system, options, state, norm = problem.system, problem.options, problem.state, problem.norm
+    method, t0 = options.method, options.t0
+    evaluator: Any = system if kernel_system is None else Evaluator(system, kernel_system)
+    handler = BreakpointHandler(problem.intervals, system, method, norm, evaluator)
+    if problem.held is not None:
+        handler.sample = sampler(system, problem.held, options.controller, kernel_system)
+        handler.sample(t0, state)
+    memory = start(system, method, t0, state, norm, options.t_end, evaluator)
+
+    def first_step() -> float:
+        return chosen_first_step(evaluator, norm, options, memory, state)
+
+    with progress_of(options.progress, system, options.t_end) as tick:
+        if kernel_system is not None:
+            run = kernel_run(problem, kernel_system, memory, handler.arrivals, first_step)
+            record = kernel_driver.integrate(
+                system, run, tick=tick, events=problem.watch, passing=handler
+            )
+            handler.done()
+            return record, ()
+        control, wrappers = placed_control(system, options, first_step, handler.arrivals)
+        steps = integrate_steps(
+            system, options, control, norm, memory, state, tick, problem.watch, handler
+        )
+        handler.done()
+        return steps, wrappers
 
 
 def integrate_steps(

@@ -220,7 +220,7 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
         Only with ``raise_on_failure``.
     """
     if isinstance(options.events, Iterator):  # they are looked at more than once
-        options = replace(options, events=list(options.events))
+        options = options._replace(events=list(options.events))
     checked = checked_options(mechanism, options)
     if acting(options.events):
         result = _run_segments(mechanism, checked, types)
@@ -241,10 +241,10 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
         mechanism = mechanism.with_state(
             mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0
         )
-    here = replace(options, t_eval=None)
+    here = options._replace(t_eval=None)
     if options.sample_time is not None and options.controller is not None:
         period = positive(options.sample_time, "sample_time", " of seconds")
-        here = replace(here, controller=_Sampled(options.controller, period))
+        here = here._replace(controller=_Sampled(options.controller, period))
     counts = [0] * len(prepared)
     last_times: list[list[float]] = [[] for _ in prepared]
     floors = [0.0] * len(prepared)
@@ -260,7 +260,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
             for i, event in enumerate(prepared)
         ]
         try:
-            asked = replace(here, events=events)
+            asked = here._replace(events=events)
             part = run_segment(mechanism, asked, types.plain)
             part.request = asked.repeatable()
         except InputError as error:
@@ -306,7 +306,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
         except KeyboardInterrupt:
             status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
             break
-        here = replace(here, t0=t, q0=q, v0=v)
+        here = here._replace(t0=t, q0=q, v0=v)
         status = RunStatus.RUNNING if t_end - t > LEFT * span else RunStatus.FINISHED
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."

@@ -168,7 +168,7 @@ def test_mutated_mechanisms_on_the_command_line_end_with_one_line_and_a_status(
         (mutation, path), (_, outcome, _) = written[i], outcomes[i]
         command = ["info"] if i % 40 else ["simulate", "--t-end", "0.01"]
         run = subprocess.run(
-            [sys.executable, "-m", "srm_mbs.cli", command[0], path, *command[1:]],
+            [sys.executable, "-m", "srm_mbs", command[0], path, *command[1:]],
             cwd=ROOT, capture_output=True, text=True, timeout=60,
         )  # fmt: skip
         said = f"{mutation.model}, {mutation.change}: {run.stdout}\n{run.stderr}"

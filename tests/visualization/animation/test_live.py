@@ -17,9 +17,9 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.visualization.animation.live import SHARE
 from srm_mbs.visualization.animation.playback import serve
 from srm_mbs.visualization.animation.server import start_server
-from tests.cli.test_cli import run
 from tests.support.browsing import bodies_in, opened, placements
 from tests.support.bundled import load
+from tests.support.commands import run
 
 
 @pytest.fixture(autouse=True)

@@ -28,9 +28,9 @@ from srm_mbs.visualization.animation.overlays import (
 from srm_mbs.visualization.animation.page import make_page, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
-from tests.cli.test_cli import run
 from tests.support.browsing import exported, opened, placements
 from tests.support.bundled import load
+from tests.support.commands import run
 from tests.support.mechanisms import floating_ring
 from tests.support.pacing import assert_pace
 from tests.support.snapshots import check_messages, refused

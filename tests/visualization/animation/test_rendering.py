@@ -18,8 +18,8 @@ import srm_mbs as srm
 from srm_mbs.visualization.animation import video as rendering
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
-from tests.cli.test_cli import run as run_command
-from tests.cli.test_cli import run_apart
+from tests.support.commands import run as run_command
+from tests.support.commands import run_apart
 from tests.support.screenshots import pixels
 
 ORANGE = np.array([0.902, 0.624, 0.0])

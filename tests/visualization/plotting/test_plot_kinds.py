@@ -17,8 +17,8 @@ import srm_mbs as srm
 from srm_mbs.api import Solution
 from srm_mbs.visualization.plotting import KINDS, joints, sampling
 from srm_mbs.visualization.plotting import figure as style
-from tests.cli.test_cli import error_line, run
 from tests.support.bundled import load
+from tests.support.commands import error_line, run
 from tests.support.daes import START_TWO, problem_two, solution_two
 from tests.support.mechanisms import floating_ring
 from tests.support.snapshots import check_messages, refused

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -118,3 +119,79 @@ def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) ->
     assert (found.history.known_until, found.history.known_below) == (2.5, 1e-3)
     assert (found.sigma, found.sigma_slope, found.steps) == (0.5, 0.25, 7)
     np.testing.assert_array_equal(found.rate, given.rate)
+
+
+def data_of(name: str) -> dict[str, Any]:
+    return fields(marshalling.system_struct(ClosedSystem(load(name)).constants()))
+
+
+def one_changed(structs: list[Any], **changes: Any) -> list[Any]:
+    """``structs`` with fields of the first replaced."""
+    first = structs[0]
+    return [type(first)(**fields(first) | changes), *structs[1:]]
+
+
+BEYOND = 10**6
+UNMOVED = np.append(np.eye(3).ravel(), np.zeros(3))
+BAD_INDICES: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, Any]]]] = {
+    "structural_rank": ("four_bar", lambda d: {"structural_rank": 3}),
+    "structural_rank below zero": ("four_bar", lambda d: {"structural_rank": -1}),
+    "rows": ("four_bar", lambda d: {"rows": -1, "residual_scale": np.zeros(0)}),
+    "sigma_ref": ("four_bar", lambda d: {"sigma_ref": 0.0}),
+    "position_of": ("four_bar", lambda d: {"position_of": [0, 1, 3]}),
+    "wrapped_angles": ("four_bar", lambda d: {"wrapped_angles": [3]}),
+    "order": ("four_bar", lambda d: {"order": [1, 1]}),
+    "residual_scale": ("four_bar", lambda d: {"residual_scale": np.array([1.0, np.nan])}),
+    "first_row": ("four_bar", lambda d: {"closures": one_changed(d["closures"], first_row=1)}),
+    "joint_a": ("four_bar", lambda d: {"closures": one_changed(d["closures"], joint_a=4)}),
+    "joint_b": ("four_bar", lambda d: {"closures": one_changed(d["closures"], joint_b=-1)}),
+    "columns": (
+        "four_bar",
+        lambda d: {"closures": one_changed(d["closures"], columns=[0, 1, BEYOND])},
+    ),
+    "group": ("stewart_platform", lambda d: {"groups": one_changed(d["groups"], start=BEYOND)}),
+    "group size": ("stewart_platform", lambda d: {"groups": one_changed(d["groups"], size=60)}),
+    "force": (
+        "stewart_platform",
+        lambda d: {"forces": one_changed(d["forces"], a=core.Anchor(joint=20, placement=UNMOVED))},
+    ),
+    "force on a joint": (
+        "stewart_platform",
+        lambda d: {"forces": one_changed(d["forces"], kind=2, in_v=BEYOND)},
+    ),
+    "coupling": (
+        "differential",
+        lambda d: {"joint_rows": one_changed(d["joint_rows"], row=BEYOND)},
+    ),
+    "coupled joint": (
+        "differential",
+        lambda d: {"joint_rows": one_changed(d["joint_rows"], in_q=[0, 1, BEYOND])},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INDICES)
+def test_a_row_joint_or_column_that_the_model_does_not_have_is_refused(case: str) -> None:
+    name, change = BAD_INDICES[case]
+    data = data_of(name)
+    with pytest.raises(ValueError, match=r"\w+\.\w+ (has|is not)"):
+        core.System(load(name).model, core.SystemData(**data | change(data)), None)
+
+
+def test_a_model_whose_indices_contradict_each_other_is_refused() -> None:
+    data = marshalling.system_struct(ClosedSystem(load("four_bar")).constants())
+    for name, value in (("idx_vs", 7), ("parents", 3), ("nqs", 2)):
+        model = load("four_bar").model.copy()
+        getattr(model, name)[2] = value
+        with pytest.raises(ValueError, match="model"):
+            core.System(model, data, None)
+
+
+def test_a_workspace_is_not_renewed_with_arrays_of_other_sizes() -> None:
+    system = ClosedSystem(load("four_bar"))
+    kernel_system = core.System(system.model, marshalling.system_struct(system.constants()), None)
+    good = {"unit": np.ones(3), "gap_scale": np.ones(2), "damping": None, "friction": None}
+    for name, size in (("unit", 2), ("gap_scale", 3), ("damping", 1), ("friction", 4)):
+        with pytest.raises(ValueError, match=r"has \d numbers instead of \d"):
+            kernel_system.renew(**good | {name: np.ones(size)})
+    kernel_system.renew(**good)

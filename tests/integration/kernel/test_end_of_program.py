@@ -1,0 +1,84 @@
+"""Programs that end while daemon threads are in the kernel."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from srm_mbs.integration.kernel import backend
+
+pytestmark = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
+
+PROGRAM = """
+import threading, time
+import numpy as np
+import srm_mbs as srm
+
+mechanism = srm.load("four_bar")
+running = threading.Event()
+
+def controller(t, q, v):
+    running.set()
+    return np.zeros(3)
+
+def event(t, q, v):
+    running.set()
+    return 1.0
+
+def work():
+    {started}
+    while True:
+        srm.simulate(mechanism, 50.0, rtol=1e-9, {options})
+
+for _ in range({threads}):
+    threading.Thread(target=work, daemon=True).start()
+running.wait()
+time.sleep(0.2)
+"""
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+@pytest.mark.parametrize(
+    ("started", "options"),
+    [
+        ("running.set()", ""),
+        ("", "controller=controller"),
+        ("", "controller=controller, sample_time=0.01"),
+        ("", "events=event"),
+    ],
+    ids=["run", "controller", "samples", "event"],
+)
+def test_a_program_ends_quietly_while_a_daemon_thread_runs(
+    threads: int, started: str, options: str
+) -> None:
+    program = PROGRAM.format(started=started or "pass", options=options, threads=threads)
+
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ""
+
+
+def test_code_that_runs_at_the_end_of_a_program_can_simulate() -> None:
+    program = """
+import atexit
+import srm_mbs as srm
+
+mechanism = srm.load("four_bar")
+
+def simulate_at_the_end():
+    print(srm.simulate(mechanism, 1.0, controller=lambda t, q, v: 0 * v).status)
+
+atexit.register(simulate_at_the_end)
+import srm_mbs.integration.kernel.run
+"""
+
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+
+    assert ended.stdout.strip() == "finished"

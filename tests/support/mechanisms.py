@@ -10,6 +10,7 @@ import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.formats.load import models_folder
 
 CLOSED_MODELS = tuple(
@@ -62,6 +63,17 @@ def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
     """M (nv, nv) at q (nq,)."""
     upper = np.triu(pin.crba(model, model.createData(), q))
     return upper + np.triu(upper, 1).T  # type: ignore[no-any-return]
+
+
+def evaluate_rows(
+    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """g (m,), G (m, nv) and Gdot v (m,) at (q, v)."""
+    data = model.createData()
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    pin.nonLinearEffects(model, data, q, v)
+    rows.update(data, q)
+    return rows.g.copy(), rows.G.copy(), rows.bias.copy()
 
 
 def along_x(distance: float) -> pin.SE3:

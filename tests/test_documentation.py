@@ -1,4 +1,4 @@
-"""What the README and the pages of docs/ show runs as it stands, and the site has all of it."""
+"""The code on the README and the pages of docs/ runs, and the site has every page."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import inspect
 import json
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +21,7 @@ from PIL import Image
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
-from srm_mbs.formats.toml.description import parse_description
+from srm_mbs.formats.toml.description import check_description, parse_toml
 from tools import plot_pictures, singular_pictures
 from tools.method_tables import filled
 from tools.singular_pictures import by_scipy
@@ -29,7 +29,11 @@ from tools.singular_pictures import by_scipy
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SOURCE = ROOT / "srm_mbs"
-PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
+PAGES = {
+    page.name: page.read_text(encoding="utf-8")
+    for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+}
+"""Text of each page, by the name of its file."""
 FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 LANGUAGES = {"python", "toml", "sh", ""}
 """Of fenced blocks; one in another language would be run by no test."""
@@ -39,7 +43,7 @@ Ran = Callable[[str], tuple[dict[str, Any], Path]]
 @cache
 def blocks(page: str) -> tuple[tuple[str, str], ...]:
     """Language and text of the fenced blocks of a page."""
-    return tuple(FENCE.findall(PAGES[page].read_text(encoding="utf-8")))
+    return tuple(FENCE.findall(PAGES[page]))
 
 
 def is_whole(text: str) -> bool:
@@ -93,7 +97,7 @@ def test_the_blocks_of_a_page_run_in_order(page: str, ran: Ran) -> None:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_block_of_a_page_is_in_a_language_that_is_known_here(page: str) -> None:
-    text = PAGES[page].read_text(encoding="utf-8")
+    text = PAGES[page]
     assert {language for language, _ in blocks(page)} <= LANGUAGES
     assert 2 * len(blocks(page)) == text.count("```")
 
@@ -109,14 +113,15 @@ def fragments() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("page", "text"), fragments())
 def test_the_tables_of_descriptions_on_a_page_are_valid(page: str, text: str) -> None:
-    description = parse_description('format = 1\nurdf = "x.urdf"\n' + text, page)
+    entries = parse_toml('format = 1\nurdf = "x.urdf"\n' + text, page)
+    description = check_description(entries, page)
     found = len(description.loop) + len(description.drive) + len(description.force)
     assert found == text.count("[[")
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_files_that_a_page_names_are_there(page: str) -> None:
-    text = PAGES[page].read_text(encoding="utf-8")
+    text = PAGES[page]
     folders = "srm_mbs|tests|benchmarks|tools|docs|models|urdf|examples"
     named = re.findall(rf"`((?:{folders})/[\w./]+)`", text)
     assert [path for path in named if not list(ROOT.glob(f"{path}*"))] == []
@@ -137,7 +142,7 @@ def test_the_site_leads_to_every_page() -> None:
 
 
 def test_the_page_of_the_api_has_every_public_name() -> None:
-    listed = re.findall(r"^::: srm_mbs\.(\w+)$", PAGES["api.md"].read_text(), re.MULTILINE)
+    listed = re.findall(r"^::: srm_mbs\.(\w+)$", PAGES["api.md"], re.MULTILINE)
     assert len(listed) == len(set(listed))
     assert set(listed) == set(srm.__all__)
 
@@ -166,10 +171,8 @@ def test_every_public_function_and_class_is_documented_with_its_members(name: st
 
 @pytest.mark.parametrize("name", [name for name in srm.__all__ if not callable(getattr(srm, name))])
 def test_every_public_table_is_documented_in_its_module(name: str) -> None:
-    (home,) = re.findall(
-        rf'^    "{name}": "([\w.]+)",$', (SOURCE / "__init__.py").read_text(), re.M
-    )
-    body = ast.parse((SOURCE / f"{home.replace('.', '/')}.py").read_text(encoding="utf-8")).body
+    home = SOURCE / f"{srm._HOME[name].replace('.', '/')}.py"
+    body = ast.parse(home.read_text(encoding="utf-8")).body
     after = next(
         b for a, b in pairwise(body) if getattr(getattr(a, "target", None), "id", "") == name
     )
@@ -206,7 +209,7 @@ def test_the_readme_starts_with_exactly_two_commands() -> None:
 
 
 def test_the_page_on_control_says_what_is_out_of_scope() -> None:
-    page = PAGES["control.md"].read_text(encoding="utf-8")
+    page = PAGES["control.md"]
     assert "Contact between bodies" in page[page.index("## Out of scope") :]
 
 
@@ -215,21 +218,23 @@ def test_the_run_with_an_impact_on_the_page_on_control_has_segments(ran: Ran) ->
     assert len(names["bounced"].segments) > 1
 
 
-def test_the_page_on_forces_and_drives_has_every_type() -> None:
-    page = PAGES["forces_and_drives.md"].read_text(encoding="utf-8")
-    for name in (*srm.FORCE_TYPES, *srm.LAW_TYPES):
-        assert f"`{name}`" in page or f'"{name}"' in page
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        ("forces_and_drives.md", [*srm.FORCE_TYPES, *srm.LAW_TYPES]),
+        ("closures.md", srm.CLOSURE_TYPES),
+        ("methods.md", srm.TABLEAUS),
+    ],
+)
+def test_a_page_has_every_name_of_its_tables(page: str, names: Iterable[str]) -> None:
+    text = PAGES[page]
+    assert [name for name in names if f"`{name}`" not in text and f'"{name}"' not in text] == []
 
 
 def test_the_joint_on_the_page_on_forces_and_drives_meets_its_stop(ran: Ran) -> None:
     names, _ = ran("forces_and_drives.md")
     assert names["solution"].energy_balance.relative < 1e-6
     assert 1.5 < names["stopped"].joint("crank")[0].max() < 1.7
-
-
-def test_the_page_on_closures_has_every_type() -> None:
-    page = PAGES["closures.md"].read_text(encoding="utf-8")
-    assert [name for name in srm.CLOSURE_TYPES if f"`{name}`" not in page] == []
 
 
 def test_the_sweeps_on_their_page_give_a_row_per_case(ran: Ran) -> None:
@@ -242,12 +247,12 @@ def test_the_sweeps_on_their_page_give_a_row_per_case(ran: Ran) -> None:
 
 def test_the_table_on_the_page_on_methods_is_that_of_the_committed_benchmark() -> None:
     results = json.loads((DOCS / "work_precision.json").read_text(encoding="utf-8"))
-    page = PAGES["methods.md"].read_text(encoding="utf-8")
+    page = PAGES["methods.md"]
     assert filled(page, results) == page, "run python -m tools.method_tables"
 
 
 def test_the_page_on_methods_has_every_tableau_with_its_order_and_stages() -> None:
-    page = PAGES["methods.md"].read_text(encoding="utf-8")
+    page = PAGES["methods.md"]
     for line in page[page.index("## Tableau") : page.index("the observed orders.")].splitlines():
         if line.startswith("| `"):
             names, orders, stages, estimate, _ = (
@@ -259,7 +264,6 @@ def test_the_page_on_methods_has_every_tableau_with_its_order_and_stages() -> No
                 tableau = srm.TABLEAUS[name]
                 assert (tableau.order, tableau.n_stages) == (int(order), int(count))
                 assert (tableau.error is not None) == (estimate == "yes")
-    assert [name for name in srm.TABLEAUS if f"`{name}`" not in page] == []
 
 
 def test_the_run_that_jumps_on_the_page_on_singular_configurations_hardly_shows_it() -> None:
@@ -285,7 +289,7 @@ def test_the_pictures_of_a_page_can_be_drawn_again(
     page: str, folder: str, draw: Callable[[Path], None], tmp_path: Path
 ) -> None:
     draw(tmp_path)
-    shown = re.findall(rf"\({folder}/(\w+\.png)\)", PAGES[page].read_text(encoding="utf-8"))
+    shown = re.findall(rf"\({folder}/(\w+\.png)\)", PAGES[page])
     assert sorted(shown) == sorted(path.name for path in tmp_path.iterdir())
     for name in shown:
         with Image.open(tmp_path / name) as new, Image.open(DOCS / folder / name) as old:

@@ -144,6 +144,9 @@ class _Statics:
             )
         return point
 
+    def centre(self, chart: TangentChart) -> ChartPoint:
+        return self.at(chart, np.zeros(chart.size))
+
     def stiffness(self, chart: TangentChart) -> FloatArray:
         """K = -dQ/dz (k, k)."""
         steps = np.full(chart.size, TAU)
@@ -151,7 +154,7 @@ class _Statics:
 
     def inertia(self, chart: TangentChart) -> FloatArray:
         """Mass matrix (k, k) of the minimal coordinates."""
-        S = self.at(chart, np.zeros(chart.size)).slopes
+        S = self.centre(chart).slopes
         self.geometry.closure(chart.q)
         out: FloatArray = S.T @ self.geometry.mass() @ S
         return out
@@ -167,8 +170,7 @@ class _Statics:
         if not chart.size:
             return 0.0
         scale = max(self.force_unit(chart), float(np.abs(self.stiffness(chart)).max()))
-        left = self.force(self.at(chart, np.zeros(chart.size)))
-        return float(np.abs(left).max()) / scale
+        return float(np.abs(self.force(self.centre(chart))).max()) / scale
 
 
 def _work(statics: _Statics, chart: TangentChart, p: FloatArray) -> float | None:
@@ -185,12 +187,12 @@ def _work(statics: _Statics, chart: TangentChart, p: FloatArray) -> float | None
 
 def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
     """Trust-region steps along which the forces do work, until Newton steps converge."""
-    reach, travelled = 0.1, 0.0
+    radius, travelled = 0.1, 0.0
     for _ in range(MAX_ITERATIONS):
         if travelled > MAX_TRAVEL:
             break
         chart = statics.chart(q)
-        Q, K = statics.force(statics.at(chart, np.zeros(chart.size))), statics.stiffness(chart)
+        Q, K = statics.force(statics.centre(chart)), statics.stiffness(chart)
         K = 0.5 * (K + K.T)
         values, vectors = np.linalg.eigh(K)
         floor = NEUTRAL_STIFFNESS * statics.force_unit(chart)
@@ -200,23 +202,25 @@ def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
             newton = np.where(soft, 0.0, along / np.where(soft, 1.0, np.maximum(values, floor)))
         else:
             newton = np.full(len(values), np.inf)
-        if np.abs(newton).max(initial=0.0) <= reach:
+        if np.abs(newton).max(initial=0.0) <= radius:
             p = vectors @ newton
             if np.abs(p).max(initial=0.0) <= STEP_TOLERANCE:
                 return q
         else:
-            p = vectors @ _bounded(values, along, reach)
-        promised = float(Q @ p - 0.5 * p @ K @ p)
+            p = vectors @ _bounded(values, along, radius)
+        predicted = float(Q @ p - 0.5 * p @ K @ p)
         work = _work(statics, chart, p)
         size = float(np.abs(p).max(initial=0.0))
         end = chart.point(p)
-        if end is not None and work is not None and work > 0.1 * promised:
+        if end is not None and work is not None and work > 0.1 * predicted:
             q, travelled = end.q, travelled + size
-            reach = min(LARGEST_STEP, max(reach, 2.0 * size)) if work > 0.7 * promised else reach
+            radius = (
+                min(LARGEST_STEP, max(radius, 2.0 * size)) if work > 0.7 * predicted else radius
+            )
         elif size <= SMALLEST_STEP:
             return end.q if end is not None and not np.isinf(newton).any() else q
         else:
-            reach = 0.3 * size
+            radius = 0.3 * size
     raise AnalysisError(
         "no stable equilibrium was found: the forces go on doing work",
         q=q,
@@ -224,21 +228,21 @@ def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
     )
 
 
-def _bounded(values: FloatArray, along: FloatArray, reach: float) -> FloatArray:
-    """Minimiser of -along.p + p.values.p/2 over |p| <= reach, in the eigenvectors' axes."""
+def _bounded(values: FloatArray, along: FloatArray, radius: float) -> FloatArray:
+    """Minimiser of -along.p + p.values.p/2 over |p| <= radius, in the eigenvectors' axes."""
     from scipy.optimize import brentq
 
     along = along.copy()
     lowest = float(values[0])
-    scale = max(float(np.abs(values).max()), float(np.abs(along).max()) / reach, 1e-100)
+    scale = max(float(np.abs(values).max()), float(np.abs(along).max()) / radius, 1e-100)
     # At a maximum the force is zero: leave it along the direction of lowest stiffness.
-    along[0] += np.copysign(1e-8 * scale * reach, along[0])
+    along[0] += np.copysign(1e-8 * scale * radius, along[0])
 
     def excess(mu: float) -> float:
-        return float(np.linalg.norm(along / (values + mu))) - reach
+        return float(np.linalg.norm(along / (values + mu))) - radius
 
     low = max(0.0, -lowest) + 1e-14 * scale
-    high = max(0.0, -lowest) + float(np.linalg.norm(along)) / reach + scale
+    high = max(0.0, -lowest) + float(np.linalg.norm(along)) / radius + scale
     if excess(low) <= 0.0:
         return along / (values + low)
     out: FloatArray = along / (values + float(brentq(excess, low, high, xtol=1e-14 * scale)))
@@ -265,7 +269,7 @@ def _balance(statics: _Statics, q: FloatArray) -> FloatArray:
     """Levenberg-Marquardt steps on Q = 0."""
     damping = 1e-3
     chart = statics.chart(q)
-    Q = statics.force(statics.at(chart, np.zeros(chart.size)))
+    Q = statics.force(statics.centre(chart))
     for _ in range(MAX_ITERATIONS):
         K = statics.stiffness(chart)
         left, values, right = np.linalg.svd(K)
@@ -280,7 +284,7 @@ def _balance(statics: _Statics, q: FloatArray) -> FloatArray:
             end = chart.point(p) if size <= LARGEST_STEP else None
             if end is not None:
                 there = statics.chart(end.q)
-                after = statics.force(statics.at(there, np.zeros(there.size)))
+                after = statics.force(statics.centre(there))
                 if np.linalg.norm(after) < np.linalg.norm(Q):
                     break
             damping = max(10.0 * damping, 1e-12)
@@ -377,7 +381,7 @@ def _described(
             values, vectors = values.real, vectors.real
         order = np.argsort(values.real)
         values, vectors = values[order], vectors[:, order]
-    point = statics.at(chart, np.zeros(chart.size))
+    point = statics.centre(chart)
     shapes = point.slopes @ vectors
     shapes = shapes / np.abs(shapes).max(axis=0, initial=0.0)
     neutral = bool(np.any(np.abs(values) <= NEUTRAL_STIFFNESS * statics.rate**2))
@@ -390,13 +394,14 @@ def _described(
     holding = np.zeros(len(rest))
     holding[columns] = -share / geometry.unit[columns]
     system = make_system(mechanism, lambda t, q, v: holding)
-    wrenches, multipliers = reactions_at(system, np.zeros(1), q[None], statics.rest[None])
+    at_q = reactions_at(system, np.zeros(1), q[None], statics.rest[None])
+    wrenches, multipliers = ({name: rows[0] for name, rows in part.items()} for part in at_q)
     joints = {name: mechanism.joint(name) for name in held}
     log.debug("%s: equilibrium of %d free directions", mechanism.name, len(values))
     return Equilibrium(
         q,
-        {name: values[0] for name, values in multipliers.items()},
-        {name: values[0] for name, values in wrenches.items()},
+        multipliers,
+        wrenches,
         {name: holding[j.idx_v : j.idx_v + j.nv] for name, j in joints.items()},
         float(np.abs(statics.force(point)).max(initial=0.0)),
         values,

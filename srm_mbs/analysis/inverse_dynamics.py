@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -76,14 +76,6 @@ class InverseDynamics:
         return self._computed[1]
 
 
-def _arrays(parts: Callable[[], Iterable[Any]]) -> list[FloatArray]:
-    """The arrays of a motion; empty if they are not numeric."""
-    try:
-        return [np.array(part, dtype=float) for part in parts()]
-    except (TypeError, ValueError):
-        return []
-
-
 def _motion(
     mechanism: Mechanism, motion: Any, t: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -98,6 +90,7 @@ def _motion(
             )
         run = motion if t is None else motion.at(t)
         return run.t, run.q, run.v, run.accelerations
+    states: list[Any] | None = None
     if callable(motion):
         if t is None:
             raise InputError(
@@ -105,15 +98,18 @@ def _motion(
             )
         times = np.atleast_1d(numbers(t, "t", "Give times t (n,) in s"))
         states = [motion(float(time)) for time in times.ravel()]
-        parts = _arrays(lambda: [times, *zip(*states, strict=True)])
-        if not states:
-            parts += [np.zeros((0, nq)), np.zeros((0, nv)), np.zeros((0, nv))]
     elif t is not None:
         raise InputError(
             "times are part of a motion that is given as arrays", element="t", remedy="Leave it out"
         )
-    else:
-        parts = _arrays(lambda: motion)
+    try:
+        if states:
+            motion = [times, *zip(*states, strict=True)]
+        elif states is not None:
+            motion = [times, np.zeros((0, nq)), np.zeros((0, nv)), np.zeros((0, nv))]
+        parts = [np.array(part, dtype=float) for part in motion]
+    except (TypeError, ValueError):
+        parts = []  # not numeric
     n = len(parts[0]) if parts and parts[0].ndim == 1 else 0
     shapes = [part.shape for part in parts]
     if shapes != [(n,), (n, nq), (n, nv), (n, nv)] or not all(
@@ -189,7 +185,7 @@ def inverse_dynamics(
         basis, _ = tangent_basis(geometry, q[i], np.arange(nv))
         if basis.shape[1] != free:
             raise InputError(
-                f"at t = {time:.6g} s the motion stands on a singular configuration, where the "
+                f"at t = {time:.6g} s the motion is on a singular configuration, where the "
                 "forces of the actuators are not determined",
                 element="motion",
                 remedy="Leave this time out",
@@ -214,10 +210,8 @@ def inverse_dynamics(
             remedy="Name more joints",
         )
 
-    def reactions() -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
-        return _reactions(mechanism, times, q, v, torques, columns)
-
     power = (torques * v[:, columns]).sum(axis=1)
+    reactions = partial(_reactions, mechanism, times, q, v, torques, columns)
     return InverseDynamics(
         times, tuple(labels[j] for j in columns), torques, power, residual, reactions
     )
@@ -261,18 +255,15 @@ def _reactions(
     torques: FloatArray,
     columns: IndexArray,
 ) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
+    """Wrenches and multipliers of every loop at n states, with the forces (n, na)."""
     acting = np.zeros(mechanism.model.nv)
     system = make_system(mechanism, lambda t, q, v: acting)
-    parts = []
-    for i in range(len(times)):
-        acting[columns] = torques[i]
-        own = slice(i, i + 1)
-        parts.append(reactions_at(system, times[own], q[own], v[own]))
+    parts = [reactions_at(system, times[:0], q[:0], v[:0])]
+    for i, own in enumerate(torques):
+        acting[columns] = own
+        parts.append(reactions_at(system, times[i : i + 1], q[i : i + 1], v[i : i + 1]))
     wrenches, multipliers = (
-        {
-            loop.name: np.concatenate([part[k][loop.name] for part in parts])
-            for loop in mechanism.loops
-        }
-        for k in (0, 1)
+        {name: np.concatenate([part[name] for part in of_times]) for name in of_times[0]}
+        for of_times in zip(*parts)
     )
     return wrenches, multipliers

@@ -234,10 +234,8 @@ def linearise(
     """
     mechanism.refuse_drives("a linearisation")
     step = positive(step, "step")
-    if q is None and v is None:
-        q, v = mechanism.q0, mechanism.v0
     if q is None:
-        q = mechanism.q0
+        q, v = mechanism.q0, mechanism.v0 if v is None else v
     q = np.array(q, dtype=float)
     v = np.zeros(mechanism.model.nv) if v is None else np.array(v, dtype=float)
     mechanism = mechanism.with_state(q, v)  # checks them

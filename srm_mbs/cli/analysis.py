@@ -15,8 +15,10 @@ from srm_mbs.cli.output import (
     Html,
     Model,
     check_output,
+    option,
     reported,
     say_written,
+    several,
     table,
 )
 from srm_mbs.errors import InputError
@@ -27,15 +29,11 @@ if TYPE_CHECKING:
 
 Hold = Annotated[
     list[str] | None,
-    typer.Option(
-        "--hold",
-        metavar="JOINT[=VALUE]",
-        help="Keep a joint at VALUE (rad, m), or where it starts. May be given several times.",
-    ),
+    several("--hold", "JOINT[=VALUE]", "Keep a joint at VALUE (rad, m), or where it starts."),
 ]
 
 
-def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]], list[str]]:
+def _values(given: list[str] | None, element: str) -> tuple[dict[str, list[float]], list[str]]:
     """Joints with values (``JOINT=VALUE,...``), and those without."""
     values: dict[str, list[float]] = {}
     names = []
@@ -43,7 +41,7 @@ def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]
         name, equals, numbers = text.partition("=")
         if name in values or name in names:
             raise InputError(
-                f"joint {name!r} is given twice", element=option, remedy="Give each joint once"
+                f"joint {name!r} is given twice", element=element, remedy="Give each joint once"
             )
         if not equals:
             names.append(name)
@@ -52,7 +50,7 @@ def _values(given: list[str] | None, option: str) -> tuple[dict[str, list[float]
             values[name] = [float(number) for number in numbers.split(",")]
         except ValueError:
             raise InputError(
-                f"{text!r} is not a joint with a value", element=option, remedy="Write crank=1.5"
+                f"{text!r} is not a joint with a value", element=element, remedy="Write crank=1.5"
             ) from None
     return values, names
 
@@ -72,14 +70,14 @@ def _write_page(html: Path | None, motion: Callable[[], JointMotion]) -> None:
         say_written(html)
 
 
-@reported()
+@reported
 def modes(
     model: Model,
     hold: Hold = None,
     starts: Annotated[
-        int, typer.Option(metavar="N", help="Number of configurations from which closing starts.")
+        int, option("N", "Number of configurations from which closing starts.")
     ] = 200,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the random ones among them.")] = 0,
+    seed: Annotated[int, option("N", "Seed of the random ones among them.")] = 0,
 ) -> None:
     """List the assembly modes, the ways in which loops close.
 
@@ -103,7 +101,7 @@ def modes(
     table(mode_rows(mechanism, found), ("mode", "found", "", *mechanism.joint_names))
 
 
-@reported()
+@reported
 def equilibrium(
     model: Model,
     hold: Hold = None,
@@ -127,37 +125,29 @@ def equilibrium(
     table(position_rows(mechanism, found.q), ("joint", "position"))
 
 
-@reported()
+@reported
 def linearise(
     model: Model,
     at: Annotated[
         str,
-        typer.Option(
-            metavar="initial|rest|equilibrium|nearest",
-            help="Where: the initial state, the initial configuration at rest, a stable "
+        option(
+            "initial|rest|equilibrium|nearest",
+            "Where: the initial state, the initial configuration at rest, a stable "
             "equilibrium, or the nearest one.",
         ),
     ] = "initial",
     actuated: Annotated[
         list[str] | None,
-        typer.Option(
-            "--input",
-            metavar="JOINT",
-            help="Joint whose force is an input of B. May be given several times.",
-            show_default="all joints",
+        several(
+            "--input", "JOINT", "Joint whose force is an input of B.", show_default="all joints"
         ),
     ] = None,
     coordinate: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="JOINT",
-            help="Joint that is a coordinate. May be given several times.",
-            show_default="chosen",
-        ),
+        several("--coordinate", "JOINT", "Joint that is a coordinate.", show_default="chosen"),
     ] = None,
     mode: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=0, help="Mode that --html shows.", show_default="0"),
+        int | None, option("N", "Mode that --html shows.", min=0, show_default="0")
     ] = None,
     html: Html = None,
 ) -> None:
@@ -171,8 +161,7 @@ def linearise(
             element="--mode",
             remedy="Give --html, or leave it out",
         )
-    if html is not None:
-        check_output(html, "--html", HTML_SUFFIXES)
+    check_output(html, "--html", HTML_SUFFIXES)
     mechanism = srm_mbs.load(model)
     state = _state(mechanism, at)
     found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
@@ -199,7 +188,7 @@ def _state(mechanism: Mechanism, at: str) -> tuple[Any, ...]:
     )
 
 
-@reported()
+@reported
 def drag(
     model: Model,
     values: Annotated[
@@ -209,9 +198,7 @@ def drag(
         ),
     ],
     html: Html = None,
-    duration: Annotated[
-        float, typer.Option(metavar="S", help="Length of the animation (s).")
-    ] = 3.0,
+    duration: Annotated[float, option("S", "Length of the animation (s).")] = 3.0,
 ) -> None:
     """Drag joints through positions, on one branch.
 
@@ -219,8 +206,7 @@ def drag(
     """
     from srm_mbs.cli.tables import path_rows, position_rows
 
-    if html is not None:
-        check_output(html, "--html", HTML_SUFFIXES)
+    check_output(html, "--html", HTML_SUFFIXES)
     mechanism = srm_mbs.load(model)
     targets, bare = _values(values, "JOINT=VALUE")
     if bare:

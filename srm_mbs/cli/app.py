@@ -31,25 +31,12 @@ from srm_mbs.cli.output import (
     Lines,
     Model,
     check_output,
+    option,
     reported,
     say_written,
+    several,
     table,
     write_files,
-)
-from srm_mbs.cli.playback import (
-    At,
-    Gaps,
-    Image,
-    Live,
-    Reactions,
-    Trace,
-    Video,
-    check_overlays,
-    check_pictures,
-    check_time,
-    live_view,
-    overlay_options,
-    play_run,
 )
 from srm_mbs.errors import InputError
 
@@ -100,74 +87,62 @@ def _global_options(
 
 
 @app.command()
-@reported()
+@reported
 def simulate(
     model: Model,
     t_end: Annotated[
         float | None,
-        typer.Option(
-            metavar="S",
-            help="End of the run (s).",
-            show_default=f"the description's, else {T_END:g}",
-        ),
+        option("S", "End of the run (s).", show_default=f"the description's, else {T_END:g}"),
     ] = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help="Integration method.")] = "psrm",
+    method: Annotated[str, option("NAME", "Integration method.")] = "psrm",
     tableau: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Runge-Kutta scheme of the method.",
+        option(
+            "NAME",
+            "Runge-Kutta scheme of the method.",
             show_default="the method's: dop853 with psrm, tvd32 with srm",
         ),
     ] = None,
     rtol: Annotated[
         float | None,
-        typer.Option(
-            metavar="R",
-            help="Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
+        option(
+            "R",
+            "Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
             "1e-4 with srm).",
             show_default="the description's, else 1e-6",
         ),
     ] = None,
     atol: Annotated[
         float | None,
-        typer.Option(
-            metavar="A",
-            help="Absolute tolerance of every coordinate.",
+        option(
+            "A",
+            "Absolute tolerance of every coordinate.",
             show_default="the description's, else rtol times the unit of each coordinate",
         ),
     ] = None,
     step: Annotated[
-        float | None,
-        typer.Option(metavar="H", help="Fixed step (s) instead of step-size control."),
+        float | None, option("H", "Fixed step (s) instead of step-size control.")
     ] = None,
     backend: Annotated[
-        str,
-        typer.Option(metavar="auto|python|kernel", help="Backend that computes the run."),
+        str, option("auto|python|kernel", "Backend that computes the run.")
     ] = "auto",
-    out: Annotated[
-        Path | None, typer.Option(metavar="RUN.npz", help="Save the run, for plot and play.")
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Plot the run as .png, .pdf or .svg."),
-    ] = None,
+    out: Annotated[Path | None, option("RUN.npz", "Save the run, for plot and play.")] = None,
+    plot: Annotated[Path | None, option("FILE", "Plot the run as .png, .pdf or .svg.")] = None,
     csv: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.csv", help="Write the motion at the steps as a table."),
+        Path | None, option("FILE.csv", "Write the motion at the steps as a table.")
     ] = None,
     html: Html = None,
-    image: Image = None,
-    at: At = None,
-    video: Video = None,
-    trace: Trace = None,
-    gaps: Gaps = False,
-    reactions: Reactions = False,
+    image: playback.Image = None,
+    at: playback.At = None,
+    video: playback.Video = None,
+    trace: playback.Trace = None,
+    gaps: playback.Gaps = False,
+    reactions: playback.Reactions = False,
     balance: Annotated[
         bool, typer.Option("--balance", help="Print the energy balance of the run.")
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
-    live: Live = False,
+    live: playback.Live = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -176,25 +151,22 @@ def simulate(
     """
     from srm_mbs.analysis.summary import run_rows
 
-    if out is not None:
-        check_output(out, "--out", (".npz",))
+    check_output(out, "--out", (".npz",))
     if plot is not None:
         from srm_mbs.visualization.plotting.figure import FORMATS
 
         check_output(plot, "--plot", FORMATS)
-    if csv is not None:
-        check_output(csv, "--csv", (".csv",))
-    if html is not None:
-        check_output(html, "--html", HTML_SUFFIXES)
-    check_pictures(image, at, video)
+    check_output(csv, "--csv", (".csv",))
+    check_output(html, "--html", HTML_SUFFIXES)
+    playback.check_pictures(image, at, video)
 
     mechanism = srm_mbs.load(model)
-    overlays = overlay_options(mechanism, trace, gaps, reactions)
-    check_overlays(trace, gaps, reactions, (html, image, video, play, live))
+    overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
+    playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
-    check_time(at, t_end)
-    view = live_view(mechanism) if live else None
+    playback.check_time(at, t_end)
+    view = playback.live_view(mechanism) if live else None
     solution = srm_mbs.simulate(
         mechanism,
         t_end,
@@ -224,7 +196,7 @@ def simulate(
         table(balance_rows(solution.energy_balance))
     typer.echo(solution.message, err=not solution.success)
     if play or view:
-        play_run(solution, overlays, view)
+        playback.play_run(solution, overlays, view)
     if failed:
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
@@ -237,16 +209,13 @@ def _first(*values: float | None) -> float:
 
 
 @app.command()
-@reported()
+@reported
 def convert(
     model: Model,
     out: Annotated[
         Path, typer.Argument(metavar="OUT.toml", help="The description; its URDF goes beside it.")
     ],
-    cut: Annotated[
-        list[str] | None,
-        typer.Option(metavar="JOINT", help="Cut a loop at this joint. May be given several times."),
-    ] = None,
+    cut: Annotated[list[str] | None, several("--cut", "JOINT", "Cut a loop at this joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
 ) -> None:
     """Write a file of any format as a TOML description and a URDF."""
@@ -260,12 +229,13 @@ def convert(
 
 
 @app.command()
-@reported()
+@reported
 def info(model: Model) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
     """
+    from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (
         drive_rows,
         force_rows,
@@ -276,22 +246,18 @@ def info(model: Model) -> None:
 
     mechanism = srm_mbs.load(model)
     table(mechanism_rows(mechanism))
-    typer.echo()
-    table(joint_rows(mechanism), ("joint", "type", "initial position", "initial rate"))
-    if mechanism.loops:
-        typer.echo()
-        table(loop_rows(mechanism), ("loop", "type", "a", "b", "gap at the start"))
-    if mechanism.forces:
-        typer.echo()
-        table(force_rows(mechanism), ("force", "type", "acts on", "values"))
-    if mechanism.drives:
-        typer.echo()
-        table(drive_rows(mechanism), ("drive", "law", "moves", "values"))
-    notes = (*mechanism.notes, *mechanism.structure.notes)
-    from srm_mbs._kernel import missing, remedy
-
+    for header, rows in (
+        (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),
+        (("loop", "type", "a", "b", "gap at the start"), loop_rows(mechanism)),
+        (("force", "type", "acts on", "values"), force_rows(mechanism)),
+        (("drive", "law", "moves", "values"), drive_rows(mechanism)),
+    ):
+        if listed := list(rows):
+            typer.echo()
+            table(listed, header)
+    notes = [*mechanism.notes, *mechanism.structure.notes]
     if missing:
-        notes = (*notes, f"the compiled kernel is not available: {missing}. {remedy}")
+        notes.append(f"the compiled kernel is not available: {missing}. {remedy}")
     if notes:
         typer.echo()
     for note in notes:
@@ -299,7 +265,7 @@ def info(model: Model) -> None:
 
 
 @app.command()
-@reported()
+@reported
 def models() -> None:
     """List the mechanisms that come with the package."""
     from srm_mbs.formats.load import largest_n, models_folder
@@ -318,13 +284,11 @@ def _first_sentence(path: Path) -> str:
     return re.split(r"(?<!\b[A-Z])\.(?:\s|$)", text, maxsplit=1)[0]
 
 
-app.command()(playback.play)
-
-
-app.command()(plot_report.plot)
-
-
-app.command()(plot_report.report)
+for command in (
+    *(playback.play, plot_report.plot, plot_report.report),
+    *(analysis.modes, analysis.equilibrium, analysis.linearise, analysis.drag),
+):
+    app.command()(command)
 
 
 @app.command(
@@ -332,7 +296,7 @@ app.command()(plot_report.report)
     options_metavar="--out DIR [--problems NAME ...] [--peers NAME ...] [--backend python]",
     add_help_option=False,
 )
-@reported()
+@reported
 def benchmark(context: typer.Context) -> None:
     """Compare run time and error with other simulators.
 
@@ -351,19 +315,8 @@ def benchmark(context: typer.Context) -> None:
             remedy="Run it at the top of a checkout of the source",
         )
     # A new process, which reads the number of threads before it loads NumPy.
-    command = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
-    status = subprocess.run(command, check=False).returncode
-    if status:
-        raise typer.Exit(status)
-
-
-for command in (
-    analysis.modes,
-    analysis.equilibrium,
-    analysis.linearise,
-    analysis.drag,
-):
-    app.command()(command)
+    arguments = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
+    raise typer.Exit(subprocess.run(arguments, check=False).returncode)
 
 
 def main() -> None:

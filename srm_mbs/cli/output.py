@@ -20,6 +20,18 @@ from srm_mbs.errors import CHECK_WRITING, InputError, SrmError, SrmWarning
 RUN_FAILED, BAD_INPUT = 1, 2
 """Exit status."""
 Given = ParamSpec("Given")
+
+
+def option(metavar: str, help: str, **more: Any) -> Any:
+    """An option that takes a value; ``more`` are further arguments of ``typer.Option``."""
+    return typer.Option(metavar=metavar, help=help, **more)
+
+
+def several(name: str, metavar: str, help: str, **more: Any) -> Any:
+    """An option that may be given several times, for a parameter of type ``list[str] | None``."""
+    return typer.Option(name, metavar=metavar, help=f"{help} May be given several times.", **more)
+
+
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
 ]
@@ -28,12 +40,10 @@ Model = Annotated[
     typer.Argument(
         metavar="MODEL",
         help="A bundled mechanism (see 'srm-mbs models'), a .toml description, or a file of "
-        "another format, which its content tells (docs/formats.md).",
+        "another format, recognised by its content (docs/formats.md).",
     ),
 ]
-Html = Annotated[
-    Path | None, typer.Option(metavar="FILE.html", help="Write the animation as one page.")
-]
+Html = Annotated[Path | None, option("FILE.html", "Write the animation as one page.")]
 HTML_SUFFIXES = (".html", ".htm")
 
 
@@ -49,32 +59,30 @@ class Lines(logging.Handler):
         say(record.levelname.lower(), record.getMessage())
 
 
-def reported() -> Callable[[Callable[Given, None]], Callable[Given, None]]:
+def reported(command: Callable[Given, None]) -> Callable[Given, None]:
     """Decorator of commands: warnings and expected errors become single lines, errors exit with 2.
 
     Errors name an option as on the command line: ``--t-end``, not ``t_end``.
     """
 
-    def decorate(command: Callable[Given, None]) -> Callable[Given, None]:
-        @wraps(command)
-        def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
-            try:
-                with _warnings_as_lines():
-                    command(*args, **kwargs)
-            except BrokenPipeError:
-                raise  # the reader of a pipe has ended: typer exits silently
-            except SrmError as error:
-                if isinstance(error, InputError) and error.element is not None:
-                    error.element = _as_written(error.element, command)
-                say("error", error)
-                raise typer.Exit(BAD_INPUT) from error
-            except OSError as error:
-                say("error", os_problem(error))
-                raise typer.Exit(BAD_INPUT) from error
+    @wraps(command)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> None:
+        try:
+            with _warnings_as_lines():
+                command(*args, **kwargs)
+        except BrokenPipeError:
+            raise  # the reader of a pipe has ended: typer exits silently
+        except SrmError as error:
+            if isinstance(error, InputError) and error.element is not None:
+                error.element = _as_written(error.element, command)
+            say("error", error)
+            raise typer.Exit(BAD_INPUT) from error
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            say("error", f"{where}{error.strerror or error}")
+            raise typer.Exit(BAD_INPUT) from error
 
-        return run
-
-    return decorate
+    return run
 
 
 @contextmanager
@@ -92,16 +100,12 @@ def _as_written(element: str, command: Callable[..., None]) -> str:
     hint = get_type_hints(command, include_extras=True).get(element)
     for given in getattr(hint, "__metadata__", ()):
         if isinstance(given, OptionInfo):
-            return (given.param_decls or ("--" + element.replace("_", "-"),))[0]
+            # Within Annotated the first argument of typer.Option is its name, if any is given.
+            name = given.default
+            return name if isinstance(name, str) else "--" + element.replace("_", "-")
         if isinstance(given, ArgumentInfo):
             return str(given.metavar)
     return element
-
-
-def os_problem(error: OSError) -> str:
-    """File and reason of ``error``."""
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}"
 
 
 def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
@@ -125,14 +129,16 @@ def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
 # -- output files -----------------------------------------------------------------------------
 
 
-def check_output(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse a file that cannot be written, before a long run.
+def check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+    """Refuse a file that cannot be written, before a long run; None is no file.
 
     Raises
     ------
     InputError
         If its suffix is not one of ``suffixes``, or it cannot be written.
     """
+    if path is None:
+        return
     problem = remedy = ""
     folder = path.parent
     if path.suffix.lower() not in suffixes:

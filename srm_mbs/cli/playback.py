@@ -17,8 +17,10 @@ from srm_mbs.cli.output import (
     BAD_INPUT,
     Run,
     check_output,
+    option,
     reported,
     say_written,
+    several,
     write_files,
 )
 from srm_mbs.errors import InputError
@@ -28,28 +30,16 @@ if TYPE_CHECKING:
     from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.visualization.animation.live import LiveView
 
-Image = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.png", help="Write a picture of the run at the time --at."),
-]
+POINT = "LINK:X,Y,Z"
+"""Form of a point of a link; coordinates in m, in the link's frame."""
+Image = Annotated[Path | None, option("FILE.png", "Write a picture of the run at the time --at.")]
 At = Annotated[
-    float | None,
-    typer.Option(
-        "--at", metavar="S", help="Time of the picture in the run (s).", show_default="the end"
-    ),
+    float | None, option("S", "Time of the picture in the run (s).", show_default="the end")
 ]
-Video = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Write a film of the run as .gif or .mp4."),
-]
+Video = Annotated[Path | None, option("FILE", "Write a film of the run as .gif or .mp4.")]
 Trace = Annotated[
     list[str] | None,
-    typer.Option(
-        "--trace",
-        metavar="LINK:X,Y,Z",
-        help="Draw the path of a point of a link (m, in the link's frame). May be given several "
-        "times.",
-    ),
+    several("--trace", POINT, "Draw the path of a point of a link (m, in the link's frame)."),
 ]
 Gaps = Annotated[bool, typer.Option("--gaps", help="Draw the gaps of the closures, exaggerated.")]
 Live = Annotated[
@@ -71,9 +61,8 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
     """
     from srm_mbs.visualization.animation.video import FILMS, encoder_of
 
-    if image is not None:
-        check_output(image, "--image", (".png",))
-    elif at is not None:
+    check_output(image, "--image", (".png",))
+    if image is None and at is not None:
         raise InputError(
             "it is the time of a picture, and none is asked for",
             element="--at",
@@ -119,11 +108,11 @@ def check_overlays(
     """
     if any(animations):
         return
-    for option, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
+    for name, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
         if given:
             raise InputError(
                 "it is drawn in the animation, and none is asked for",
-                element=option,
+                element=name,
                 remedy="Give --html, --image, --video, --play or --live too",
             )
 
@@ -146,8 +135,8 @@ def overlay_options(
     return {"trace": anchors, "gaps": gaps, "reactions": reactions}
 
 
-def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
-    """The points LINK:X,Y,Z of ``option``.
+def given_points(texts: list[str], element: str) -> list[srm_mbs.Anchor]:
+    """The points LINK:X,Y,Z of the argument ``element``.
 
     Raises
     ------
@@ -166,14 +155,14 @@ def given_points(texts: list[str], option: str) -> list[srm_mbs.Anchor]:
         if not colon:
             raise InputError(
                 f"{text!r} is not a point of a link",
-                element=option,
+                element=element,
                 remedy="Write LINK:X,Y,Z, for example rod:0.5,0,0",
             )
         found.append(srm_mbs.Anchor(link, xyz=(x, y, z)))
     return found
 
 
-@reported()
+@reported
 def play(
     run: Run,
     image: Image = None,

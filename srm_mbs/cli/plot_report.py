@@ -8,61 +8,52 @@ from typing import Annotated, Any
 import typer
 
 import srm_mbs
-from srm_mbs.cli.output import HTML_SUFFIXES, Run, check_output, reported, say_written, table
-from srm_mbs.cli.playback import given_points
+from srm_mbs.cli.output import (
+    HTML_SUFFIXES,
+    Run,
+    check_output,
+    option,
+    reported,
+    say_written,
+    several,
+    table,
+)
+from srm_mbs.cli.playback import POINT, given_points
 from srm_mbs.errors import InputError
 
-OPTIONS = {"joints": "--joint", "loops": "--loop", "rows": "--rows", "points": "--point"}
-"""Options of plots in Python, and on the command line."""
 
-
-@reported()
+@reported
 def plot(
     run: Run,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Write the picture to this .png, .pdf or .svg.",
+        option(
+            "FILE",
+            "Write the picture to this .png, .pdf or .svg.",
             show_default="RUN.png, or RUN_KIND.png for other kinds than run",
         ),
     ] = None,
     kind: Annotated[
         str,
-        typer.Option(
-            metavar="KIND",
-            help="Kind of picture: run (drift, energy, sigma, steps), state (joints over time), "
+        option(
+            "KIND",
+            "Kind of picture: run (drift, energy, sigma, steps), state (joints over time), "
             "balance (energies and works), reactions, sigma (with all kinds of steps), phase (rate "
             "over position), path (of points in space).",
         ),
     ] = "run",
-    joint: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--joint",
-            metavar="NAME",
-            help="Draw this joint, with state and phase. May be given several times.",
-        ),
+    joints: Annotated[
+        list[str] | None, several("--joint", "NAME", "Draw this joint, with state and phase.")
     ] = None,
-    loop: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--loop",
-            metavar="NAME",
-            help="Draw this closure, with reactions. May be given several times.",
-        ),
+    loops: Annotated[
+        list[str] | None, several("--loop", "NAME", "Draw this closure, with reactions.")
     ] = None,
     rows: Annotated[
         bool, typer.Option("--rows", help="Draw the multiplier of each row, with reactions.")
     ] = False,
-    point: Annotated[
+    points: Annotated[
         list[str] | None,
-        typer.Option(
-            "--point",
-            metavar="LINK:X,Y,Z",
-            help="Draw this point of a link (m, in the link's frame), with path. "
-            "May be given several times.",
-        ),
+        several("--point", POINT, "Draw this point of a link (m, in the link's frame), with path."),
     ] = None,
 ) -> None:
     """Draw a picture of a saved run."""
@@ -70,38 +61,27 @@ def plot(
     from srm_mbs.visualization.plotting.figure import FORMATS
 
     wanted: dict[str, Any] = {
-        "joints": joint,
-        "loops": loop,
-        "rows": rows or None,
-        "points": given_points(point, "--point") if point else None,
+        "joints": joints,
+        "loops": loops,
+        "rows": rows,
+        "points": points and given_points(points, "--point"),
     }
-    options = {name: value for name, value in wanted.items() if value is not None}
-    try:
-        check_options(kind, options)
-        solution = srm_mbs.load_solution(run)
-        path = out
-        if path is None:
-            name = run.stem if kind == "run" else f"{run.stem}_{kind}"
-            path = run.with_name(f"{name}.png")
-        check_output(path, "--out", FORMATS)
-        solution.plot(path, kind, **options)
-    except InputError as error:
-        if error.element in ("kind", *OPTIONS):
-            error.element = OPTIONS.get(error.element, "--kind")
-        raise
+    options = {name: value for name, value in wanted.items() if value}
+    check_options(kind, options)
+    solution = srm_mbs.load_solution(run)
+    name = run.stem if kind == "run" else f"{run.stem}_{kind}"
+    path = run.with_name(f"{name}.png") if out is None else out
+    check_output(path, "--out", FORMATS)
+    solution.plot(path, kind, **options)
     say_written(path)
 
 
-@reported()
+@reported
 def report(
     run: Run,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="OUT.html",
-            help="Write the page to this file.",
-            show_default="RUN_report.html",
-        ),
+        option("OUT.html", "Write the page to this file.", show_default="RUN_report.html"),
     ] = None,
     no_animation: Annotated[
         bool,
@@ -109,10 +89,10 @@ def report(
     ] = False,
     rtol: Annotated[
         float | None,
-        typer.Option(
-            metavar="R",
-            help="Relative tolerance of the second run, for the error estimate; runs with fixed "
-            "steps are made again with smaller ones.",
+        option(
+            "R",
+            "Relative tolerance of the second run, for the error estimate; runs with fixed "
+            "steps are repeated with smaller ones.",
             show_default="a hundredth of the run's",
         ),
     ] = None,
@@ -123,7 +103,7 @@ def report(
 ) -> None:
     """Write one page about a saved run.
 
-    It has the mechanism, motion, settings, accuracy and plots.  The run is made again at tighter
+    It has the mechanism, motion, settings, accuracy and plots.  The run is repeated at tighter
     tolerances, to estimate its error.
     """
     from srm_mbs.analysis.report.report import write_report
@@ -138,7 +118,7 @@ def report(
         )
     solution = srm_mbs.load_solution(run)
     if not no_second_run:
-        typer.echo("making the run again, to estimate its error", err=True)
+        typer.echo("repeating the run, to estimate its error", err=True)
     certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)
     write_report(solution, path, animation=not no_animation, certificate=certificate)
     table((found.topic, found.grade, found.text) for found in certificate.findings)

@@ -26,36 +26,26 @@ def mode_rows(mechanism: Mechanism, modes: Sequence[AssemblyMode]) -> Iterator[t
     """(number, starts that led to it, singular, position of each joint) of each assembly mode."""
     for number, mode in enumerate(modes, 1):
         positions = (text for _, text in position_rows(mechanism, mode.q))
-        yield (
-            str(number),
-            f"{mode.found} of {mode.starts}",
-            "singular" if mode.singular else "",
-            *positions,
-        )
+        singular = "singular" if mode.singular else ""
+        yield str(number), f"{mode.found} of {mode.starts}", singular, *positions
 
 
-def equilibrium_rows(mechanism: Mechanism, found: Equilibrium) -> list[tuple[str, str]]:
+def equilibrium_rows(mechanism: Mechanism, found: Equilibrium) -> Iterator[tuple[str, str]]:
     """Stability, frequencies, holding forces and reactions: (quantity, value)."""
     kind = "stable" if found.stable else "neutral" if found.neutral else "unstable"
-    rows = [("equilibrium", kind + (", on a singular configuration" if found.singular else ""))]
-    rows.append(("force left", f"{found.residual:.1e} N m"))
-    for value in np.atleast_1d(found.eigenvalues):
-        if np.iscomplexobj(found.eigenvalues) and value.imag:
-            text = f"eigenvalue {value:.6g} 1/s^2"
+    yield "equilibrium", kind + ", on a singular configuration" * found.singular
+    yield "force left", f"{found.residual:.1e} N m"
+    for value in found.eigenvalues:
+        if value.imag:
+            yield "small motion", f"eigenvalue {value:.6g} 1/s^2"
         elif value.real > 0.0:
-            text = f"swings with {np.sqrt(value.real) / (2.0 * np.pi):.6g} Hz"
+            yield "small motion", f"swings with {np.sqrt(value.real) / (2.0 * np.pi):.6g} Hz"
         else:
-            text = f"leaves with {np.sqrt(-value.real):.6g} 1/s"
-        rows.append(("small motion", text))
-    rows += [
-        (f"to hold {name}", force_text(mechanism, name, force))
-        for name, force in found.holding.items()
-    ]
+            yield "small motion", f"leaves with {np.sqrt(-value.real):.6g} 1/s"
+    for name, force in found.holding.items():
+        yield f"to hold {name}", force_text(mechanism, name, force)
     for name, wrench in found.reactions.items():
-        rows.append(
-            (f"reaction {name}", f"{vector_text(wrench[:3])} N, {vector_text(wrench[3:])} N m")
-        )
-    return rows
+        yield f"reaction {name}", f"{vector_text(wrench[:3])} N, {vector_text(wrench[3:])} N m"
 
 
 def eigenvalue_rows(found: Linearisation) -> Iterator[tuple[str, ...]]:
@@ -84,28 +74,22 @@ def state_names(found: Linearisation) -> list[str]:
     return [*found.coordinates, *(f"rate of {name}" for name in found.coordinates)]
 
 
-def balance_rows(found: EnergyBalance) -> list[tuple[str, str]]:
+def balance_rows(found: EnergyBalance) -> Iterator[tuple[str, str]]:
     """Energies and works at the end of a run, and how well they balance: (quantity, J)."""
-    gains = [
-        ("kinetic energy at the end", found.kinetic[-1]),
-        ("potential energy at the end", found.potential[-1]),
-        ("energy gained", found.kinetic[-1] + found.potential[-1] - found.start),
-    ]
-    gains += [(f"work of {name}", work[-1]) for name, work in found.works.items()]
-    return [
-        *((name, f"{value:.9g} J") for name, value in gains),
-        ("balance", f"open by at most {found.relative:.1e} of {found.scale:.3g} J"),
-    ]
+    kinetic, potential = found.kinetic[-1], found.potential[-1]
+    yield "kinetic energy at the end", f"{kinetic:.9g} J"
+    yield "potential energy at the end", f"{potential:.9g} J"
+    yield "energy gained", f"{kinetic + potential - found.start:.9g} J"
+    for name, work in found.works.items():
+        yield f"work of {name}", f"{work[-1]:.9g} J"
+    yield "balance", f"open by at most {found.relative:.1e} of {found.scale:.3g} J"
 
 
-def path_rows(found: FollowedPath) -> list[tuple[str, str]]:
+def path_rows(found: FollowedPath) -> Iterator[tuple[str, str]]:
     """End of a path, and the singular configurations on it: (quantity, value)."""
-    rows = [
-        ("path", found.message),
-        ("configurations on the way", str(len(found.path))),
-        ("branch kept", "yes" if found.branch_kept else "no"),
-    ]
+    yield "path", found.message
+    yield "configurations on the way", str(len(found.path))
+    yield "branch kept", "yes" if found.branch_kept else "no"
     for point in found.singular:
         at = ", ".join(f"{name} = {value:.6g}" for name, value in point.values.items())
-        rows.append(("singular configuration", f"{at}; loops {', '.join(point.loops)}"))
-    return rows
+        yield "singular configuration", f"{at}; loops {', '.join(point.loops)}"

@@ -11,9 +11,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from io import TextIOWrapper
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from srm_mbs.errors import InputError, __version__
@@ -26,7 +24,7 @@ FORMAT = 1
 
 
 class Journal:
-    """Finished cases of a sweep, read from and appended to a file; a context manager.
+    """Finished cases of a sweep, read from and appended to a file.
 
     Parameters
     ----------
@@ -50,10 +48,18 @@ class Journal:
         self._path = path
         self._keys = _keys(cases)
         self.known: dict[int, Outcome] = {}
-        head = {"format": FORMAT, "version": __version__, "sweep": _parts(task)}
+        # Fingerprints of everything that determines the results.
+        parts = {
+            "mechanism": task.source,
+            "t_end": task.t_end,
+            "measure": task.measure,
+            "options": [task.options, task.simulate_options],
+        }
+        sweep = {name: _checked_fingerprint(value, name) for name, value in parts.items()}
+        head = {"format": FORMAT, "version": __version__, "sweep": sweep}
         try:
             whole = self._read(head) if path.exists() else 0
-            self._file: TextIOWrapper = path.open("r+" if whole else "w", encoding="utf-8")
+            self._file = path.open("r+" if whole else "w", encoding="utf-8")
             # The last line is incomplete if the process was killed.
             self._file.seek(whole)
             self._file.truncate()
@@ -68,7 +74,10 @@ class Journal:
             ) from error
 
     def _read(self, head: Mapping[str, Any]) -> int:
-        """Read the known outcomes; returns the length (bytes) of the complete lines."""
+        """Read the known outcomes; returns the length (bytes) of the complete lines.
+
+        Refuses the file of another sweep or format.
+        """
         data = self._path.read_bytes()
         whole = data.rfind(b"\n") + 1
         lines = data[:whole].splitlines()
@@ -76,23 +85,18 @@ class Journal:
             if data and not json.dumps(head).encode().startswith(data):
                 raise self._fault("it is not a file of a sweep")
             return 0
-        entries = []
+        index = {key: k for k, key in enumerate(self._keys)}
         for number, line in enumerate(lines, 1):
             try:
-                entries.append(json.loads(line))
-                if number > 1:
-                    entries[-1] = entries[-1]["case"], Outcome(**entries[-1]["outcome"])
+                entry = json.loads(line)
+                if number == 1:
+                    found = entry
+                    continue
+                key, outcome = entry["case"], Outcome(**entry["outcome"])
+                if key in index:
+                    self.known.setdefault(index[key], outcome)
             except (ValueError, KeyError, TypeError) as error:
-                raise self._fault(f"line {number} is damaged: {error}") from error
-        self._check(entries[0], head)
-        index = {key: k for k, key in enumerate(self._keys)}
-        for key, outcome in entries[1:]:
-            if key in index:
-                self.known.setdefault(index[key], outcome)
-        return whole
-
-    def _check(self, found: Any, head: Mapping[str, Any]) -> None:
-        """Refuse the file of another sweep or format."""
+                raise self._fault(f"line {number} is damaged") from error
         if not isinstance(found, dict) or found.get("format") != FORMAT:
             raise self._fault("it is not a file of a sweep, or is of another format")
         own, other = head["sweep"], found.get("sweep", {})
@@ -100,7 +104,8 @@ class Journal:
         if found.get("version") != head["version"]:
             different.append(f"version of srm_mbs ({found.get('version')})")
         if different:
-            raise self._fault(f"it belongs to a sweep with another {', '.join(different)}")
+            raise self._fault(f"it belongs to a sweep that differs in {', '.join(different)}")
+        return whole
 
     def _fault(self, problem: str) -> InputError:
         return InputError(
@@ -121,28 +126,9 @@ class Journal:
         self._file.write(json.dumps(entry) + "\n")
         self._file.flush()
 
-    def __enter__(self) -> Journal:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._file.close()
-
-
-def _parts(task: Task) -> dict[str, str]:
-    """Fingerprints of everything that determines the results."""
-    options = [task.options, task.simulate_options]
-    parts = {
-        "mechanism": task.source,
-        "t_end": task.t_end,
-        "measure": task.measure,
-        "options": options,
-    }
-    return {name: _checked_fingerprint(value, name) for name, value in parts.items()}
 
 
 def _checked_fingerprint(value: Any, what: str) -> str:

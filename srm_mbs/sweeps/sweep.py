@@ -111,10 +111,10 @@ def sweep(
             element="mechanism",
             remedy="Give srm.load(...), or a function of the parameters of a case",
         )
-    for value, what in ((measure, "measure"), (options, "options")):
-        if not (callable(value) or (value is None and what == "options")):
+    for name, function in {"measure": measure, "options": options}.items():
+        if not callable(function) and (name == "measure" or function is not None):
             raise InputError(
-                f"{what} = {value!r} cannot be called", element=what, remedy="Give a function"
+                f"{name} = {function!r} cannot be called", element=name, remedy="Give a function"
             )
     if not isinstance(chunk, int) or chunk < 1:
         raise InputError(
@@ -143,7 +143,7 @@ def sweep(
         journal = None
         outcomes: dict[int, Outcome] = {}
         if resume is not None:
-            journal = stack.enter_context(Journal(Path(resume), task, given))
+            journal = stack.enter_context(closing(Journal(Path(resume), task, given)))
             outcomes |= journal.known
         resumed = len(outcomes)
         log.info("sweep of %d cases, %d of them known", len(given), resumed)

@@ -6,7 +6,6 @@ from itertools import product
 
 import numpy as np
 import pinocchio as pin
-import pytest
 from scipy.optimize import brentq
 
 import srm_mbs as srm
@@ -146,7 +145,6 @@ def test_a_3_rrr_platform_has_the_modes_that_a_scan_of_its_angle_finds() -> None
 
 
 def test_a_crank_that_cannot_be_there_has_no_modes_and_a_singular_one_is_marked() -> None:
-    mechanism = srm.load("four_bar")
     model = planar({"a": ((0.0, 0.0), [1.0, 1.0]), "b": ((3.0, 0.0), [1.0])})
     loop = srm.LoopClosure(
         "point",
@@ -158,15 +156,6 @@ def test_a_crank_that_cannot_be_there_has_no_modes_and_a_singular_one_is_marked(
     assert srm.assembly_modes(short, {"a_0": 2.0}, starts=10) == []
     (straight,) = srm.assembly_modes(short, {"a_0": 0.0, "a_1": 0.0}, starts=10)
     np.testing.assert_allclose(np.cos(straight.q[2]), -1.0)
-    with pytest.raises(srm.InputError, match=r"can still move \(1 degrees of freedom\)"):
-        srm.assembly_modes(mechanism, hold=[], starts=20)
-    with pytest.raises(srm.InputError, match="without loops"):
-        srm.assembly_modes(srm.load("pendulum_chain"))
-    for starts in (np.nan, "many", 2.5):
-        with pytest.raises(srm.InputError, match="is not a positive whole number"):
-            srm.assembly_modes(mechanism, {"crank": 1.0}, starts=starts)
-    with pytest.raises(srm.InputError, match="starts = 0"):
-        srm.assembly_modes(mechanism, starts=0)
     fold = srm.assembly_modes(srm.load("slider_crank"), {"crank": 0.5 * np.pi}, starts=20)
     assert [mode.singular for mode in fold] == [True]
 

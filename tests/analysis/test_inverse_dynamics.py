@@ -48,6 +48,7 @@ def terms(mechanism: srm.Mechanism, q: np.ndarray, v: np.ndarray):
         ("spatial_four_bar", ["crank"]),
         ("slider_crank", ["crank"]),
         ("pendulum_chain", ["link_0", "link_1", "link_2"]),
+        ("differential", ["left_shaft", "pinion"]),
     ],
 )
 def test_the_torques_of_a_controller_are_recovered(name: str, names: list[str]) -> None:
@@ -55,8 +56,13 @@ def test_the_torques_of_a_controller_are_recovered(name: str, names: list[str]) 
     found = srm.inverse_dynamics(mechanism, run, names)
     assert found.actuated == tuple(names)
     np.testing.assert_allclose(found.torques, given, atol=1e-8)
-    for loop, wrench in run.reactions.items():
-        np.testing.assert_allclose(found.reactions[loop], wrench, atol=1e-6, rtol=1e-8)
+    for of_run, own in (
+        (run.reactions, found.reactions),
+        (run.reaction_multipliers, found.reaction_multipliers),
+    ):
+        assert own.keys() == of_run.keys()
+        for loop, values in of_run.items():
+            np.testing.assert_allclose(own[loop], values, atol=1e-6, rtol=1e-8)
 
 
 def test_the_power_of_the_torques_is_what_the_energy_gains() -> None:
@@ -101,13 +107,10 @@ def test_overactuated_torques_are_those_of_least_norm() -> None:
     assert np.linalg.norm(found.torques) < np.linalg.norm(single.torques)
 
 
-def test_too_few_actuators_are_refused_unless_the_motion_needs_no_more() -> None:
+def test_fewer_actuators_than_degrees_of_freedom_do_where_the_motion_needs_no_more() -> None:
     mechanism, run, given = driven("five_bar", ["crank_left"])
     found = srm.inverse_dynamics(mechanism, run, "crank_left")
     np.testing.assert_allclose(found.torques, given, atol=1e-8)
-    _, both, _ = driven("five_bar", ["crank_left", "crank_right"])
-    with pytest.raises(srm.InputError, match="crank_left cannot drive this motion of 2 degrees"):
-        srm.inverse_dynamics(mechanism, both, "crank_left")
 
 
 def test_a_free_motion_of_ball_joints_needs_nothing() -> None:
@@ -140,36 +143,6 @@ def test_a_prescribed_crank_turns_uniformly() -> None:
 def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:
     mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
     for motion in (run, lambda t: (run.q[0], run.v[0], run.accelerations[0])):
-        assert srm.inverse_dynamics(mechanism, motion, "crank", t=[]).torques.shape == (0, 1)
-
-
-def test_motions_that_cannot_be_are_refused() -> None:
-    mechanism, run, _ = driven("four_bar", ["crank"], 0.2)
-    t, q, v, a = run.t, run.q, run.v, run.accelerations
-    for parts, what in (
-        ((t, q + 0.1, v, a), "positions"),
-        ((t, q, v + 0.1, a), "rates"),
-        ((t, q, v, a + 0.1), "accelerations"),
-    ):
-        with pytest.raises(srm.InputError, match=f"the {what} of the motion violate"):
-            srm.inverse_dynamics(mechanism, parts, "crank")
-    with pytest.raises(srm.InputError, match="a motion of shapes"):
-        srm.inverse_dynamics(mechanism, (t, q, v), "crank")
-    with pytest.raises(srm.InputError, match="needs times"):
-        srm.inverse_dynamics(mechanism, lambda t: (q[0], v[0], a[0]), "crank")
-    for told in (None, (q[0], v[0]), (q[0], v, a[0]), ("a", v[0], a[0])):
-        with pytest.raises(srm.InputError, match="a motion of shapes"):
-            srm.inverse_dynamics(mechanism, lambda t, told=told: told, "crank", t=[0.0, 0.1])
-    with pytest.raises(srm.InputError, match="t = 'soon' does not consist of finite numbers"):
-        srm.inverse_dynamics(mechanism, lambda t: (q[0], v[0], a[0]), "crank", t="soon")
-    with pytest.raises(srm.InputError, match="weights = 'light' does not consist"):
-        srm.inverse_dynamics(mechanism, run, "crank", weights="light")
-    with pytest.raises(srm.InputError, match="weights of shape"):
-        srm.inverse_dynamics(mechanism, run, "crank", weights=[1.0, 2.0])
-    with pytest.raises(srm.InputError, match="there is no joint 'wheel'"):
-        srm.inverse_dynamics(mechanism, run, "wheel")
-    singular = load("slider_crank")
-    fold = srm.assemble(singular, {"crank": 0.5 * np.pi}).q
-    rest = np.zeros((1, 2))
-    with pytest.raises(srm.InputError, match="stands on a singular configuration"):
-        srm.inverse_dynamics(singular, (np.zeros(1), fold[None], rest, rest), "crank")
+        found = srm.inverse_dynamics(mechanism, motion, "crank", t=[])
+        assert found.torques.shape == (0, 1)
+        assert found.reactions["pin"].shape == (0, 6)

@@ -7,7 +7,6 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
-from tests.support.mechanisms import floating_ring
 
 
 def gaps(path: srm.FollowedPath) -> float:
@@ -45,7 +44,6 @@ def test_a_rocker_stops_where_crank_and_coupler_are_in_line(to: float) -> None:
     assert len(path.q) == 0
     reach = 3.0 if to < 0.0 else 1.0
     angle = np.pi - np.arccos((1.5**2 + 2.2**2 - reach**2) / (2.0 * 1.5 * 2.2))
-    assert path.limit is not None
     np.testing.assert_allclose(path.limit.values["rocker"], angle, atol=1e-12)
     np.testing.assert_allclose(np.abs(np.sin(path.limit.q[1])), 0.0, atol=1e-7)
     assert path.branch_kept
@@ -78,7 +76,6 @@ def test_two_cranks_are_dragged_together_and_stop_together() -> None:
     assert path.complete
     np.testing.assert_allclose(path.q[0][[0, 2]], list(both.values()), atol=1e-14)
     stopped = srm.follow(mechanism, {"crank_left": 5.0, "crank_right": start[1]})
-    assert stopped.limit is not None
     assert stopped.limit.values["crank_right"] == pytest.approx(start[1], abs=1e-12)
     # the two couplers are in line there: their directions, sums of the angles of each side
     left, right = stopped.limit.q[:2].sum(), stopped.limit.q[2:].sum()
@@ -98,26 +95,3 @@ def test_a_path_can_be_played() -> None:
     motion = path.motion(2.0)
     np.testing.assert_array_equal(motion(0.0)[0], path.path[0])
     np.testing.assert_allclose(motion(2.0)[0], path.q[-1])
-    with pytest.raises(srm.InputError, match="duration = 0"):
-        path.motion(0)
-
-
-def test_what_cannot_be_dragged_is_refused() -> None:
-    mechanism = srm.load("four_bar")
-    for values, what in (
-        ({"wheel": 1.0}, "no joint 'wheel'"),
-        ({"crank": np.nan}, "cannot be dragged along"),
-        ({"crank": "up"}, "cannot be dragged along"),
-        ({"crank": [1.0, 2.0], "rocker": [1.0]}, r"have \[2, 1\] values"),
-        ({}, r"have \[\] values"),
-        ({"crank": 1.0, "rocker": 1.4}, "independently"),
-    ):
-        with pytest.raises(srm.InputError, match=what):
-            srm.follow(mechanism, values)
-    with pytest.raises(srm.InputError, match="without loops"):
-        srm.follow(srm.load("pendulum_chain"), {"link_0": 1.0})
-    with pytest.raises(srm.InputError, match="starts on a singular"):
-        srm.follow(srm.load("slider_crank"), {"crank": 1.0}, [0.5 * np.pi, -np.pi])
-    ring = floating_ring()
-    with pytest.raises(srm.InputError, match="cannot be dragged along"):
-        srm.follow(ring, {"b": 1.0})

@@ -13,7 +13,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 import srm_mbs as srm
 from benchmarks.work_precision import (
@@ -32,24 +31,23 @@ from benchmarks.work_precision.harness import attempt, errors_of, measure_proble
 from benchmarks.work_precision.peers import PEERS
 from benchmarks.work_precision.peers.base import Outcome, OverBudgetError, Peer, Setting
 from benchmarks.work_precision.problems import PROBLEMS, andrews
+from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.records import Measurement, Results
 from benchmarks.work_precision.references import by_extrapolation, by_gauss, by_scipy
 from benchmarks.work_precision.reliability import measure_reliability, summary
 from benchmarks.work_precision.scaling import measure_scaling
 from benchmarks.work_precision.skip import ITEMS, measure_unneeded
 from benchmarks.work_precision.trees import Equations
-from srm_mbs.cli.app import app
 from srm_mbs.dynamics.multibody import make_system
 from tests.support.bundled import problem as shared
-
-ROOT = Path(__file__).parents[2]
+from tests.support.commands import ROOT, run, run_apart
 
 
 def quiet(text: str) -> None:
     pass
 
 
-class Absent(type(PEERS["mujoco"])):  # type: ignore[misc]
+class Absent(type(PEERS["mujoco"])):
     """A peer whose package nobody has."""
 
     name = "absent"
@@ -95,11 +93,8 @@ def test_a_measurement_has_error_drift_energy_evaluations_and_times_of_every_rep
             assert len(row[clock]["all"]) == 2
             assert row[clock]["least"] == min(row[clock]["all"])
             assert row[clock]["least"] <= row[clock]["median"] <= max(row[clock]["all"])
-    assert {row["peer"] for row in data["preparations"]} == {
-        "ours",
-        "reduced",
-        "pinocchio_dop853",
-    }
+    peers = {row["peer"] for row in data["preparations"]}
+    assert peers == {"ours", "reduced", "pinocchio_dop853"}
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_a_message(results: Results) -> None:
@@ -128,25 +123,14 @@ def test_plots_and_tables_are_made_from_the_file_alone(results: Results, tmp_pat
     pixels = np.array(Image.open(picture).convert("L"))
     assert pixels.std() > 5.0
     text = (tmp_path / "tables.md").read_text()
-    for words in (
-        "Ours beside the best peer",
-        "slider_crank_regular",
-        "hand-reduced ODE",
-        "absent",
-    ):
+    for words in ("Ours beside the best peer", *results.problems, "hand-reduced ODE", "absent"):
         assert words in text
 
 
 def test_a_setting_counts_only_if_every_tighter_one_reaches_the_level() -> None:
-    lucky = [
-        Point(1e-3, 1e-7, 1.0),
-        Point(1e-4, 1e-2, 2.0),
-        Point(1e-5, 1e-7, 3.0),
-        Point(1e-6, 1e-8, 4.0),
-    ]
-    found = cheapest(lucky, 1e-6)
-    assert found is not None
-    assert found.tightness == 1e-5
+    errors = {1e-3: 1e-7, 1e-4: 1e-2, 1e-5: 1e-7, 1e-6: 1e-8}
+    lucky = [Point(*pair, float(cost)) for cost, pair in enumerate(errors.items(), start=1)]
+    assert cheapest(lucky, 1e-6) is lucky[2]
     failed = [*lucky[:3], Point(1e-6, None, 0.0)]
     assert cheapest(failed, 1e-6) is None
     assert cheapest(lucky, 1e-8) is lucky[3]
@@ -212,6 +196,20 @@ def test_the_equations_of_the_peers_are_ours(name: str) -> None:
     assert np.abs(acceleration - theirs).max() < 1e-9 * scale
 
 
+def installed(name: str) -> Peer:
+    """The peer; skips the test where its package is missing."""
+    if PEERS[name].missing():
+        pytest.skip(f"{PEERS[name].missing()} is not installed")
+    return PEERS[name]
+
+
+def simulated(problem: Problem, peer: Peer, setting: Setting) -> np.ndarray:
+    """The observed coordinates of a run of the peer at the samples of the problem."""
+    outcome = attempt(problem, peer.prepare(problem), setting)
+    assert not isinstance(outcome, str), outcome
+    return problem.observe(*outcome[0].states())
+
+
 @pytest.mark.parametrize(
     ("peer", "error"),
     [
@@ -225,9 +223,7 @@ def test_the_equations_of_the_peers_are_ours(name: str) -> None:
     ],
 )
 def test_every_peer_simulates_the_spatial_robot(peer: str, error: float) -> None:
-    chosen = PEERS[peer]
-    if chosen.missing():
-        pytest.skip(f"{chosen.missing()} is not installed")
+    chosen = installed(peer)
     whole = shared("walking_robot")
     problem = replace(
         whole,
@@ -239,26 +235,19 @@ def test_every_peer_simulates_the_spatial_robot(peer: str, error: float) -> None
         setting = replace(setting, value=1e-6)
     else:
         setting = Setting("step", 1e-3, setting.variant, setting.gain, 1)
-    outcome = attempt(problem, chosen.prepare(problem), setting)
-    assert not isinstance(outcome, str), outcome
-    q, v = outcome[0].states()
-    difference = np.abs(problem.observe(q, v)[-1] - problem.reference.observed[0])
-    assert difference.max() < error
+    observed = simulated(problem, chosen, setting)
+    assert np.abs(observed[-1] - problem.reference.observed[0]).max() < error
 
 
 @pytest.mark.parametrize("name", ["slider_crank_regular", "n_four_bar_2", "squeezing_mechanism"])
 @pytest.mark.parametrize("peer", ["exudyn", "mujoco", "pinocchio_rk4_baumgarte"])
 def test_peers_with_fixed_steps_simulate_planar_loops(peer: str, name: str) -> None:
-    chosen = PEERS[peer]
-    if chosen.missing():
-        pytest.skip(f"{chosen.missing()} is not installed")
+    chosen = installed(peer)
     whole = shared(name)
     problem = replace(whole, t_end=whole.t_end / 10.0)  # every tenth sample is one of the whole
     setting = next(each for each in chosen.settings(problem) if each.substeps == 20)
-    outcome = attempt(problem, chosen.prepare(problem), setting)
-    assert not isinstance(outcome, str), outcome
-    q, v = outcome[0].states()
-    difference = np.abs(problem.observe(q, v)[9::10] - problem.reference.observed[:10])
+    observed = simulated(problem, chosen, setting)
+    difference = np.abs(observed[9::10] - problem.reference.observed[:10])
     difference[:, problem.rates :] /= problem.rate_unit
     assert difference.max() < 1e-3
 
@@ -301,12 +290,12 @@ def test_a_repeat_that_takes_too_long_ends_the_sweep_and_not_the_benchmark() -> 
     def runner(setting: Setting) -> Callable[[], Outcome]:
         whole = peer.prepare(problem)(setting)
 
-        def run() -> Outcome:
+        def run_once() -> Outcome:
             if next(calls):
                 raise OverBudgetError("stopped after 0.6 s")
             return whole()
 
-        return run
+        return run_once
 
     done = list(sweep(problem, peer, runner, settings, 5, 1.0, quiet))
     assert [measurement.status for measurement, _ in done] == ["over budget"]
@@ -315,29 +304,18 @@ def test_a_repeat_that_takes_too_long_ends_the_sweep_and_not_the_benchmark() -> 
 
 def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["benchmark", "--out", "x"])
-    assert result.exit_code == 2
-    assert "checkout" in result.output
-    result = CliRunner().invoke(app, ["benchmark", "--help"])
-    assert result.exit_code == 0
-    assert "--peers" in result.output
+    assert "checkout" in run("benchmark", "--out", "x", status=2)
+    assert "--peers" in run("benchmark", "--help")
 
 
 def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]
     chosen += ["--backend", srm.backend()]
-    run = subprocess.run(
-        [sys.executable, "-m", "srm_mbs.cli", "benchmark", *arguments, *chosen],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240,
-    )
-    assert run.returncode == 0, run.stderr
-    assert "[1/1]" in run.stdout
-    assert "written:" in run.stdout
+    done = run_apart("benchmark", *arguments, *chosen)
+    assert done.returncode == 0, done.stderr
+    assert "[1/1]" in done.stdout
+    assert "written:" in done.stdout
     results = records.load(tmp_path / "results.json")
     assert {row.peer for row in results.measurements} == {"ours", "pinocchio_dop853"}
     assert (tmp_path / "work_precision_pendulum_chain.png").is_file()
@@ -401,21 +379,14 @@ def test_energy_is_compared_with_the_start() -> None:
 
 def test_the_reference_of_the_squeezing_mechanism_ends_as_published() -> None:
     # DAE test set of CWI and Bari: beta, theta, gamma, phi, delta, omega, epsilon at 0.03 s (rad)
-    published = np.array(
-        [
-            15.81077119629904,
-            -15.75637105984298,
-            0.04082224013073101,
-            -0.5347301163226948,
-            0.5244099658805304,
-            0.5347301163226948,
-            1.048080741042263,
-        ]
-    )
+    published = [
+        *(15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948),
+        *(0.5244099658805304, 0.5347301163226948, 1.048080741042263),
+    ]
     problem = shared("squeezing_mechanism")
     assert problem.reference.accuracy < 1e-11
     ours = problem.reference.observed[-1][:7]
-    assert np.abs(ours - published[andrews.TREE_ORDER]).max() < 2e-9
+    assert np.abs(ours - np.array(published)[andrews.TREE_ORDER]).max() < 2e-9
 
 
 def test_the_benchmark_page_and_the_readme_get_the_figure_and_a_table_between_their_marks(
@@ -524,9 +495,8 @@ def test_cells_of_sizes_that_only_the_kernel_is_measured_at_are_empty(
     last = tables.text(loaded).rstrip().splitlines()[-1]
     assert last.startswith("| 2 | 5 |")
     assert last.count(" - ") == len(empty)
-    assert [picture.name for picture in plots.draw(loaded, tmp_path)] == [
-        "scaling_closed_loops.png"
-    ]
+    (picture,) = plots.draw(loaded, tmp_path)
+    assert picture.name == "scaling_closed_loops.png"
 
 
 def test_reliability_counts_right_branches_and_names_peers_that_are_missing(

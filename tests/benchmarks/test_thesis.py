@@ -152,7 +152,7 @@ def test_the_control_of_appendix_b_forces_steps_at_its_threshold() -> None:
     control = PublishedControl(t_end=1.0, first_step=0.1, order=3, smallest=0.02)
 
     def judged(xi: float) -> tuple[StepDecision, float]:
-        proposal = control.propose(0.0, math.inf, None)  # type: ignore[arg-type]
+        proposal = control.propose(0.0, math.inf, None)
         result = StepResult.__new__(StepResult)
         result.error_ratio = xi
         return control.decide(proposal, result), proposal.h

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from tests.cli.test_cli import error_line, row, run
+from tests.support.commands import row, run
 
 pytestmark = pytest.mark.filterwarnings("ignore:zmq.eventloop:DeprecationWarning")
 
@@ -79,23 +79,3 @@ def test_simulate_prints_the_balance_when_asked() -> None:
     assert row(output, "work of force motor").endswith(" J")
     assert "open by at most" in row(output, "balance")
     assert "balance" not in run("simulate", "four_bar", "--t-end", 0.1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("modes", "four_bar", "--hold", "crank=x"), "'crank=x' is not a joint with a value"),
-        (("modes", "four_bar", "--hold", "crank=1,2"), "a held joint takes one value"),
-        (("modes", "four_bar", "--seed", -1), "--seed: seed = -1 is not a natural number"),
-        (("modes", "four_bar", "--hold", "crank=1", "--hold", "crank"), "'crank' is given twice"),
-        (("drag", "four_bar", "crank=1", "crank=2"), "joint 'crank' is given twice"),
-        (("equilibrium", "four_bar", "--hold", "wheel"), "there is no joint 'wheel'"),
-        (("linearise", "four_bar", "--at", "here"), "there is no state 'here'"),
-        (("linearise", "four_bar", "--html", "x.txt"), "the suffix '.txt' is not known here"),
-        (("linearise", "four_bar", "--mode", "1"), "--mode: there is no page that could show it"),
-        (("drag", "four_bar", "crank"), "joint 'crank' has no value"),
-        (("drag", "four_bar", "crank=nan"), "JOINT=VALUE[,VALUE...]: joint 'crank' cannot be"),
-    ],
-)
-def test_bad_input_is_one_line_with_status_2(arguments, message: str) -> None:
-    assert message in error_line(run(*arguments, status=2))

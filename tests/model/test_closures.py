@@ -32,7 +32,8 @@ from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.model.anchors import WORLD, Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure, perpendicular_basis
 from tests.support.backends import needs_kernel
-from tests.support.mechanisms import evaluate_rows, random_state
+from tests.support.dynamics import evaluate_rows
+from tests.support.mechanisms import random_state
 from tests.support.snapshots import check_refusals
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)

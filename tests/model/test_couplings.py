@@ -20,7 +20,8 @@ from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.support.backends import needs_kernel, on_both
-from tests.support.mechanisms import evaluate_rows, random_state
+from tests.support.dynamics import evaluate_rows
+from tests.support.mechanisms import random_state
 from tests.support.snapshots import check_messages, refused
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)

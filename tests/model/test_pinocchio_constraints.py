@@ -11,7 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
-from tests.support.mechanisms import evaluate_rows
+from tests.support.dynamics import evaluate_rows
 from tests.support.snapshots import check_refusals
 
 

@@ -6,6 +6,7 @@ Tests that change how a mechanism is loaded call ``srm.load`` instead.
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pinocchio as pin
@@ -33,6 +34,25 @@ def finished(mechanism: srm.Mechanism, t_end: float, **options: Any) -> srm.Solu
     solution = srm.simulate(mechanism, t_end, **options)
     assert solution.success, solution.message
     return solution
+
+
+def rewritten(
+    folder: Path, name: str, *changes: tuple[str, str], urdf: tuple[tuple[str, str], ...] = ()
+) -> Path:
+    """Path of a bundled description in ``folder``, with its URDF, both with texts replaced."""
+    source = load(name).source
+    assert source is not None
+    texts = {}
+    for suffix, text, pairs in (
+        ("urdf", source.urdf, urdf),
+        ("toml", source.description, ((f"../urdf/{name}", name), *changes)),
+    ):
+        for old, new in pairs:
+            assert old in text, f"{old!r} is not in the text to be changed"
+            text = text.replace(old, new)
+        texts[suffix] = folder / f"{name}.{suffix}"
+        texts[suffix].write_text(text, encoding="utf-8")
+    return texts["toml"]
 
 
 @cache

@@ -19,13 +19,13 @@ from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
 from srm_mbs.integration.kernel.marshalling import control_struct
-from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
+from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
-from tests.support.mechanisms import mass_matrix
+from tests.support.dynamics import mass_matrix
 
 
 def control_state(control: Any) -> Any:
@@ -166,9 +166,9 @@ def compare(
             out.enlarge(rates=np.max(np.abs(change) / (np.abs(memory.rate) + one)))
         limit = min(max_step, system.step_limit(x))
         # Before the reference proposes: its proposal writes the slope into the memory.
-        stop, compiled_decision = run.attempt_from(t, x, memory, control_state(control))
+        reason, compiled_decision = run.attempt_from(t, x, memory, control_state(control))
         proposal = control.propose(t, limit, memory)
-        assert proposal.singular_arrival == (stop == ARRIVAL)
+        assert proposal.singular_arrival == (reason is ReturnReason.ARRIVAL)
         if proposal.singular_arrival:
             memory = passing.singular_arrival(t, x, memory)
             out.arrivals += 1

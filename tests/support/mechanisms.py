@@ -10,7 +10,8 @@ import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.system import Terms
 from srm_mbs.formats.load import models_folder
 
 CLOSED_MODELS = tuple(
@@ -59,25 +60,14 @@ def random_state(
     return q, rng.uniform(-1.0, 1.0, model.nv)
 
 
-def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
-    """M (nv, nv) at q (nq,)."""
-    upper = np.triu(pin.crba(model, model.createData(), q))
-    return upper + np.triu(upper, 1).T  # type: ignore[no-any-return]
-
-
-def evaluate_rows(
-    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """g (m,), G (m, nv) and Gdot v (m,) at (q, v)."""
-    data = model.createData()
-    pin.crba(model, data, q, pin.Convention.WORLD)
-    pin.nonLinearEffects(model, data, q, v)
-    rows.update(data, q)
-    return rows.g.copy(), rows.G.copy(), rows.bias.copy()
-
-
 def along_x(distance: float) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array([distance, 0.0, 0.0]))
+
+
+def start_terms(mechanism: srm.Mechanism) -> Terms:
+    """The terms of the reference at the start."""
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    return make_system(mechanism).evaluate(0.0, state)
 
 
 def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
@@ -102,6 +92,18 @@ def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     mechanism = srm.Mechanism(model, (loop,), q0=q)
     state = srm.assemble(mechanism, v=1.5 * rng.standard_normal(model.nv))
     return mechanism.with_state(state.q, state.v)
+
+
+def with_slider_mass(mass: float) -> srm.Mechanism:
+    """The bundled slider_crank_slider with another mass (kg) of the slider."""
+    base = srm.load("slider_crank_slider")
+    model = base.model.copy()
+    slider = model.getJointId("slider")
+    inertia = model.inertias[slider]
+    model.inertias[slider] = pin.Inertia(
+        mass, inertia.lever, inertia.inertia * (mass / inertia.mass)
+    )
+    return srm.Mechanism(model, base.loops, q0=base.q0, v0=base.v0)
 
 
 def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mechanism:

@@ -25,6 +25,7 @@ import pytest
 import srm_mbs as srm
 from benchmarks import sweep_throughput as throughput
 from srm_mbs.sweeps.fingerprint import fingerprint
+from tests.support.snapshots import check_messages, refused
 from tests.support.sweeping import deadly, dying_once, lowest, pendulum, period, states
 
 COUNT = 5
@@ -290,31 +291,25 @@ class Unchanging:
 
 
 def test_the_file_of_another_sweep_is_refused(tmp_path: Path, four_bar: srm.Mechanism) -> None:
-    file = tmp_path / "sweep.jsonl"
-    again = partial(srm.sweep, resume=file)
-    cases = [{}]
-    again(four_bar, cases, 0.1)
+    file, cases = tmp_path / "sweep.jsonl", [{}]
+    again = partial(srm.sweep, four_bar, cases, 0.1, resume=file)
+    again()
     kept = file.read_bytes()
     springy = replace(four_bar, forces=(srm.TorsionSpring("crank", stiffness=1.0),))
-    for other, match in (
-        (lambda: again(springy, cases, 0.1), "another mechanism"),
-        (lambda: again(four_bar, cases, 0.2), "another t_end"),
-        (lambda: again(four_bar, cases, 0.1, rtol=1e-8), "another options"),
-        (lambda: again(four_bar, cases, 0.1, measure=states), "another measure"),
-    ):
-        with pytest.raises(srm.InputError, match=match):
-            other()
-    assert again(srm.load("four_bar"), cases, 0.1).resumed == 1
+    messages = {
+        "mechanism": refused(lambda: srm.sweep(springy, cases, 0.1, resume=file), tmp_path),
+        "t_end": refused(lambda: srm.sweep(four_bar, cases, 0.2, resume=file), tmp_path),
+        "options": refused(partial(again, rtol=1e-8), tmp_path),
+        "measure": refused(partial(again, measure=states), tmp_path),
+        "folder": refused(partial(again, resume=tmp_path / "no" / "sweep.jsonl"), tmp_path),
+    }
+    assert srm.sweep(srm.load("four_bar"), cases, 0.1, resume=file).resumed == 1
     assert file.read_bytes() == kept
-    file.write_bytes(kept + b"[]\n")
-    with pytest.raises(srm.InputError, match="line 3 is damaged"):
-        again(four_bar, cases, 0.1)
-    file.write_bytes(b"my notes")
-    with pytest.raises(srm.InputError, match="not a file of a sweep"):
-        again(four_bar, cases, 0.1)
-    assert file.read_bytes() == b"my notes"
-    with pytest.raises(srm.InputError, match="cannot be used"):
-        srm.sweep(four_bar, cases, 0.1, resume=tmp_path / "nowhere" / "sweep.jsonl")
+    for case, content in {"damaged line": kept + b"[]\n", "other file": b"my notes"}.items():
+        file.write_bytes(content)
+        messages[case] = refused(again, tmp_path)
+        assert file.read_bytes() == content
+    check_messages("sweep_files", messages)
 
 
 def test_fingerprints_tell_values_apart_and_know_equal_ones() -> None:
@@ -383,29 +378,30 @@ def test_a_table_without_its_package_says_what_to_install(monkeypatch: pytest.Mo
 
 def test_bad_input_is_refused_before_any_run(four_bar: srm.Mechanism, processes: Executor) -> None:
     one = [{}]
-    for call, match in (
-        (lambda: srm.sweep("four_bar", one, 1.0), "neither a mechanism nor a function"),
-        (lambda: srm.sweep(four_bar, [], 1.0), "no cases"),
-        (lambda: srm.sweep(four_bar, "q0", 1.0), "no cases"),
-        (lambda: srm.sweep(four_bar, [3.0], 1.0), r"cases\[0\]: 3.0 is not a set"),
-        (lambda: srm.sweep(four_bar, {"q0": [[0.0]], "v0": []}, 1.0), "lengths"),
-        (lambda: srm.sweep(four_bar, {"q0": 1.0}, 1.0), "not columns"),
-        (lambda: srm.sweep(four_bar, {"a": {"mass": 1.0}}, 1.0), r"cases\['a'\].*'mass'"),
-        (lambda: srm.sweep(four_bar, [{"q": {}, "v0": [0.0]}], 1.0), "Give one of the two"),
-        (lambda: srm.sweep(pendulum, [{"status": 1.0}], 1.0), "column of every table"),
-        (lambda: srm.sweep(four_bar, one, -1.0), "t_end"),
-        (lambda: srm.sweep(four_bar, one, 1.0, rtoll=1e-3), "no option 'rtoll'"),
-        (lambda: srm.sweep(four_bar, one, 1.0, q0=four_bar.q0), "Give it in the cases"),
-        (lambda: srm.sweep(four_bar, one, 1.0, method="euler"), "no method 'euler'"),
-        (lambda: srm.sweep(four_bar, one, 1.0, measure=3), "measure = 3"),
-        (lambda: srm.sweep(four_bar, one, 1.0, chunk=0), "chunk = 0"),
-        (lambda: srm.sweep(four_bar, one, 1.0, executor=3), "has no submit"),
-    ):
-        with pytest.raises(srm.InputError, match=match):
-            call()
     held = (line for line in ())
+    unsent = partial(srm.sweep, four_bar, one, 1.0, measure=lambda s: {"n": held})
+    calls: dict[str, Callable[[], Any]] = {
+        "mechanism": lambda: srm.sweep("four_bar", one, 1.0),
+        "no cases": lambda: srm.sweep(four_bar, [], 1.0),
+        "text as cases": lambda: srm.sweep(four_bar, "q0", 1.0),
+        "number as case": lambda: srm.sweep(four_bar, [3.0], 1.0),
+        "lengths": lambda: srm.sweep(four_bar, {"q0": [[0.0]], "v0": []}, 1.0),
+        "no columns": lambda: srm.sweep(four_bar, {"q0": 1.0}, 1.0),
+        "parameter": lambda: srm.sweep(four_bar, {"a": {"mass": 1.0}}, 1.0),
+        "two starts": lambda: srm.sweep(four_bar, [{"q": {}, "v0": [0.0]}], 1.0),
+        "reserved name": lambda: srm.sweep(pendulum, [{"status": 1.0}], 1.0),
+        "end": lambda: srm.sweep(four_bar, one, -1.0),
+        "option": lambda: srm.sweep(four_bar, one, 1.0, rtoll=1e-3),
+        "start as option": lambda: srm.sweep(four_bar, one, 1.0, q0=four_bar.q0),
+        "method": lambda: srm.sweep(four_bar, one, 1.0, method="euler"),
+        "measure": lambda: srm.sweep(four_bar, one, 1.0, measure=3),
+        "options": lambda: srm.sweep(four_bar, one, 1.0, options=3),
+        "chunk": lambda: srm.sweep(four_bar, one, 1.0, chunk=0),
+        "executor": lambda: srm.sweep(four_bar, one, 1.0, executor=3),
+    }
+    check_messages("sweeps", {case: refused(call) for case, call in calls.items()})
     with pytest.raises(srm.InputError, match="cannot be sent"):
-        srm.sweep(four_bar, one, 1.0, measure=lambda s: {"n": held}, executor=processes)
+        unsent(executor=processes)
 
 
 def test_an_interrupted_run_ends_the_sweep_and_keeps_what_was_finished(tmp_path: Path) -> None:

@@ -71,116 +71,106 @@ def _grade(value: float, limits: tuple[float, float]) -> Grade:
 
 def assess_status(solution: SimulationResult) -> Assessment:
     """Whether the run reached its end."""
+    topic = "end of the run"
     start, end = solution.span
     if solution.status == "finished":
-        return Assessment("end of the run", "good", f"It reached its end at t = {end:.6g} s.")
+        return Assessment(topic, "good", f"It reached its end at t = {end:.6g} s.")
     if solution.status == "event":
-        return Assessment(
-            "end of the run", "good", f"An event ended it at t = {end:.6g} s, as asked."
-        )
-    asked = "" if solution.request is None else f" of {solution.request.t_end:.6g} s"
+        return Assessment(topic, "good", f"An event ended it at t = {end:.6g} s, as asked.")
     word = "was interrupted" if solution.status == "interrupted" else "failed"
-    text = (
-        f"It {word} at t = {end:.6g} s{asked}; all that is said here is about the time up to there."
-    )
     if end <= start:
-        text = f"It {word} at its start: there is no motion to judge."
-    return Assessment("end of the run", "poor", text)
+        return Assessment(topic, "poor", f"It {word} at its start: there is no motion to judge.")
+    asked = "" if solution.request is None else f" of {solution.request.t_end:.6g} s"
+    text = f"It {word} at t = {end:.6g} s{asked}; all assessments refer to the time until then."
+    return Assessment(topic, "poor", text)
 
 
 def assess_drift(drift: Sequence[Drift]) -> Assessment:
     """How well the closures were satisfied."""
+    topic = "closed loops"
     if not drift:
-        return Assessment(
-            "closed loops", "good", "It has neither loops nor drives: nothing can drift."
-        )
-    worst = max(row.relative for row in drift)
+        return Assessment(topic, "good", "It has neither loops nor drives: nothing can drift.")
     sizes = " and ".join(f"{row.position:.1e} {row.unit}" for row in drift)
-    grade = _grade(worst, DRIFT_LIMITS)
+    grade = _grade(max(row.relative for row in drift), DRIFT_LIMITS)
     meaning = {
         "good": "that is rounding, or close to it",
         "fair": "that is small beside the mechanism, but more than rounding",
         "poor": "the loops came visibly apart",
     }[grade]
-    return Assessment("closed loops", grade, f"They stayed closed to {sizes}: {meaning}.")
+    return Assessment(topic, grade, f"They stayed closed to {sizes}: {meaning}.")
 
 
 def assess_energy(energy: EnergyError | str) -> Assessment:
     """Whether the energy balance closes."""
+    topic = "energy balance"
     if isinstance(energy, str):
-        return Assessment("energy balance", "unknown", f"It cannot be computed: {energy}")
+        return Assessment(topic, "unknown", f"It cannot be computed: {energy}")
     if energy.scale <= energy.rounding:
-        return Assessment("energy balance", "good", "Nothing moved, and no energy was exchanged.")
+        return Assessment(topic, "good", "Nothing moved, and no energy was exchanged.")
     grade = _grade(energy.relative, RESIDUAL_LIMITS)
-    rounded = grade != "good" and energy.residual <= energy.rounding
     text = "The energy, which should be constant, changes"
     if energy.works:
         text = "The energy gained and the work done, which should be equal, differ"
     text += f" by at most {energy.residual:.1e} J, {energy.relative:.1e} of the"
     text += f" {energy.scale:.3g} J that took part."
-    if rounded:
-        return Assessment("energy balance", "good", f"{text} That is rounding of the energies.")
+    if grade != "good" and energy.residual <= energy.rounding:
+        return Assessment(topic, "good", f"{text} That is rounding of the energies.")
     if grade == "poor":
         text += " The run is not accurate, or a force is not smooth where no step ends."
-    return Assessment("energy balance", grade, text)
+    return Assessment(topic, grade, text)
 
 
-def _setting(estimate: ErrorEstimate, trial: Trial) -> str:
-    return f"step {trial.setting:.3g} s" if estimate.fixed else f"rtol {trial.setting:.3g}"
+def _runs_with(estimate: ErrorEstimate, trials: Sequence[Trial]) -> str:
+    """The subject of a sentence about ``trials``."""
+    name, unit = ("step", " s") if estimate.fixed else ("rtol", "")
+    settings = " and ".join(f"{name} {trial.setting:.3g}{unit}" for trial in trials)
+    return f"The run{'s' * (len(trials) > 1)} with {settings}"
 
 
 def assess_errors(solution: SimulationResult, estimate: ErrorEstimate | str) -> list[Assessment]:
     """The error of the run, by comparison with the other runs."""
     if isinstance(estimate, str):
-        return [
-            Assessment(
-                "estimated error",
-                "unknown",
-                f"There is none, as there is no second run: {estimate}.",
-            )
-        ]
+        text = f"There is none, as there is no second run: {estimate}."
+        return [Assessment("estimated error", "unknown", text)]
     rate = solution.mechanism.structure.units.rate
     return [
-        _error(solution, estimate),
+        Assessment("estimated error", *_error(solution, estimate)),
         *_other_runs(solution, estimate),
-        _order(estimate),
+        Assessment("order" if estimate.fixed else "error over tolerance", *_order(estimate)),
         *_sensitivity(estimate.comparison, rate),
         *_common_errors(solution),
     ]
 
 
-def _error(solution: SimulationResult, estimate: ErrorEstimate) -> Assessment:
-    largest: dict[str, list[float]] = {}
+def _error(solution: SimulationResult, estimate: ErrorEstimate) -> tuple[Grade, str]:
+    """Grade and text of the estimated error."""
+    largest: dict[str, float] = {}
     for row in estimate.joints:
-        largest.setdefault(row.unit, []).append(row.position)
-    sizes = " and ".join(f"{max(values):.1e} {unit}" for unit, values in largest.items())
-    if estimate.apart is not None:
-        if estimate.branch is not None:
-            text = (
-                f"The run and the one beside it pass the singular configuration at "
-                f"t = {estimate.branch:.6g} s on different branches, and are different motions "
-                "from there: at least one of them is wrong, and they do not tell which."
-            )
-            return Assessment("estimated error", "poor", text)
-        text = (
-            f"From t = {estimate.apart:.4g} s on the run and the one beside it are too far apart "
-            "to tell where the mechanism is: what the run says later is a motion that could be, "
-            f"not the one that follows from the start. Before that they differ by at most {sizes}."
+        largest[row.unit] = max(row.position, largest.get(row.unit, 0.0))
+    sizes = " and ".join(f"{value:.1e} {unit}" for unit, value in largest.items())
+    if estimate.branch is not None:
+        return "poor", (
+            f"The run and the comparison run pass the singular configuration at "
+            f"t = {estimate.branch:.6g} s on different branches, and are different motions from "
+            "there: at least one of them is wrong; the comparison does not show which."
         )
-        return Assessment("estimated error", "poor", text)
+    if estimate.apart is not None:
+        return "poor", (
+            f"From t = {estimate.apart:.4g} s on the run and the comparison run disagree about the "
+            "position of the mechanism: the rest of the run is a possible motion, not the one that "
+            f"follows from the start. Before that they differ by at most {sizes}."
+        )
     grade = _grade(estimate.size, ERROR_LIMITS)
     if estimate.bound:
-        text = (
-            f"The run beside it is looser and differs by {sizes}: the error of this run should be "
-            "smaller, but there is no tighter one to show by how much."
+        return grade, (
+            f"The comparison run is looser and differs by {sizes}: the error of this run should be "
+            "smaller, but there is no tighter run to show by how much."
         )
-        return Assessment("estimated error", grade, text)
     end = min(solution.span[1], float(estimate.comparison.t[-1]))
-    text = (
+    return grade, (
         f"No joint is off by more than about {sizes} up to t = {end:.6g} s. This is an estimate, "
         "the difference to a tighter run, and no proven bound."
     )
-    return Assessment("estimated error", grade, text)
 
 
 def _other_runs(solution: SimulationResult, estimate: ErrorEstimate) -> list[Assessment]:
@@ -189,18 +179,15 @@ def _other_runs(solution: SimulationResult, estimate: ErrorEstimate) -> list[Ass
     others = [trial for trial in estimate.trials if not trial.own]
     ended = [trial for trial in others if trial.status in ("finished", "event")]
     stopped = [trial for trial in others if trial not in ended]
-
-    def runs_with(trials: Sequence[Trial]) -> str:
-        runs = " and ".join(_setting(estimate, trial) for trial in trials)
-        return f"The run{'s' * (len(trials) > 1)} with {runs}"
-
     if solution.status == "failed" and ended:
-        text = f"{runs_with(ended)} went on where this one failed: it is the setting that failed."
+        runs = _runs_with(estimate, ended)
+        text = f"{runs} went on where this one failed: it is the setting that failed."
         out.append(Assessment("second run", "poor", text))
     if stopped and (solution.success or solution.status == "failed"):
+        runs = _runs_with(estimate, stopped)
         times = " and ".join(f"{trial.end:.9g} s" for trial in stopped)
         too = " as well" * (not solution.success)
-        text = f"{runs_with(stopped)} stopped{too}, at t = {times}; compared is what both have."
+        text = f"{runs} stopped{too}, at t = {times}; compared is what both have."
         out.append(Assessment("second run", "poor" if solution.success else "fair", text))
     jumps = estimate.comparison.jumps
     if len(jumps):
@@ -213,37 +200,36 @@ def _other_runs(solution: SimulationResult, estimate: ErrorEstimate) -> list[Ass
     return out
 
 
-def _order(estimate: ErrorEstimate) -> Assessment:
-    topic = "order" if estimate.fixed else "error over tolerance"
+def _order(estimate: ErrorEstimate) -> tuple[Grade, str]:
+    """Grade and text of how errors fall with the step or the tolerance."""
     order, expected = estimate.order, estimate.expected_order
     if order is None:
-        return Assessment(topic, *_unobserved_order(estimate))
+        return _unobserved_order(estimate)
     if estimate.fixed:
         text = f"With the step, errors fall with order {order:.2f}"
         if expected is None:
-            return Assessment(topic, "fair" if order > SMALLEST_SLOPE else "poor", f"{text}.")
-        good = order > expected - ORDER_TOLERANCE
+            return "fair" if order > SMALLEST_SLOPE else "poor", f"{text}."
         text += f"; that of the scheme is {expected:g}."
-        if not good:
-            text += (
-                " The steps are too large for it, or something is not smooth: take the error above "
-                "as a rough one."
-            )
-        return Assessment(topic, "good" if good else "fair", text)
-    if order < SMALLEST_SLOPE and estimate.size < ROUNDING_ERROR_LIMIT:
-        text = (
+        if order > expected - ORDER_TOLERANCE:
+            return "good", text
+        return "fair", (
+            f"{text} The steps are too large for it, or something is not smooth: take the error "
+            "above as a rough one."
+        )
+    if order >= SMALLEST_SLOPE:
+        return "good", (
+            f"Errors fall as the tolerance to the power {order:.2f}, where 1 is usual: a tighter "
+            "tolerance pays, and the estimate holds."
+        )
+    if estimate.size < ROUNDING_ERROR_LIMIT:
+        return "good", (
             "The differences no longer fall with the tolerance: they are what rounding leaves, and "
             "a tighter one gains nothing."
         )
-        return Assessment(topic, "good", text)
-    if order < SMALLEST_SLOPE:
-        text = (
-            f"The differences hardly fall with the tolerance (slope {order:.2f}, where 1 is "
-            "usual): the estimate of the error cannot be relied on."
-        )
-        return Assessment(topic, "poor" if estimate.size > ERROR_LIMITS[0] else "fair", text)
-    text = f"Errors fall as the tolerance to the power {order:.2f}, where 1 is usual"
-    return Assessment(topic, "good", f"{text}: a tighter tolerance pays, and the estimate holds.")
+    return "poor" if estimate.size > ERROR_LIMITS[0] else "fair", (
+        f"The differences hardly fall with the tolerance (slope {order:.2f}, where 1 is usual): "
+        "the estimate of the error cannot be relied on."
+    )
 
 
 def _unobserved_order(estimate: ErrorEstimate) -> tuple[Grade, str]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray
 from srm_mbs.analysis.accuracy.error_estimate import sample_times
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.scaling import constraint_angles
@@ -65,7 +64,7 @@ class EnergyError:
 
 def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
     """The drift of a run, for each unit of its closure rows and drives; empty for an open chain."""
-    found: dict[str, tuple[FloatArray, FloatArray, float]] = {}
+    found: dict[str, list[list[float]]] = {}
     for part in solution.segments:
         mechanism = part.mechanism
         if not mechanism.constrained:
@@ -73,32 +72,17 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
         ends = part.steps.times
         if part.steps.stop is not None:  # an event within the last step
             ends = ends[:-1]
+        runs = [part.at(times) for times in (ends, sample_times(part))]
+        errors = [e for run in runs for e in constraint_errors(mechanism, run.t, run.q, run.v)]
         angles = constraint_angles(mechanism)
-        for unit, own in (("m", ~angles), ("rad", angles)):
-            if not own.any():
-                continue
-            scale = mechanism.structure.units.length if unit == "m" else 1.0
-            largest = []
-            for times in (ends, sample_times(part)):
-                run = part.at(times)
-                errors = constraint_errors(mechanism, run.t, run.q, run.v)
-                largest.append([np.linalg.norm(e[:, own], axis=1).max() for e in errors])
-            at_ends, between = np.array(largest)
-            if unit in found:
-                at_ends = np.maximum(at_ends, found[unit][0])
-                between = np.maximum(between, found[unit][1])
-                scale = max(scale, found[unit][2])
-            found[unit] = at_ends, between, scale
+        length = mechanism.structure.units.length
+        for unit, own, scale in (("m", ~angles, length), ("rad", angles, 1.0)):
+            if own.any():
+                largest = [float(np.linalg.norm(e[:, own], axis=1).max()) for e in errors]
+                found.setdefault(unit, []).append([*largest, scale])
+    worst = {unit: np.max(parts, axis=0).tolist() for unit, parts in found.items()}
     return tuple(
-        Drift(
-            unit,
-            float(at_ends[0]),
-            float(at_ends[1]),
-            float(between[0]),
-            float(between[1]),
-            float(at_ends[0]) / scale,
-        )
-        for unit, (at_ends, between, scale) in found.items()
+        Drift(unit, *(*largest, largest[0] / scale)) for unit, (*largest, scale) in worst.items()
     )
 
 

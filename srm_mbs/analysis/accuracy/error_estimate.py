@@ -201,7 +201,7 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
             raise InputError(
                 f"the run has fixed steps of {settings.step:g} s: no tolerance decides its error",
                 element="rtol",
-                remedy="Leave rtol out: it is made again with half and a quarter of the step",
+                remedy="Leave rtol out: the run is repeated with half and a quarter of the step",
             )
         return [settings.step / 2.0, settings.step / 4.0]
     # By default no tolerance is so tight that rounding dominates.
@@ -211,16 +211,15 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
     )
     if rtol is None and settings.rtol < INTERMEDIATE_RATIO * tightest:
         other = INTERMEDIATE_RATIO * settings.rtol  # a looser run gives a bound
-    if abs(math.log(other / settings.rtol)) < math.log(DIFFERENT_RATIO):
+    ratio = max(other / settings.rtol, settings.rtol / other)
+    if ratio < DIFFERENT_RATIO:
         raise InputError(
-            f"rtol = {other:g} is that of the run: two runs alike tell nothing",
+            f"rtol = {other:g} is that of the run: two equal runs show no error",
             element="rtol",
             remedy=f"Give for example rtol={max(TIGHTEST_RATIO * settings.rtol, tightest):g}",
         )
-    found = [other]
-    if abs(math.log(other / settings.rtol)) > math.log(INTERMEDIATE_RATIO):
-        found.append(math.sqrt(other * settings.rtol))
-    return sorted(found, reverse=True)
+    between = [math.sqrt(other * settings.rtol)] * (ratio > INTERMEDIATE_RATIO)
+    return sorted([other, *between], reverse=True)
 
 
 def estimate_error(

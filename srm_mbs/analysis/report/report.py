@@ -16,7 +16,6 @@ from srm_mbs.analysis.report.sections import (
     GRADE_LABELS,
     PICTURES,
     accuracy_data,
-    animation_page,
     freedom_rows,
     mechanism_data,
     pictures_data,
@@ -24,9 +23,13 @@ from srm_mbs.analysis.report.sections import (
 )
 from srm_mbs.errors import InputError, __version__
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.page import render, write_page
+from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.page import render, write_file
+from srm_mbs.visualization.animation.playback import page_of
 
 FOLDER = Path(__file__).parent
+FRAMES_PER_SECOND = 30.0
+"""Key frames per second of the animation."""
 CONTENTS = {
     "mechanism": "The mechanism",
     "animation": "The motion",
@@ -73,11 +76,17 @@ def write_report(
     InputError
         If ``rtol`` or a kind of plot is not valid, or the animation or the file cannot be written.
     """
-    check_pictures(pictures)
+    for kind in pictures:
+        if kind not in PICTURES:
+            raise InputError(
+                f"reports have no picture of the kind {kind!r}",
+                element="pictures",
+                remedy=f"Known: {', '.join(PICTURES)}",
+            )
     if certificate is None:
         certificate = certify(solution, rtol=rtol, again=again, progress=progress)
     page = report_page(solution, certificate, animation=animation, pictures=pictures)
-    write_page(page, Path(path))
+    write_file(Path(path), page.encode())
 
 
 def report_page(
@@ -88,7 +97,9 @@ def report_page(
     pictures: Sequence[str] = tuple(PICTURES),
 ) -> str:
     """The page of :func:`write_report`."""
-    check_pictures(pictures)
+    player = None
+    if animation:
+        player = page_of(solution, FRAMES_PER_SECOND, OverlayOptions(), panel=True)
     included = {"animation": animation, "pictures": bool(pictures)}
     return render(
         FOLDER,
@@ -101,29 +112,12 @@ def report_page(
         passages=bool(solution.crossings),
         grades=GRADE_LABELS,
         mechanism=mechanism_data(solution),
-        animation=animation_page(solution) if animation else None,
+        animation=player,
         freedom=freedom_rows(solution.mechanism),
         run=run_data(solution),
         accuracy=accuracy_data(solution, certificate),
         pictures=pictures_data(solution, pictures) if pictures else None,
     )
-
-
-def check_pictures(kinds: Sequence[str]) -> None:
-    """Refuse a kind of plot that reports do not have.
-
-    Raises
-    ------
-    InputError
-        Naming those that they have.
-    """
-    for kind in kinds:
-        if kind not in PICTURES:
-            raise InputError(
-                f"reports have no picture of the kind {kind!r}",
-                element="pictures",
-                remedy=f"Known: {', '.join(PICTURES)}",
-            )
 
 
 def _summary(solution: SimulationResult, certificate: Certificate) -> list[str]:

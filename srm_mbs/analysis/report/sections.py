@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,9 +26,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import NAMED_LOOPS
-from srm_mbs.visualization.animation.playback import page_of
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from srm_mbs.visualization.plotting import plot_solution
 from srm_mbs.visualization.plotting.figure import (
@@ -44,8 +41,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FRAMES_PER_SECOND = 30.0
-"""Key frames per second of the animation."""
 MAX_LISTED_PASSAGES = 100
 """Most passages that are listed one by one."""
 MAX_BRANCH_WORK = 3000
@@ -56,7 +51,7 @@ PIXELS_PER_INCH = 160
 SMALLEST_DIFFERENCE = 1e-9
 """Smallest difference that is drawn, over the largest: zeros at the start would make the axis
 long."""
-NOT_KNOWN = "not told"
+NOT_COMPUTED = "not computed"
 
 FREEDOM = {
     "degrees of freedom": "Independent motions that remain.",
@@ -114,31 +109,10 @@ GRADE_LABELS: dict[Grade, str] = {
 """Each grade as a sign and a word, so that it is legible without its colour."""
 
 
-@dataclass(frozen=True)
-class Image:
-    """An image within the page.
-
-    Attributes
-    ----------
-    data
-        The file.
-    media_type
-        For example ``image/png``.
-    description
-        Alternative text.
-    caption
-        Text below the image.
-    """
-
-    data: bytes
-    media_type: str
-    description: str
-    caption: str
-
-    @property
-    def source(self) -> str:
-        """The image as a data URI."""
-        return f"data:{self.media_type};base64,{base64.b64encode(self.data).decode('ascii')}"
+def _image(data: bytes, media_type: str, description: str, caption: str) -> dict[str, str]:
+    """An image within the page: data URI, alternative text, and the text below the image."""
+    source = f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
+    return {"source": source, "description": description, "caption": caption}
 
 
 def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
@@ -157,7 +131,7 @@ def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
     snapshot, problem = None, ""
     start = solution.span[0]
     try:
-        snapshot = Image(
+        snapshot = _image(
             draw_snapshot(solution, start),
             "image/png",
             f"Drawing of the bodies of {mechanism.name} at the start of the run",
@@ -178,17 +152,6 @@ def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
         "drives": list(drive_rows(mechanism)),
         "notes": (*mechanism.notes, *mechanism.structure.notes),
     }
-
-
-def animation_page(solution: SimulationResult) -> str:
-    """The page of the animation.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made.
-    """
-    return page_of(solution, FRAMES_PER_SECOND, OverlayOptions(), panel=True)
 
 
 def freedom_rows(mechanism: Mechanism) -> list[tuple[str, str, str]]:
@@ -261,9 +224,9 @@ def _passages(solution: SimulationResult) -> dict[str, Any]:
         "passages": [
             (
                 f"{crossing.time:.9g}",
-                crossing.participants.names if named else NOT_KNOWN,
+                crossing.participants.names if named else NOT_COMPUTED,
                 f"{crossing.sigma:.2g}",
-                _branch(crossing) if followed else NOT_KNOWN,
+                _branch(crossing) if followed else NOT_COMPUTED,
                 PRECAUTIONS.get(crossing.placement, "none needed"),
             )
             for crossing in listed
@@ -276,7 +239,7 @@ def _passages(solution: SimulationResult) -> dict[str, Any]:
 def _branch(crossing: Crossing) -> str:
     count, before, after = len(crossing.branches), crossing.arrived_on, crossing.left_on
     if before is None or after is None:
-        return NOT_KNOWN
+        return "not known"
     if before == after:
         return f"kept ({count} meet)"
     return f"left on another one ({count} meet)"
@@ -308,15 +271,15 @@ def pictures_data(solution: SimulationResult, kinds: Sequence[str]) -> dict[str,
     return {"images": images, "missing": missing}
 
 
-def _plot_image(figure: Figure, description: str, caption: str) -> Image:
+def _plot_image(figure: Figure, description: str, caption: str) -> dict[str, str]:
     """A figure of Matplotlib as a vector drawing, or as pixels if that would be too large."""
     out = io.BytesIO()
     figure.savefig(out, format="svg", metadata={"Date": None})
-    if len(out.getvalue()) <= MAX_DRAWING:
-        return Image(out.getvalue(), "image/svg+xml", description, caption)
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=PIXELS_PER_INCH)
-    return Image(out.getvalue(), "image/png", description, caption)
+    media_type = "image/svg+xml"
+    if len(out.getvalue()) > MAX_DRAWING:
+        out, media_type = io.BytesIO(), "image/png"
+        figure.savefig(out, format="png", dpi=PIXELS_PER_INCH)
+    return _image(out.getvalue(), media_type, description, caption)
 
 
 def accuracy_data(solution: SimulationResult, certificate: Certificate) -> dict[str, Any]:

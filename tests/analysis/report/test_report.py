@@ -1,4 +1,4 @@
-"""The page about a run: what stands in it, and that it opens anywhere."""
+"""The report of a run: its content, and that it opens anywhere."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs.analysis.report.report import report_page
 from srm_mbs.analysis.report.sections import pictures_data
-from srm_mbs.cli.app import app
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.visualization.animation.shapes import ANCHOR_COLOUR
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import LARGE, opened
 from tests.support.bundled import load
+from tests.support.commands import run as run_command
 
 VOID = {"meta", "link", "img", "br", "input", "hr"}
 MEGABYTES = 1_000_000
@@ -144,7 +143,6 @@ def test_the_certificate_in_the_page_is_that_of_the_run(
     for found in certificate.findings:
         assert found.text in page.text
     estimate = certificate.estimate
-    assert estimate is not None
     table = next(table for table in page.tables if table[0][:2] == ["joint", "position"])
     for row, joint in zip(table[1:], estimate.joints, strict=True):
         assert row[0] == joint.joint
@@ -186,6 +184,12 @@ def test_names_of_the_user_are_text_in_the_page(run: srm.Solution) -> None:
     assert "<script>alert(1)" not in parsed.srcdoc
 
 
+def short_page(run: srm.Solution, *, again: bool = True) -> Page:
+    """The page of a run, without its animation and pictures."""
+    certificate = srm.certify(run, again=again)
+    return Page(report_page(run, certificate, animation=False, pictures=()))
+
+
 def test_a_run_that_failed_has_a_page_that_says_so() -> None:
     def breaks(t: float, q: Any, v: Any) -> list[float]:
         if t > 0.5:
@@ -194,7 +198,7 @@ def test_a_run_that_failed_has_a_page_that_says_so() -> None:
 
     failed = srm.simulate(load("simple_pendulum"), 1.0, controller=breaks)
     assert not failed.success
-    page = Page(report_page(failed, srm.certify(failed), animation=False, pictures=()))
+    page = short_page(failed)
     assert "it <broke>" in page.text
     assert "Accuracy, overall ✗ poor" in page.text
     assert page.srcdoc == ""
@@ -207,18 +211,18 @@ def test_a_run_that_failed_at_its_start_has_a_page() -> None:
         raise ValueError("never")
 
     failed = srm.simulate(load("four_bar"), 1.0, controller=broken)
-    page = Page(report_page(failed, srm.certify(failed), animation=False, pictures=()))
+    page = short_page(failed)
     assert "failed at its start" in page.text
 
 
 def test_the_page_of_many_loops_leaves_out_what_takes_minutes_and_says_so() -> None:
     run = srm.simulate(srm.n_four_bar(40), 1.5)
     crossing, *_ = run.crossings
-    page = Page(report_page(run, srm.certify(run, again=False), animation=False, pictures=()))
+    page = short_page(run, again=False)
     passages = next(table for table in page.tables if table[0][0] == "time (s)")
     assert passages[1][0] == f"{crossing.time:.9g}"
-    assert (passages[1][1], passages[1][3]) == ("not told", "not told")
-    assert "takes minutes to find out" in page.text
+    assert (passages[1][1], passages[1][3]) == ("not computed", "not computed")
+    assert "takes minutes to compute" in page.text
     # They were not asked for: one passage takes 9 s.
     assert not {"participants", "_tangents", "singular"} & vars(crossing).keys()
 
@@ -229,7 +233,7 @@ def test_a_run_with_event_actions_and_drives_has_a_page() -> None:
     start = srm.assemble(mechanism)
     event = srm.Event(lambda t, q, v: t - 0.2, action=lambda t, q, v: None)
     driven = srm.simulate(mechanism, 0.4, q0=start.q, v0=start.v, events=[event])
-    page = Page(report_page(driven, srm.certify(driven), animation=False, pictures=()))
+    page = short_page(driven)
     assert page.cell("drives") == "1"
     assert "At the jump by an event action the times differ" in page.text
 
@@ -247,19 +251,16 @@ def test_tables_without_rows_and_headings_without_content_are_left_out() -> None
 # --- the snapshot ---------------------------------------------------------------------------------
 
 
-def test_the_snapshot_shows_a_sphere_as_large_as_the_camera_sees_it(tmp_path: Path) -> None:
+def test_the_snapshot_shows_a_sphere_as_large_as_the_camera_sees_it() -> None:
     run = srm.simulate(load("simple_pendulum"), 0.1)
-    picture = Image.open(io.BytesIO(draw_snapshot(run, 0.0))).convert("RGB")
-    pixels = np.asarray(picture, dtype=float)
-    assert picture.width == 900
-    drawn = (pixels < 250.0).any(axis=2)
-    columns = np.flatnonzero(drawn.any(axis=0))
-    rows = np.flatnonzero(drawn.any(axis=1))
+    pixels = seen(run)
+    height, width, _ = pixels.shape
+    assert width == 900
+    rows, columns = np.nonzero((pixels < 250.0).any(axis=2))
     # The camera's place is chosen so that the motion fills 84 % of the width or the height.
-    filled = max((columns[-1] - columns[0]) / 900.0, (rows[-1] - rows[0]) / 600.0)
-    assert 0.6 < filled < 0.9
-    assert rows[0] <= 24
-    assert picture.height - rows[-1] <= 26
+    assert 0.6 < max(np.ptp(columns) / 900.0, np.ptp(rows) / 600.0) < 0.9
+    assert rows.min() <= 24
+    assert height - rows.max() <= 26
 
 
 TWO_SHAPES = """<robot name="two"><link name="base"/>
@@ -400,34 +401,14 @@ def test_the_command_writes_the_page_beside_the_run(
     monkeypatch.setattr(
         "srm_mbs.analysis.report.report.pictures_data", lambda *_: {"images": [], "missing": []}
     )  # they take a second
-    done = CliRunner().invoke(app, ["report", str(saved), "--no-animation"])
-    assert done.exit_code == 0, done.output
+    output = run_command("report", saved, "--no-animation")
     path = saved.with_name(f"{saved.stem}_report.html")
-    assert f"written: {path}" in done.output
-    assert re.search(r"^estimated error +good +No joint is off", done.output, re.MULTILINE)
-    assert "making the run again" in done.output
+    assert f"written: {path}" in output
+    assert re.search(r"^estimated error +good +No joint is off", output, re.MULTILINE)
+    assert "repeating the run" in output
     page = Page(path.read_text(encoding="utf-8"))
     assert page.srcdoc == ""
     assert "iframe" not in path.read_text(encoding="utf-8").split("</style>")[1]
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--out", "report.pdf"], "the suffix '.pdf' is not known here"),
-        (["--rtol", "1e-6"], "two runs alike"),
-        (["--rtol", "1e-8", "--no-second-run"], "--rtol: it is the tolerance of the second run"),
-    ],
-)
-def test_the_command_refuses_what_it_cannot_do(saved: Path, options: list[str], words: str) -> None:
-    done = CliRunner().invoke(app, ["report", str(saved), *options])
-    assert done.exit_code == 2
-    assert words in done.output
-
-
-def test_pictures_that_reports_do_not_have_are_refused(run: srm.Solution, tmp_path: Path) -> None:
-    with pytest.raises(srm.InputError, match=r"'phase'.*Known: run, state, balance"):
-        run.report(tmp_path / "report.html", pictures=["phase"])
 
 
 def test_a_picture_that_a_loaded_run_has_not_is_named_in_the_page(tmp_path: Path) -> None:

@@ -1,6 +1,0 @@
-"""``python -m srm_mbs.cli``: the command line."""
-
-from srm_mbs.cli.app import main
-
-if __name__ == "__main__":
-    main()

@@ -49,64 +49,65 @@ KERNEL_REPEATS = 10
 """Runs on the kernel per run in Python: they are that much shorter."""
 
 
-def plain_start(system: System, t: float, state: FloatArray) -> IntegratorState:
-    """First stage; no multiplier history."""
-    terms = system.evaluate(t, state)
-    return IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
-
-
-def plain_step(
-    system: System,
-    scheme: srm.ButcherTableau,
-    t: float,
-    h: float,
-    state: FloatArray,
-    memory: IntegratorState,
-    norm: ErrorNorm,
-    theta: float,
-) -> StepResult:
+@dataclass(frozen=True)
+class PlainStep:
     """The split PSRM with nothing for singular configurations (docs/notation.md, "The method")."""
-    s = scheme.n_stages
-    all_weights, fractions = later_stages(scheme)
-    rates = np.zeros((s + 1, system.tangent_size))
-    weighed = rates[:s]
-    sigmas = [memory.sigma]
-    rates[0] = memory.rate
-    for j, weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
-        delta = weights.dot(weighed)
-        x = system.retract(state, delta)
-        terms = system.evaluate(t + fraction * h, x)
-        sigmas.append(terms.sigma)
-        rate = terms.rate()
-        rates[j] = system.chart_rate(delta, rate)
-    state_scale = system.state_scale(x)
-    correction = terms.correction()
-    if theta != 1.0:
-        correction = theta * correction
-    weights = norm.weights(np.maximum(memory.state_scale, state_scale))
-    return StepResult(
-        t=t,
-        h=h,
-        state=system.retract(x, -correction),
-        rates=rates,
-        end_rate=rate - system.rate_change(correction),
-        correction=correction,
-        error_ratio=norm(h * (scheme.error @ rates), weights),
-        sigmas=np.array(sigmas),
-        rank=terms.rank,
-        zone=None,
-        history=None,
-        multiplier=None,
-        state_scale=state_scale,
-    )
 
+    scheme: srm.ButcherTableau
+    eps: None
 
-def plain_accept(memory: IntegratorState, result: StepResult) -> None:
-    """Rate, sigma and size at the end of the step."""
-    memory.steps += 1
-    memory.rate = result.end_rate
-    memory.sigma = float(result.sigmas[-1])
-    memory.state_scale = result.state_scale
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
+        """First stage; no multiplier history."""
+        terms = system.evaluate(t, state)
+        return IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
+
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """One step."""
+        scheme, s = self.scheme, self.scheme.n_stages
+        all_weights, fractions = later_stages(scheme)
+        rates = np.zeros((s + 1, system.tangent_size))
+        weighed = rates[:s]
+        sigmas = [memory.sigma]
+        rates[0] = memory.rate
+        for j, weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
+            delta = weights.dot(weighed)
+            x = system.retract(state, delta)
+            terms = system.evaluate(t + fraction * h, x)
+            sigmas.append(terms.sigma)
+            rate = terms.rate()
+            rates[j] = system.chart_rate(delta, rate)
+        state_scale = system.state_scale(x)
+        correction = terms.correction()
+        weights = norm.weights(np.maximum(memory.state_scale, state_scale))
+        return StepResult(
+            t=t,
+            h=h,
+            state=system.retract(x, -correction),
+            rates=rates,
+            end_rate=rate - system.rate_change(correction),
+            correction=correction,
+            error_ratio=norm(h * (scheme.error @ rates), weights),
+            sigmas=np.array(sigmas),
+            rank=terms.rank,
+            state_scale=state_scale,
+        )
+
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
+        """Rate, sigma and size at the end of the step."""
+        memory.steps += 1
+        memory.rate = result.end_rate
+        memory.sigma = float(result.sigmas[-1])
+        memory.state_scale = result.state_scale
 
 
 @contextmanager
@@ -123,9 +124,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         return method.start(system, t, state, norm)  # type: ignore[no-any-return]
 
     with (
-        patch.object(psrm, "split_start", plain_start),
-        patch.object(psrm, "split_step", plain_step),
-        patch.object(psrm, "split_accept", plain_accept),
+        patch.object(psrm, "SplitStep", PlainStep),
         patch.object(runner, "placed_control", control),
         patch.object(runner, "start", start),
         patch.object(runner, "bifurcation_sentences", lambda _: ""),

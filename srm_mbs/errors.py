@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 __version__ = "0.1.0"
@@ -63,6 +64,17 @@ class InputError(SrmError, ValueError):
         if self.file is None:
             self.file = file
         return self
+
+
+@contextmanager
+def naming(*, file: str | None = None, element: str | None = None) -> Iterator[None]:
+    """Fill ``file`` and ``element`` into an :class:`InputError` that names none."""
+    try:
+        yield
+    except InputError as error:
+        error.file = error.file or file
+        error.element = error.element or element
+        raise
 
 
 class AssemblyError(InputError):

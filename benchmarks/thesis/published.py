@@ -26,12 +26,11 @@ from srm_mbs.integration.methods.thesis.sweep import (
     Answer,
     Start,
     Sweep,
+    SweepEquation,
     SweepNode,
     SweepResult,
     SweepState,
     interpolant,
-    multipliers_between,
-    sweep_over,
 )
 
 SAFETY, LARGEST_FACTOR = 0.8, 5.0
@@ -89,11 +88,12 @@ class PublishedSRM:
             if node.rate is None:
                 terms = system.evaluate(t, node.state)
                 rate, _ = answer(terms, 0)
-                start = Start(rate.copy(), node.multiplier, terms.sigma, terms.rank)
+                start = Start.of(terms, rate, node.multiplier)
             else:
                 start = Start(node.rate, node.multiplier, memory.sigma, len(node.state))
-            runs.append(sweep_over(system, scheme, t, h, node.state, answer, start))
-            previous = multipliers_between(system, scheme, how, t, h, runs[-1], answer)
+            equation = SweepEquation(system, scheme, t, h, answer)
+            runs.append(equation.integrate(node.state, start))
+            previous = equation.multipliers_at_nodes(runs[-1], how)
         last = runs[-1]
         state_scale = np.maximum(np.abs(memory.sweeps[-1].state), np.abs(last.state))
         error_ratio = 0.0
@@ -111,9 +111,6 @@ class PublishedSRM:
             error_ratio=error_ratio,
             sigmas=last.sigmas,
             rank=last.rank,
-            zone=None,
-            history=None,
-            multiplier=None,
             state_scale=state_scale,
             sweeps=tuple(
                 SweepNode(

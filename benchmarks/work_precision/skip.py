@@ -71,10 +71,7 @@ class _AlgebraAnyway(OpenSystem):
         self.evaluations += 1
         q, v = self.split(state)
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        f = -pin.nonLinearEffects(self.model, self.data, q, v)
-        force = self.applied_force(t, q, v)
-        if force is not None:
-            f += force
+        f = self.applied_force(t, q, v) - pin.nonLinearEffects(self.model, self.data, q, v)
         U = cholesky(self.data.M)
         rate = self._terms.rate()
         rate[: self.nv] = v

@@ -76,33 +76,29 @@ def _load_from(place: Path, folder: Path, sources: str, search: Sequence[str]) -
     built = _module("built", place)
     # Kernels that do not name their sources were built before the sources were compared.
     if sources and sources != getattr(built, "SOURCES", ""):
-        return Kernel(
-            None,
-            f"it was built from other sources than those in {folder.parents[1]}",
-            f"Run: {install_command(folder, search)}",
-        )
+        reason = f"it was built from other sources than those in {folder.parents[1]}"
+        return Kernel(None, reason, _build_again(folder, sources, search))
     built_against: str = built.PINOCCHIO
     installed = version("pin")
     minor = built_against.split(".")[:2]
     # Another Pinocchio would crash the interpreter.
     if minor != installed.split(".")[:2]:
-        pin = f'pip install "pin=={".".join(minor)}.*"'
-        return Kernel(
-            None,
-            f"it was built against Pinocchio {built_against}, but pin {installed} is installed",
-            f"Run: {install_command(folder, search) if sources else pin}",
-        )
+        reason = f"it was built against Pinocchio {built_against}, but pin {installed} is installed"
+        same_pin = f'Run: pip install "pin=={".".join(minor)}.*"'
+        return Kernel(None, reason, _build_again(folder, sources, search) if sources else same_pin)
     import pinocchio  # noqa: F401 - loads the libraries that the kernel links to
 
     try:
         core = _module("_core", place)
     except ImportError as error:
-        return Kernel(
-            None,
-            f"it cannot be loaded: {error}",
-            f"Run: {install_command(folder, search) if sources else INSTALL_AGAIN}",
-        )
+        reason = f"it cannot be loaded: {error}"
+        return Kernel(None, reason, _build_again(folder, sources, search))
     return Kernel(core)
+
+
+def _build_again(folder: Path, sources: str, search: Sequence[str], before: str = "Run") -> str:
+    """The command that builds the kernel for the package in ``folder``, as an imperative."""
+    return f"{before}: {install_command(folder, search) if sources else INSTALL_AGAIN}"
 
 
 def _module(name: str, place: Path) -> ModuleType:
@@ -120,19 +116,14 @@ def _module(name: str, place: Path) -> ModuleType:
 def _not_built(folder: Path, sources: str, search: Sequence[str]) -> Kernel:
     """Why no kernel was built for the package in ``folder``."""
     if sources and next(installation_records(search), None) is None:
-        return Kernel(
-            None,
-            "a checkout of the source has none of its own, and no srm-mbs is installed for "
-            f"{sys.executable}",
-            f"Run: {install_command(folder, search)}",
-        )
-    command = install_command(folder, search) if sources else INSTALL_AGAIN
-    return Kernel(
-        None,
+        reason = "a checkout of the source has none of its own, and no srm-mbs is installed for "
+        return Kernel(None, reason + sys.executable, _build_again(folder, sources, search))
+    reason = (
         "it was not built when srm-mbs was installed, because there was no C++17 compiler or "
-        "because it failed",
-        f"With a C++17 compiler, run: {command} -v",
+        "because it failed"
     )
+    command = _build_again(folder, sources, search, "With a C++17 compiler, run")
+    return Kernel(None, reason, f"{command} -v")
 
 
 core, missing, remedy = load(Path(__file__).parent, sys.path)

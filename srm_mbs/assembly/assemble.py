@@ -28,17 +28,19 @@ from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
-from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.numbers import finite_numbers
 
 log = logging.getLogger(__name__)
 
 LARGEST_CONTRADICTION = 1e-9
 """Largest difference (rad, m) between a held position and the initial value of a drive."""
+ARRAY_OR_MAPPING = "Give an array, or a mapping from joint names to values"
+"""Remedy for malformed q and v."""
 
 
-def with_absolute_drives(
+def _with_absolute_drives(
     mechanism: Mechanism, start: FloatArray, held: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Mechanism]:
     """Hold absolute drives at their initial values: joints in ``start`` and ``held``, points by
@@ -70,7 +72,7 @@ def with_absolute_drives(
                 remedy="Free it, or remove absolute from the drive: its law then begins there",
             )
         start[:] = driven
-        held = (*held, *(() if drive.joint in held else (drive.joint,)))
+        held = tuple(dict.fromkeys((*held, drive.joint)))
     if len(loops) == len(mechanism.loops):
         return held, mechanism
     return held, replace(mechanism, loops=tuple(loops), drives=())
@@ -111,6 +113,7 @@ def _positions(
     held: tuple[str, ...],
     limits: bool,
 ) -> FloatArray:
+    """The closed configuration (nq,) nearest to ``start``, within the joint limits if asked for."""
     free = free_coordinates(mechanism, held)
     q = assemble_positions(problem, start, free)
     if not problem.closed(q):
@@ -121,17 +124,6 @@ def _positions(
     if within is None:
         raise limits_in_the_way(mechanism, problem, held, q)
     return within
-
-
-def _vector(values: Any, size: int, what: str) -> FloatArray:
-    array = finite_array(values, (size,))
-    if array is None:
-        raise InputError(
-            f"{what} must be {size} finite numbers",
-            element=what,
-            remedy="Give an array, or a mapping from joint names to values",
-        )
-    return array
 
 
 def _check_distances(problem: ClosureProblem, start: FloatArray) -> None:
@@ -204,15 +196,16 @@ def assemble(
                 element="guess",
                 remedy="Keep one of the two",
             )
-        set_position(mechanism, start, name, value)
+        with naming(element="guess"):
+            set_position(mechanism, start, name, value)
     held: tuple[str, ...] = ()
     if isinstance(q, Mapping):
         for name, value in q.items():
-            set_position(mechanism, start, name, value)
+            with naming(element="q"):
+                set_position(mechanism, start, name, value)
         held = tuple(q)
     elif q is not None:
-        start = _vector(q, model.nq, "q")
-        start = pin.normalize(model, start)
+        start = pin.normalize(model, np.array(finite_numbers(q, model.nq, "q", ARRAY_OR_MAPPING)))
         if not (np.isfinite(start).all() and pin.isNormalized(model, start, 1e-9)):
             raise InputError(
                 "q has a quaternion, or a (cos, sin) pair, of length zero",
@@ -222,18 +215,20 @@ def assemble(
     if hold is not None:
         held = (hold,) if isinstance(hold, str) else tuple(hold)
         for name in held:
-            mechanism.joint(name)
+            with naming(element="hold"):
+                mechanism.joint(name)
     rates = np.zeros(model.nv)
     held_rates: tuple[str, ...] = ()
     if isinstance(v, Mapping):
         for name, value in v.items():
-            set_rate(mechanism, rates, name, value)
+            with naming(element="v"):
+                set_rate(mechanism, rates, name, value)
         held_rates = tuple(v)
     elif v is not None:
-        rates = _vector(v, model.nv, "v")
+        rates = np.array(finite_numbers(v, model.nv, "v", ARRAY_OR_MAPPING))
     if not mechanism.constrained:
         return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
-    held, to_close = with_absolute_drives(mechanism, start, held)
+    held, to_close = _with_absolute_drives(mechanism, start, held)
     problem = ClosureProblem(to_close, start)
     closed = start.copy()
     if to_close.loops:

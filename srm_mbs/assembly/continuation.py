@@ -47,7 +47,8 @@ BETWEEN = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """A singular configuration on the way: parameter, q (nq,), its loops, its dragged values."""
+    """A singular configuration on the way: q (nq,), the loops that lose rank, the dragged values
+    (rad, m)."""
 
     q: FloatArray
     loops: tuple[str, ...]
@@ -85,17 +86,19 @@ class Drag:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
+    """Configuration (nq,), dragged coordinates (n,) in units, and parameter."""
+
     q: FloatArray
     h: FloatArray
     s: float
 
 
 _Moved = tuple[_Point, FloatArray]
-"""A point, and its motion (n,) from where Newton's iteration began."""
+"""A point, and its motion (nv + 1,) from where Newton's iteration began."""
 
 
 class _Follower:
-    """One segment of the path, between two knots."""
+    """The path, followed segment by segment, each between two knots."""
 
     def __init__(
         self, problem: ClosureProblem, columns: IndexArray, rank: int, start: FloatArray
@@ -104,7 +107,7 @@ class _Follower:
         nv = problem.model.nv
         self.free = np.setdiff1d(np.arange(nv), columns)
         self.selection = np.eye(nv)[columns]
-        self.points = [_Point(start, np.zeros(0), 0.0)]
+        self.points = [_Point(start, np.zeros(len(columns)), 0.0)]
         self.tangents: list[FloatArray] = []
         self.cosine = 1.0
 
@@ -113,6 +116,7 @@ class _Follower:
         self.base, self.values, self.slope = s, values, slope
 
     def rows(self, G: FloatArray) -> FloatArray:
+        """Derivatives of g and h - H(s) by (q, s), for the Jacobian G (m, nv) of g."""
         below = np.column_stack([self.selection, -self.slope])
         return np.vstack([np.column_stack([G, np.zeros(len(G))]), below])
 
@@ -122,8 +126,7 @@ class _Follower:
         near = smallest_singular_value(problem, q, self.rank) < CLOSE
         if near and before is not None:
             return before
-        singular = np.linalg.svd(self.rows(problem.normalised(q)))[2]
-        null = singular[self.rank + len(self.columns) :]
+        null = np.linalg.svd(self.rows(problem.normalised(q)))[2][self.rank + len(self.columns) :]
         # With further freedom left, the shortest way.
         along = null[0] if len(null) == 1 else null.T @ null[:, -1]
         along = along / np.linalg.norm(along)
@@ -184,7 +187,7 @@ class _Follower:
                 point = found[0]
                 ahead = self.tangent(point.q, along)
                 cosine = float(ahead @ along)
-                back = ahead[-1] <= 0.0 or (cosine < 0.0)
+                back = ahead[-1] <= 0.0 or cosine < 0.0
                 if point.s > self.points[-1].s and not back and cosine > BENDS:
                     self.cosine = min(self.cosine, cosine)
                     self.points.append(point)
@@ -220,11 +223,9 @@ def drag(
     unit = problem.unit[columns]
     knots = np.vstack([np.zeros(len(columns)), values / unit])
     follower = _Follower(problem, columns, rank, q)
-    follower.points = [_Point(q, knots[0], 0.0)]
     reached, complete = [q], True
     old: FloatArray | None = None
-    for k in range(len(knots) - 1):
-        slope = knots[k + 1] - knots[k]
+    for k, slope in enumerate(np.diff(knots, axis=0)):
         if not slope.any():
             here = follower.points[-1]
             follower.points[-1] = _Point(here.q, here.h, k + 1.0)

@@ -50,14 +50,6 @@ PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts if the search from the guess itself fails."""
 
 
-def _plain(loop: LoopClosure) -> IndexArray:
-    """The rows of ``loop`` whose only zeros are the intended closed configurations."""
-    lengths, alignments, joints = loop.rows.blocks
-    rows = np.arange(loop.rows.count)
-    turns = () if len(loop.rows.matched) else rows[alignments]
-    return np.concatenate([rows[lengths], turns, rows[joints]]).astype(int)
-
-
 @per_model
 def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
     return periodic_coordinates(mechanism.model)
@@ -66,35 +58,44 @@ def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
 class ClosureProblem(ClosureGeometry):
     """The closure equations of a mechanism, and the distance from the intended closed state."""
 
+    @cached_property
+    def _unambiguous(self) -> list[IndexArray]:
+        """Of each loop, the rows whose only zeros are the intended closed configurations.
+
+        Where a closure matches axes, the zeros of its alignments also have them reversed.
+        """
+        out, first = [], 0
+        for loop in self.mechanism.loops:
+            lengths, alignments, joints = loop.rows.blocks
+            own = np.arange(loop.rows.count)
+            turns = own[:0] if len(loop.rows.matched) else own[alignments]
+            out.append(first + np.concatenate([own[lengths], turns, own[joints]]))
+            first += loop.rows.count
+        return out
+
     def mismatch(self, q: FloatArray) -> FloatArray:
         """Residual whose only zeros are the intended closed configurations: distances (in units)
         and differences of axes."""
         g, _ = self.closure(q)
-        parts, at = [], 0
-        for loop in self.mechanism.loops:
-            own = g[at : at + loop.rows.count]
-            at += loop.rows.count
-            parts.append(own[_plain(loop)])
+        parts = []
+        for loop, rows in zip(self.mechanism.loops, self._unambiguous):
+            parts.append(g[rows])
             if len(loop.rows.matched):
-                Ta, Tb = self._anchors(loop)
-                R = Tb.rotation.T @ Ta.rotation
-                parts.append((loop.rows.matched @ R.T - loop.rows.matched).ravel())
+                parts.append((self._axes_in_b(loop) - loop.rows.matched).ravel())
         return np.concatenate(parts)
 
     def mismatch_jacobian(self, q: FloatArray) -> FloatArray:
         """Derivative of :meth:`mismatch` for motions of the joints, in units (entries, nv)."""
         _, G = self.closure(q)
-        parts, at = [], 0
-        for loop in self.mechanism.loops:
-            parts.append(G[at : at + loop.rows.count][_plain(loop)])
-            at += loop.rows.count
+        parts = []
+        for loop, rows in zip(self.mechanism.loops, self._unambiguous):
+            parts.append(G[rows])
             if len(loop.rows.matched):
-                Ta, Tb = self._anchors(loop)
-                joint_a, joint_b = (joint for joint, _ in loop.resolve(self.model))
+                (joint_a, _), (joint_b, in_b) = loop.resolve(self.model)
                 moves = support(self.model, joint_a) - support(self.model, joint_b)
-                turn = Tb.rotation.T @ (world_jacobian(self.data)[3:] * moves * self.unit)
-                R = Tb.rotation.T @ Ta.rotation
-                parts += [-pin.skew(m) @ turn for m in loop.rows.matched @ R.T]
+                into_b = (self.data.oMi[joint_b] * in_b).rotation.T
+                turn = into_b @ (world_jacobian(self.data)[3:] * moves * self.unit)
+                parts += [-pin.skew(axis) @ turn for axis in self._axes_in_b(loop)]
         return np.concatenate(parts)
 
     def loop_residuals(self, q: FloatArray) -> dict[str, tuple[float | None, float | None]]:
@@ -102,27 +103,24 @@ class ClosureProblem(ClosureGeometry):
         g = self.closure(q)[0] * self.row_unit
         angles = row_angles(self.mechanism)
         out = {}
-        at = 0
-        for loop in self.mechanism.loops:
-            own = slice(at, at + loop.rows.count)
-            at = own.stop
-            rows, turned = g[own][_plain(loop)], angles[own][_plain(loop)]
+        for loop, own in zip(self.mechanism.loops, self._unambiguous):
+            rows, turned = g[own], angles[own]
             apart = float(np.linalg.norm(rows[~turned])) if not turned.all() else None
             angle = float(np.linalg.norm(rows[turned])) if turned.any() else None
             if len(loop.rows.matched):
-                Ta, Tb = self._anchors(loop)
-                R = Tb.rotation.T @ Ta.rotation
                 # chord of the unit vectors -> angle, accurate for small ones
-                chords = np.linalg.norm(loop.rows.matched @ R.T - loop.rows.matched, axis=1)
+                chords = np.linalg.norm(self._axes_in_b(loop) - loop.rows.matched, axis=1)
                 angle = float(np.max(2.0 * np.arcsin(np.minimum(0.5 * chords, 1.0))))
             elif len(loop.rows.alignments):
                 angle = float(np.max(np.arcsin(np.minimum(np.abs(rows[turned]), 1.0))))
             out[loop.name] = (apart, angle)
         return out
 
-    def _anchors(self, loop: LoopClosure) -> tuple[pin.SE3, pin.SE3]:
+    def _axes_in_b(self, loop: LoopClosure) -> FloatArray:
+        """The matched axes of a in the frame of b (c, 3), where the rows were evaluated last."""
         a, b = (self.data.oMi[joint] * inside for joint, inside in loop.resolve(self.model))
-        return a, b
+        out: FloatArray = loop.rows.matched @ (b.rotation.T @ a.rotation).T
+        return out
 
     def distance(self, q: FloatArray) -> float:
         """From the start to q: the norm of the joint motions in units."""
@@ -134,14 +132,14 @@ class ClosureProblem(ClosureGeometry):
         configuration.  Those of coupled joints are not among them."""
         coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
         turning = _periodic_coordinates(self.mechanism)
-        in_q: list[int] = []
-        in_v: list[int] = []
-        for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:]):
-            own = np.flatnonzero(turning[joint.idx_v : joint.idx_v + joint.nv])
-            if name not in coupled:
-                in_q += (joint.idx_q + own).tolist()
-                in_v += (joint.idx_v + own).tolist()
-        return np.array(in_q, dtype=int), np.array(in_v, dtype=int)
+        indices = [
+            (joint.idx_q + k, joint.idx_v + k)
+            for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:])
+            for k in range(joint.nv)
+            if turning[joint.idx_v + k] and name not in coupled
+        ]
+        in_q, in_v = np.array(indices, dtype=int).reshape(-1, 2).T
+        return in_q, in_v
 
     @property
     def periodic(self) -> IndexArray:
@@ -340,11 +338,8 @@ def assemble_within_limits(
     limited = _limited(mechanism)
     found: list[FloatArray] = []
     for k in range(STARTS):
-        q = (
-            problem.move(start, rng.uniform(-SPREAD, SPREAD, len(free)), free)
-            if k
-            else start.copy()
-        )
+        spread = rng.uniform(-SPREAD, SPREAD, len(free)) if k else np.zeros(len(free))
+        q = problem.move(start, spread, free)
         low, high = np.full(problem.model.nv, -np.inf), np.full(problem.model.nv, np.inf)
         for _, i, j, least, largest in limited:
             inside = 1e-6 * min(1.0, largest - least)  # the search starts within its bounds

@@ -8,7 +8,7 @@ null vector u of G (the tangents of the branches).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -76,45 +76,50 @@ def assemble_velocity(
     conditions, close = _conditions(mechanism, problem, q, drives)
     fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
 
-    def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
-        """The rates nearest to u that satisfy the conditions; None if there are none."""
+    def onto_rows(
+        u: FloatArray, free: IndexArray, to: _Conditions
+    ) -> tuple[FloatArray, FloatArray]:
+        """The rates nearest to u that satisfy the linear conditions, and the null space of these
+        in the free coordinates."""
         moved = rank_revealing_qr(to.rows[:, free], SINGULAR)
         u = u.copy()
         for _ in range(2):  # the second pass removes the rounding of the first
             u[free] -= moved.solve(to.rows @ u - to.right)
         if np.abs(u).max() <= AT_REST * fastest:
             u[:] = 0.0  # rounding, which has no direction
-        return _onto_tangent(u, free, moved.null, to.curvature)
+        return u, moved.null
+
+    def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
+        """The rates nearest to u that satisfy the conditions; None if there are none."""
+        u, null = onto_rows(u, free, to)
+        return _onto_tangent(u, free, null, to.curvature)
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
         """Rates in units, the largest G v left, and whether a motion has these rates."""
         free = free_coordinates(mechanism, names)
-        u = fit(v / problem.unit, free, conditions)
+        start = v / problem.unit
+        u = fit(start, free, conditions)
         if u is not None and close is not None:
             limit = branch_limit(close, q, u)
             u = u if limit is None else fit(u, free, _on_branch(limit, problem.unit, drives))
+        moves = u is not None
         if u is None:
-            start = v / problem.unit
-            linear = replace(conditions, curvature=lambda u: np.zeros(0))
-            nearest = fit(start, free, linear)
-            closest = start if nearest is None else nearest
-            return start, float(np.abs(G @ closest - prescribed).max()), False
-        return u, float(np.abs(G @ u - prescribed).max()), True
+            u, _ = onto_rows(start, free, conditions)
+        return u, float(np.abs(G @ u - prescribed).max()), moves
 
     # Next to a singular configuration q lies off its branch by round-off over the distance.
     smallest = min(smallest_singular_value(normalised, EXACTLY), 1.0)
     tolerance = max(RATE_TOLERANCE, min(CLOSURE_ROUNDING / smallest, LARGEST_RATE_ERROR))
     tolerance *= max(1.0, fastest)
-
-    def consistent(error: float, moves: bool) -> bool:
-        return error <= tolerance and moves
-
     solved, error, moves = solve(held)
-    if consistent(error, moves):
+    if error <= tolerance and moves:
         return solved * problem.unit
-    guilty = [
-        name for name in held if consistent(*solve([h for h in held if h != name])[1:])
-    ] or list(held)
+    guilty = []
+    for name in held:
+        _, left, moves_without = solve([other for other in held if other != name])
+        if left <= tolerance and moves_without:
+            guilty.append(name)
+    guilty = guilty or list(held)
     driven = quoted(drive.name for drive in mechanism.drives)
     if error > tolerance and not held:
         what = (
@@ -178,8 +183,7 @@ def _conditions(
     left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
 
     def curvature(u: FloatArray) -> FloatArray:
-        bias = np.concatenate([problem.bias(q, u), drives.bias(u)])
-        out: FloatArray = left.T @ bias
+        out: FloatArray = left.T @ np.concatenate([problem.bias(q, u), drives.bias(u)])
         return out
 
     here = _with_drives(normalised, drives, curvature)
@@ -222,12 +226,11 @@ def _onto_tangent(
         return out
 
     rng = np.random.default_rng(0)
-    best = None
+    zeros = []
     for start in (np.zeros(null.shape[1]), *rng.uniform(-2.0, 2.0, (8, null.shape[1]))):
         found = least_squares(
             lambda w: curvature(bent(w)) / size**2, start, xtol=1e-15, ftol=1e-15, gtol=1e-15
         )
-        closer = best is None or np.linalg.norm(found.x) < np.linalg.norm(best)
-        if closer and np.abs(found.fun).max() <= CURVATURE:
-            best = found.x
-    return None if best is None else bent(best)
+        if np.abs(found.fun).max() <= CURVATURE:
+            zeros.append(found.x)
+    return bent(min(zeros, key=np.linalg.norm)) if zeros else None

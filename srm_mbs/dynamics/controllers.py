@@ -59,21 +59,30 @@ def evaluate_controller(
     ControllerError
         If it raises, or returns anything but nv finite numbers.
     """
+    return evaluate_callback("the controller", controller, len(v), "generalised forces", t, q, v)
+
+
+def evaluate_callback(
+    name: str,
+    function: Controller,
+    size: int,
+    values: str,
+    t: float,
+    q: FloatArray,
+    v: FloatArray,
+) -> FloatArray:
+    """The result (size,) of a function of the user, as for :func:`evaluate_controller`; messages
+    name the function and its ``values``."""
     try:
-        tau = np.array(controller(t, q.copy(), v.copy()), dtype=float, order="C")
+        result = np.array(function(t, q.copy(), v.copy()), dtype=float, order="C")
     except Exception as error:
-        raise ControllerError(f"the controller raised {error!r} at t = {t:.6g} s") from error
-    trouble = controller_error(tau, len(v))
-    if trouble:
-        raise ControllerError(
-            f"the controller returned {trouble} at t = {t:.6g} s; it must return {len(v)} finite "
-            "generalised forces"
-        )
-    return tau
-
-
-def controller_error(given: FloatArray, size: int) -> str:
-    """The fault of an array that should be ``size`` finite numbers; empty if it has none."""
-    if given.shape != (size,):
-        return f"an array of shape {given.shape}"
-    return "" if np.isfinite(given).all() else "values that are not finite"
+        raise ControllerError(f"{name} raised {error!r} at t = {t:.6g} s") from error
+    if result.shape != (size,):
+        problem = f"an array of shape {result.shape}"
+    elif not np.isfinite(result).all():
+        problem = "values that are not finite"
+    else:
+        return result
+    raise ControllerError(
+        f"{name} returned {problem} at t = {t:.6g} s; it must return {size} finite {values}"
+    )

@@ -21,14 +21,15 @@ and passes isolated singularities of G B, where P and yhat stay bounded and y ne
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_columns, whiten
-from srm_mbs.dynamics.system import Terms, Zone
+from srm_mbs.dynamics.system import Zone
 from srm_mbs.errors import CallbackError, EvaluationError, InputError
 from srm_mbs.model.dae import SemiExplicitDAE
 
@@ -40,8 +41,8 @@ class ObliqueProjection:
     ----------
     rows : (ny,), columns : (ny,)
         Typical norms of the rows of G and the columns of B.
-    reference : (3,)
-        Typical ``sizes``; 1 if not known.
+    reference
+        Three typical ``sizes``; 1 if not known.
 
     Attributes
     ----------
@@ -51,23 +52,15 @@ class ObliqueProjection:
         The last pivot of the scaled G^T, that of the scaled B, and the smallest cosine in C.
     sigma
         The smallest of these three numbers over its reference.
-    rank
-        Number of directions in use.
+    rank, rank_deficient
+        Number of directions in use, and whether it is less than ny.
     """
 
     def __init__(
-        self,
-        rows: FloatArray,
-        columns: FloatArray,
-        reference: FloatArray | None = None,
+        self, rows: FloatArray, columns: FloatArray, reference: Sequence[float] = (1.0, 1.0, 1.0)
     ) -> None:
-        self.rows, self.columns = rows, columns
-        self.reference = np.ones(3) if reference is None else reference
+        self.rows, self.columns, self.reference = rows, columns, reference
         self.factorisations = 0
-        self.size = len(rows)
-        self.rank = self.size
-        self.sigma = np.inf
-        self.rank_deficient = False
 
     def factor(self, G: FloatArray, B: FloatArray, threshold: float | None) -> None:
         """Factorise G (ny, nx) and B (nx, ny).
@@ -81,19 +74,14 @@ class ObliqueProjection:
             If G or B is not finite, or G B is singular though neither G nor B loses rank.
         """
         self.factorisations += 1
-        ny = self.size
         if not (np.isfinite(G).all() and np.isfinite(B).all()):
             raise EvaluationError("G or B is not finite")
         packed, order, tau, g_pivots = pivoted_qr((G / self.rows[:, None]).T)
         packed_b, _, tau_b, b_pivots = pivoted_qr(B / self.columns)
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold)
-        rank = ny
-        while rank and not (
-            g_pivots[rank - 1] > floor * self.reference[0]
-            and b_pivots[rank - 1] > floor * self.reference[1]
-        ):
-            rank -= 1
-        self.rank, self.rank_deficient = rank, rank < ny
+        used = (g_pivots > floor * self.reference[0]) & (b_pivots > floor * self.reference[1])
+        rank = int(np.flatnonzero(used).max(initial=-1)) + 1
+        self.rank, self.rank_deficient = rank, rank < len(G)
         self.order = order[:rank]
         self.R = packed[:rank, :rank]
         self.Q_G = q_columns(packed, tau, rank)
@@ -104,8 +92,8 @@ class ObliqueProjection:
             raise EvaluationError(
                 "G B is singular though neither G nor B loses rank: x' does not stay bounded there"
             )
-        self.inverse = (right.T / cosines) @ left.T
-        self.sizes = np.array([g_pivots[ny - 1], b_pivots[ny - 1], cosine])
+        self.inverse: FloatArray = (right.T / cosines) @ left.T
+        self.sizes = np.array([g_pivots[-1], b_pivots[-1], cosine])
         self.sigma = float((self.sizes / self.reference).min())
 
     def lift(self, residual: FloatArray) -> FloatArray:
@@ -113,30 +101,30 @@ class ObliqueProjection:
         if self.rank == 0:
             return np.zeros(self.Q_B.shape[0])
         scaled = (residual / self.rows)[self.order]
-        lifted: FloatArray = self.Q_B @ (self.inverse @ whiten(self.R, scaled))
-        return lifted
+        return self.Q_B @ (self.inverse @ whiten(self.R, scaled))
 
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nx,)."""
-        projected: FloatArray = self.Q_B @ (self.inverse @ (self.Q_G.T @ w))
-        return projected
+        return self.Q_B @ (self.inverse @ (self.Q_G.T @ w))
 
 
 class DaeTerms:
-    """Terms of one evaluated point."""
+    """Terms of one evaluated point, with ``predicted``, the yhat (nx,) of the zone."""
 
-    def __init__(self, system: DaeSystem) -> None:
+    held = False
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        t: float,
+        x: FloatArray,
+        functions: tuple[FloatArray, FloatArray, FloatArray],
+        predicted: FloatArray | None,
+    ) -> None:
         self._system = system
         self._p = system.projection
-        self.t = 0.0
-        self.x = self.f = self.B = self.G = np.zeros(0)
-        self.predicted: FloatArray | None = None
-        self._g: FloatArray | None = None
-
-    def load(self, t: float, x: FloatArray, f: FloatArray, B: FloatArray, G: FloatArray) -> None:
-        """The values at a new point."""
-        self.t, self.x, self.f, self.B, self.G = t, x, f, B, G
-        self._g = None
+        self.t, self.x, self.predicted = t, x, predicted
+        self.f, self.B, self.G = functions
 
     @property
     def sigma(self) -> float:
@@ -150,17 +138,12 @@ class DaeTerms:
     def rank_deficient(self) -> bool:
         return self._p.rank_deficient
 
-    @property
-    def held(self) -> bool:
-        return False
-
     def normals(self) -> FloatArray:
         return np.zeros((len(self.x), 0))
 
+    @cached_property
     def _residual(self) -> FloatArray:
-        if self._g is None:
-            self._g = self._system.call("g", self.t, self.x)
-        return self._g
+        return self._system.call("g", self.t, self.x)
 
     def _gamma(self) -> FloatArray:
         return self.G @ self.f + self._system.time_derivative(self.t, self.x)
@@ -192,10 +175,10 @@ class DaeTerms:
         return 0.0
 
     def correction(self) -> FloatArray:
-        return self._p.lift(self._residual())
+        return self._p.lift(self._residual)
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
-        g = self._residual()
+        g = self._residual
         if self._system.carries_yhat:
             yhat = self._completed(self._p.project(previous) + self._p.lift(g) / eps)
             return self.f - yhat, yhat
@@ -269,7 +252,6 @@ class DaeSystem:
         self.multiplier_size = self.nx if self.carries_yhat else self.ny
         self._check_values(t0, x0)
         self.projection = self._measured(t0, x0)
-        self._terms = DaeTerms(self)
         self._check_jacobian(t0, x0)
         self.predicts = self._time_derivative_known(t0, x0, t_end)
 
@@ -382,8 +364,7 @@ class DaeSystem:
                 element="G",
                 remedy="Give equations of index 2: G B regular but for isolated points",
             )
-        reference = np.median(sizes_seen, axis=0)
-        return ObliqueProjection(rows, columns, reference)
+        return ObliqueProjection(rows, columns, np.median(sizes_seen, axis=0).tolist())
 
     def _check_jacobian(self, t: float, x: FloatArray) -> None:
         """Refuse a G that is not dg/dx: everything else would look right and be wrong."""
@@ -439,24 +420,22 @@ class DaeSystem:
 
     # --- the contract -------------------------------------------------------------------------
 
-    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> DaeTerms:
         """Factorise G and B at ``state``; see :class:`~srm_mbs.dynamics.system.System`."""
         self.evaluations += 1
         if not np.isfinite(state).all():
             raise EvaluationError("the state is not finite")
         f, B, G = (self.call(name, t, state) for name in ("f", "B", "G"))
         self.projection.factor(G, B, None if zone is None else zone.threshold)
-        terms = self._terms
-        terms.load(t, state, f, B, G)
-        terms.predicted = None
+        predicted = None
         if self.projection.rank_deficient and zone is not None:
-            terms.predicted = zone.predict(t)
-            if terms.predicted is None:
+            predicted = zone.predict(t)
+            if predicted is None:
                 raise EvaluationError(
                     "the solution stays next to a singularity of G B for longer than its "
                     "multiplier can be predicted"
                 )
-        return terms
+        return DaeTerms(self, t, state, (f, B, G), predicted)
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """x + dx."""
@@ -516,7 +495,7 @@ class DaeSystem:
 
     def multiplier_at(self, t: float, state: FloatArray) -> FloatArray:
         """y (ny,) by the exact prediction; of least norm where B loses rank."""
-        terms: Any = self.evaluate(t, state)
+        terms = self.evaluate(t, state)
         return self.factor_of(terms.multiplier(), terms.B)
 
     def uncarried(self, t: float, state: FloatArray, carried: FloatArray) -> FloatArray:

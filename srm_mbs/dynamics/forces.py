@@ -15,9 +15,10 @@ the user.  :class:`ForceKinematics` has all elements of a mechanism.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from math import sqrt
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -30,8 +31,8 @@ from srm_mbs.dynamics.constraints.rows import (
     support,
     world_jacobian,
 )
-from srm_mbs.dynamics.controllers import controller_error
-from srm_mbs.errors import ControllerError, EvaluationError
+from srm_mbs.dynamics.controllers import evaluate_callback
+from srm_mbs.errors import EvaluationError
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.forces import (
     Bushing,
@@ -47,33 +48,37 @@ from srm_mbs.model.laws import Law
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 
-class Evaluator(Protocol):
+class Evaluator(ABC):
     """One element, resolved against a model.  ``data`` holds placements, velocities and J."""
 
+    @abstractmethod
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         """Add the element's generalised forces at t (s) to ``tau`` (nv,)."""
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
-        """Its potential energy (J); ``data`` need hold the placements only."""
+        """Its potential energy (J), if it has one; ``data`` need hold the placements only."""
+        return 0.0
 
-    def constants(self) -> dict[str, Any]:
-        """Constants for the compiled kernel; ``kind`` numbers the kinds as forces.hpp does."""
+    @abstractmethod
+    def constants(self) -> dict[str, Any] | None:
+        """Constants for the compiled kernel, of which ``kind`` numbers the kinds as forces.hpp
+        does; None for functions of the user, which the kernel calls."""
 
 
-class HeldAnchor:
-    """An anchor: a frame on a body."""
+class ResolvedAnchor:
+    """An anchor as a frame on the body of a joint, 0 for the world."""
 
     def __init__(self, model: pin.Model, anchor: Anchor) -> None:
-        self.joint, self.inside = anchor.resolve(model)
+        self.joint, self.in_joint = anchor.resolve(model)
         self.support = support(model, self.joint)
 
     def constants(self) -> tuple[int, FloatArray]:
         """Joint, and placement in its axes as numbers, for the compiled kernel."""
-        return self.joint, placement_numbers(self.inside)
+        return self.joint, placement_numbers(self.in_joint)
 
     def placement(self, data: pin.Data) -> pin.SE3:
-        """Of the frame in the world."""
-        return data.oMi[self.joint] * self.inside if self.joint else self.inside
+        """Placement of the frame in the world."""
+        return data.oMi[self.joint] * self.in_joint if self.joint else self.in_joint
 
     def velocity(self, data: pin.Data) -> pin.Motion:
         """Spatial velocity of the body, in world axes at the world origin."""
@@ -81,22 +86,32 @@ class HeldAnchor:
         return data.oMi[joint].act(data.v[joint]) if joint else pin.Motion.Zero()
 
 
-def about_origin(force: FloatArray, moment: FloatArray, point: FloatArray) -> FloatArray:
-    """The wrench (6,) of a force at ``point`` and a moment, about the world origin."""
-    return np.concatenate([force, moment + cross(point, force)])
+def add_wrench(
+    tau: FloatArray,
+    data: pin.Data,
+    support: FloatArray,
+    force: FloatArray,
+    moment: FloatArray,
+    point: FloatArray,
+) -> None:
+    """Add J^T W to ``tau`` (nv,) on the joints of ``support`` (nv,), of a force (3,) at ``point``
+    (3,) and a moment (3,), all in world axes."""
+    wrench = np.concatenate([force, moment + cross(point, force)])
+    tau += (world_jacobian(data).T @ wrench) * support
 
 
 def point_velocity(body: pin.Motion, point: FloatArray) -> FloatArray:
     """Velocity (3,) of ``point``, in world axes, that moves with ``body``."""
-    out: FloatArray = body.linear + cross(body.angular, point)
-    return out
+    return body.linear + cross(body.angular, point)  # type: ignore[no-any-return]
 
 
-class OverTime:
-    """Numbers (n,) that laws multiply over time: none, one for all of them, or one for each."""
+class ValuesOverTime:
+    """Numbers (n,) that laws multiply over time: no law, one for all of them, or one for each."""
 
-    def __init__(self, numbers: FloatArray, law: Law | Sequence[Law] | None) -> None:
-        self._numbers = numbers
+    def __init__(
+        self, numbers: Sequence[float] | FloatArray, law: Law | Sequence[Law] | None
+    ) -> None:
+        self._numbers = np.array(numbers, dtype=float)
         laws = () if law is None else (law,) if isinstance(law, Law) else law
         self._curves = [each.curve() for each in laws]
 
@@ -110,15 +125,15 @@ class OverTime:
     def constants(self) -> dict[str, Any]:
         """Numbers and curves, for the compiled kernel."""
         curves = [curve.constants() for curve in self._curves]
-        return {"numbers": self._numbers.astype(float), "curves": curves}
+        return {"numbers": self._numbers, "curves": curves}
 
 
-class SpringDamperEvaluator:
+class SpringDamperEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.SpringDamper`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: SpringDamper) -> None:
         self.name = force.name
-        self.a, self.b = HeldAnchor(model, force.a), HeldAnchor(model, force.b)
+        self.a, self.b = ResolvedAnchor(model, force.a), ResolvedAnchor(model, force.b)
         self.support = self.a.support - self.b.support
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_length = float(force.rest_length or 0.0)
@@ -143,7 +158,7 @@ class SpringDamperEvaluator:
             # Points that meet move along the line that joins them.
             along = apart * ((apart / length) @ rate / length) if length else rate
             force -= self.damping * along
-        tau += (world_jacobian(data).T @ about_origin(force, np.zeros(3), at_a)) * self.support
+        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         apart = self.a.placement(data).translation - self.b.placement(data).translation
@@ -161,13 +176,13 @@ class SpringDamperEvaluator:
         }
 
 
-class WrenchEvaluator:
+class WrenchEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.Wrench`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Wrench) -> None:
-        self.at = HeldAnchor(model, force.at)
+        self.at = ResolvedAnchor(model, force.at)
         self.turns = force.frame == "link"
-        self.wrench = OverTime(np.array([*force.force, *force.moment]), force.law)
+        self.wrench = ValuesOverTime([*force.force, *force.moment], force.law)
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         at = self.at.placement(data)
@@ -175,11 +190,7 @@ class WrenchEvaluator:
         force, moment = numbers[:3], numbers[3:]
         if self.turns:
             force, moment = at.rotation @ force, at.rotation @ moment
-        wrench = about_origin(force, moment, at.translation)
-        tau += (world_jacobian(data).T @ wrench) * self.at.support
-
-    def energy(self, data: pin.Data, q: FloatArray) -> float:
-        return 0.0
+        add_wrench(tau, data, self.at.support, force, moment, at.translation)
 
     def constants(self) -> dict[str, Any]:
         return {
@@ -190,14 +201,14 @@ class WrenchEvaluator:
         } | self.wrench.constants()
 
 
-class BushingEvaluator:
+class BushingEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Bushing) -> None:
-        self.a, self.b = HeldAnchor(model, force.a), HeldAnchor(model, force.b)
+        self.a, self.b = ResolvedAnchor(model, force.a), ResolvedAnchor(model, force.b)
         self.support = self.a.support - self.b.support
-        self.stiffness, self.damping = np.array(force.stiffness), np.array(force.damping)
-        self.damped = bool(np.any(self.damping))
+        self.stiffness = np.array(force.stiffness, dtype=float)
+        self.damping = np.array(force.damping, dtype=float)
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         Ta, Tb = self.a.placement(data), self.b.placement(data)
@@ -207,15 +218,15 @@ class BushingEvaluator:
         L = pin.Jlog3(relative.rotation)
         force = self.stiffness[:3] * relative.translation
         moment = self.stiffness[3:] * turn
-        if self.damped:
+        if self.damping.any():
             # The motion relative to b's axes and origin.
             W = self.a.velocity(data) - self.b.velocity(data)
             rate = Tb.rotation.T @ point_velocity(W, Ta.translation)
             spin = L.T @ (Tb.rotation.T @ W.angular)
             force = force + self.damping[:3] * rate
             moment = moment + self.damping[3:] * spin
-        wrench = about_origin(-(Tb.rotation @ force), -(Tb.rotation @ (L @ moment)), Ta.translation)
-        tau += (world_jacobian(data).T @ wrench) * self.support
+        force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
+        add_wrench(tau, data, self.support, force, moment, Ta.translation)
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         relative = self.b.placement(data).actInv(self.a.placement(data))
@@ -228,29 +239,26 @@ class BushingEvaluator:
             "a": self.a.constants(),
             "b": self.b.constants(),
             "support": self.support,
-            "numbers": np.concatenate([self.stiffness, self.damping]).astype(float),
+            "numbers": np.concatenate([self.stiffness, self.damping]),
         }
 
 
-class JointTorqueEvaluator:
+class JointTorqueEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.JointTorque`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: JointTorque) -> None:
         joint = model.joints[model.getJointId(force.joint)]
         self.own = slice(joint.idx_v, joint.idx_v + joint.nv)
-        self.torque = OverTime(np.atleast_1d(np.array(force.torque, dtype=float)), force.law)
+        self.torque = ValuesOverTime(np.array(force.torque, dtype=float, ndmin=1), force.law)
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         tau[self.own] += self.torque.at(t)
-
-    def energy(self, data: pin.Data, q: FloatArray) -> float:
-        return 0.0
 
     def constants(self) -> dict[str, Any]:
         return {"kind": 1, "in_v": self.own.start} | self.torque.constants()
 
 
-class TorsionSpringEvaluator:
+class TorsionSpringEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.TorsionSpring`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: TorsionSpring) -> None:
@@ -277,7 +285,7 @@ class TorsionSpringEvaluator:
         }
 
 
-class LimitSpringEvaluator:
+class LimitSpringEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.LimitSpring`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: LimitSpring) -> None:
@@ -316,38 +324,24 @@ class LimitSpringEvaluator:
         }
 
 
-class _UserForceEvaluator:
+class _UserForceEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.UserForce`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: UserForce) -> None:
-        self.name, self.function = force.name, force.function
-        self.at = None if force.at is None else HeldAnchor(model, force.at)
+        self.name, self.function = f"the force {force.name!r}", force.function
+        self.at = None if force.at is None else ResolvedAnchor(model, force.at)
         self.size = model.nv if force.at is None else 6
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
-        try:
-            given = np.asarray(self.function(t, q.copy(), v.copy()), dtype=float)
-        except Exception as error:
-            raise ControllerError(
-                f"the force {self.name!r} raised {error!r} at t = {t:.6g} s"
-            ) from error
-        trouble = controller_error(given, self.size)
-        if trouble:
-            raise ControllerError(
-                f"the force {self.name!r} returned {trouble} at t = {t:.6g} s; it must return "
-                f"{self.size} finite numbers"
-            )
+        given = evaluate_callback(self.name, self.function, self.size, "numbers", t, q, v)
         if self.at is None:
             tau += given
             return
-        wrench = about_origin(given[:3], given[3:], self.at.placement(data).translation)
-        tau += (world_jacobian(data).T @ wrench) * self.at.support
+        at = self.at.placement(data).translation
+        add_wrench(tau, data, self.at.support, given[:3], given[3:], at)
 
-    def energy(self, data: pin.Data, q: FloatArray) -> float:
-        return 0.0
-
-    def constants(self) -> dict[str, Any]:
-        raise TypeError("the compiled kernel calls back for it")
+    def constants(self) -> None:
+        return None
 
 
 _EVALUATORS = {
@@ -368,13 +362,7 @@ def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
 
 
 class ForceKinematics:
-    """All force elements of a mechanism.
-
-    Parameters
-    ----------
-    model, forces
-        The tree and its elements.
-    """
+    """All force elements of a mechanism: ``forces`` on the tree ``model``."""
 
     def __init__(self, model: pin.Model, forces: Sequence[ForceElement]) -> None:
         self._model, self._nv = model, model.nv
@@ -422,8 +410,4 @@ class ForceKinematics:
 
     def constants(self) -> list[dict[str, Any]]:
         """Constants of each element for the compiled kernel, without the functions of the user."""
-        return [
-            element.constants()
-            for element in self._elements
-            if not isinstance(element, _UserForceEvaluator)
-        ]
+        return [own for element in self._elements if (own := element.constants()) is not None]

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,7 @@ SERIES = _bernoulli_terms(14)
 
 @dataclass(frozen=True)
 class GroupJoint:
-    """A joint whose configuration is a non-commutative Lie group."""
+    """A joint whose configurations are a Lie group that does not commute."""
 
     group: str
     """``so3``, ``se3`` or ``se2``."""
@@ -62,24 +61,16 @@ class GroupJoint:
     def ad(self, u: FloatArray) -> FloatArray:
         """Matrix of w -> [u, w] in Pinocchio's order (linear, angular)."""
         if self.group == "so3":
-            return _skew(u)
-        if self.group == "se2":
-            x, y, w = u
-            return np.array([[0.0, -w, y], [w, 0.0, -x], [0.0, 0.0, 0.0]])
-        out = np.zeros((6, 6))
-        out[:3, :3] = out[3:, 3:] = _skew(u[3:])
-        out[:3, 3:] = _skew(u[:3])
-        return out
+            return pin.skew(u)  # type: ignore[no-any-return]
+        if self.group == "se3":
+            return pin.Motion(u).action  # type: ignore[no-any-return]
+        x, y, w = u
+        return np.array([[0.0, -w, y], [w, 0.0, -x], [0.0, 0.0, 0.0]])
 
     def rotation(self, v: FloatArray) -> float:
         """Size of the joint's angular part of a whole tangent vector v (nv,): rad or rad/s."""
         angular = {"so3": 0, "se3": 3, "se2": 2}[self.group]
         return float(np.linalg.norm(v[self.start + angular : self.start + self.size]))
-
-
-def _skew(w: FloatArray) -> FloatArray:
-    x, y, z = w
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def group_joints(model: pin.Model) -> tuple[GroupJoint, ...]:
@@ -142,7 +133,7 @@ def dexp_inverse(joint: GroupJoint, u: FloatArray, v: FloatArray) -> FloatArray:
     """
     ad = joint.ad(u)
     w = ad @ v
-    out: FloatArray = v + 0.5 * w
+    out = v + 0.5 * w
     for coefficient in SERIES:
         w = ad @ w
         term = coefficient * w
@@ -177,7 +168,7 @@ def _angle_pairs(mechanism: MechanismData) -> IndexArray:
 
 @per_start
 def _caps(mechanism: Mechanism) -> FloatArray:
-    """Largest size (2 nv,) that a component of a state counts as in :meth:`Manifold.magnitudes`."""
+    """Largest scale (2 nv,) of a component of a state in :meth:`Manifold.state_scale`."""
     unit = mechanism.structure.units.coordinate
     return np.concatenate([unit, np.full(mechanism.model.nv, np.inf)])
 
@@ -191,21 +182,10 @@ class Manifold:
         self.nq, self.nv = model.nq, model.nv
         self.tangent_size = 2 * self.nv
         self._groups = _groups(mechanism)
+        self._planar = [joint for joint in self._groups if joint.group == "se2"]
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate
         self._position_of = _vector_coordinates(mechanism)
-
-    @cached_property
-    def _caps(self) -> FloatArray:
-        return _caps(self.mechanism)
-
-    @cached_property
-    def _planar(self) -> tuple[GroupJoint, ...]:
-        return tuple(joint for joint in self._groups if joint.group == "se2")
-
-    @cached_property
-    def _wrapped_angles(self) -> IndexArray:
-        return _angle_pairs(self.mechanism)
 
     def chart_constants(self) -> dict[str, Any]:
         """Constants for the compiled kernel, independent of the start."""
@@ -213,7 +193,7 @@ class Manifold:
             "position_of": [int(i) for i in self._position_of],
             "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
             "series": np.array(SERIES),
-            "turning": [int(i) for i in self._wrapped_angles],
+            "turning": [int(i) for i in _angle_pairs(self.mechanism)],
             "largest_rotation": LARGEST_ROTATION,
             "farthest_node": FARTHEST_NODE,
             "rotation_per_step": ROTATION_PER_STEP,
@@ -257,7 +237,7 @@ class Manifold:
         moved = self.retract(start, delta)
         delta[: self.nv] += pin.difference(self.model, moved[:nq], end[:nq])
         if near is not None:
-            turning = self._wrapped_angles
+            turning = _angle_pairs(self.mechanism)
             turns = np.round((near[turning] - delta[turning]) / (2.0 * np.pi))
             delta[turning] += 2.0 * np.pi * turns
         return delta
@@ -276,7 +256,7 @@ class Manifold:
 
     def rate_change(self, delta: FloatArray) -> FloatArray:
         """(dv, 0); see :class:`~srm_mbs.dynamics.system.System`."""
-        out: FloatArray = np.zeros(delta.shape)
+        out = np.zeros(delta.shape)
         out[..., : self.nv] = delta[..., self.nv :]
         return out
 
@@ -290,8 +270,7 @@ class Manifold:
         Angles are capped at 1 rad so that the accuracy does not decay with the number of turns.
         """
         if self._flat:
-            sizes: FloatArray = np.minimum(np.abs(state), self._caps)
-            return sizes
+            return np.minimum(np.abs(state), _caps(self.mechanism))
         q, v = self.split(state)
         position = self._unit.copy()
         vector = self._position_of >= 0

@@ -13,7 +13,7 @@ from srm_mbs.dynamics.constraints.mobility import Mobility, mobility
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.constraints.structure import Structure, structure_of
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.mechanism import MechanismData, per_model, per_start
+from srm_mbs.model.mechanism import MechanismData, per_start
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,13 +53,13 @@ class Mechanism(MechanismData):
 
     @property
     def structure(self) -> Structure:
-        """Rank, redundancy and scales of the closures, by the walk of docs/notation.md."""
+        """Rank, redundancy and scales of the closures (docs/notation.md, "Load-time analysis")."""
         return structure_of(self)
 
     @property
     def mobility(self) -> Mobility:
-        """Gruebler counts against the true rank, redundant rows, joints that are stuck or idle."""
-        return _mobility(self)
+        """Gruebler's count and the rank, redundant rows, joints that are stuck or idle."""
+        return mobility(self)
 
     @property
     def initial_errors(self) -> tuple[FloatArray, FloatArray]:
@@ -110,11 +110,6 @@ class Mechanism(MechanismData):
         super().__setstate__(state)
         if state["structure"] is not None:
             structure_of.keep(self, state["structure"])
-
-
-@per_model
-def _mobility(mechanism: Mechanism) -> Mobility:
-    return mobility(mechanism)
 
 
 @per_start

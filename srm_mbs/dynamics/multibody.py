@@ -24,12 +24,8 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import (
-    GRAPH_ORDER_ABOVE,
-    coordinate_parents,
-    graph_order,
-)
-from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
+from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.rows import COINCIDENT
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
@@ -78,33 +74,43 @@ class OpenTerms:
 
 
 class ClosedTerms:
-    """Terms of one stage of a closed-loop mechanism."""
+    """Terms of one stage of a closed-loop mechanism, which the factorisation of the system has.
 
-    def __init__(
-        self,
-        projection: Projection,
-        loops: LoopKinematics | DrivenKinematics,
-        residual_scale: FloatArray,
-    ) -> None:
-        self._p = projection
-        self._loops = loops
-        self._target_rate = loops.target_rate if isinstance(loops, DrivenKinematics) else None
-        self._residual_scale = residual_scale
-        self.v = np.zeros(0)
-        self.predicted: FloatArray | None = None
-        self.sigma = projection.sigma
-        self.rank_deficient = projection.rank_deficient
+    Parameters
+    ----------
+    system
+        The mechanism, with the rows and the factorisation at the stage.
+    v : (nv,)
+        Velocity.
+    predicted : (nv,) or None
+        yhat of the zone, of which the part of dropped rows is used.
+    """
+
+    def __init__(self, system: ClosedSystem, v: FloatArray, predicted: FloatArray | None) -> None:
+        self._p = system.projection
+        self._loops = system.loops
+        self._residual_scale = system.residual_scale
+        self._driven = bool(system.mechanism.drives)
+        self._v, self._predicted = v, predicted
+
+    @property
+    def sigma(self) -> float:
+        return self._p.sigma
 
     @property
     def rank(self) -> int:
         return self._p.rank
 
+    @property
+    def rank_deficient(self) -> bool:
+        return self._p.rank_deficient
+
     def _completed(self, white: FloatArray) -> FloatArray:
         """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
-        if self.predicted is None:
+        if self._predicted is None:
             return white
         p = self._p
-        prediction = p.U @ self.predicted
+        prediction = p.U @ self._predicted
         return white + prediction - p.Q @ (p.Q.T @ prediction)
 
     @property
@@ -112,16 +118,14 @@ class ClosedTerms:
         return self._p.held is not None
 
     def normals(self) -> FloatArray:
-        if self._target_rate is not None:
-            return np.zeros((self.v.size, 0))
-        return self._p.normals()
+        return np.zeros((self._v.size, 0)) if self._driven else self._p.normals()
 
     def _white_multiplier(self) -> FloatArray:
         return self._completed(self._p.white_multiplier)
 
     def rate(self) -> FloatArray:
         p = self._p
-        return np.concatenate([self.v, p.unwhiten(p.white_force - self._white_multiplier())])
+        return np.concatenate([self._v, p.unwhiten(p.white_force - self._white_multiplier())])
 
     def multiplier(self) -> FloatArray:
         return self._p.unwhiten(self._white_multiplier())
@@ -136,9 +140,7 @@ class ClosedTerms:
         """L^T (P w - s E s'): with w = v and s = 1 that of the rates that violate G v = s'."""
         p = self._p
         white = p.white_project(w)
-        return (
-            white if self._target_rate is None else white - s * p.normal(self._target_rate[p.order])
-        )
+        return white - s * p.normal(self._loops.target_rate[p.order]) if self._driven else white
 
     def constraint_residual(self) -> float:
         return float(np.abs(self._loops.g * self._residual_scale).max())
@@ -146,17 +148,14 @@ class ClosedTerms:
     def correction(self) -> FloatArray:
         p = self._p
         position = p.normal(self._loops.g[p.order])
-        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self.v))])
+        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self._v))])
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         p = self._p
         position = p.unwhiten(p.normal(self._loops.g[p.order]))
-        white = self._completed(self._white_rates(previous + self.v / eps, 1.0 / eps))
-        rate = np.concatenate([self.v - position / eps, p.unwhiten(p.white_force - white)])
+        white = self._completed(self._white_rates(previous + self._v / eps, 1.0 / eps))
+        rate = np.concatenate([self._v - position / eps, p.unwhiten(p.white_force - white)])
         return rate, p.unwhiten(white)
-
-
-_NO_ROWS = np.zeros(0)
 
 
 class Mechanics(Manifold):
@@ -171,9 +170,8 @@ class Mechanics(Manifold):
         self.multiplier_size = self.nv
         self.evaluations = 0
         self._controller = controller
-        damping, friction = self.model.damping, self.model.friction
-        self._damping = damping.copy() if np.count_nonzero(damping) else None
-        self._friction = friction.copy() if np.count_nonzero(friction) else None
+        self._damping: FloatArray = self.model.damping.copy()
+        self._friction: FloatArray = self.model.friction.copy()
         self._friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
@@ -228,28 +226,18 @@ class Mechanics(Manifold):
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
-        if self._damping is None:
-            return np.zeros(v.shape)
-        out: FloatArray = -self._damping * v
-        return out
+        return -self._damping * v if self._damping.any() else np.zeros(v.shape)
 
     def friction_force(self, v: FloatArray) -> FloatArray:
         """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
-        if self._friction is None:
+        if not self._friction.any():
             return np.zeros(v.shape)
-        out: FloatArray = -self._friction * np.tanh(v / self._friction_speed)
-        return out
+        return -self._friction * np.tanh(v / self._friction_speed)
 
-    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray | None:
-        """Controller, joint damping and joint friction (nv,); None if there is none of them."""
-        force = None if self._damping is None else self.damping_force(v)
-        if self._friction is not None:
-            rubbing = self.friction_force(v)
-            force = rubbing if force is None else force + rubbing
-        if self._controller is None:
-            return force
-        tau = self.controlled_force(t, q, v)
-        return tau if force is None else tau + force
+    def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Controller, joint damping and joint friction (nv,)."""
+        passive = self.damping_force(v) + self.friction_force(v)
+        return self.controlled_force(t, q, v) + passive
 
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel
@@ -260,9 +248,9 @@ class Mechanics(Manifold):
         """Those among :meth:`constants` that depend on the start, or that the model may change."""
         return {
             "unit": self._unit,
-            "gap_scale": _NO_ROWS,
-            "damping": self._damping,
-            "friction": self._friction,
+            "gap_scale": np.zeros(0),
+            "damping": self._damping if self._damping.any() else None,
+            "friction": self._friction if self._friction.any() else None,
         }
 
     def constants_of_model(self) -> dict[str, Any]:
@@ -298,7 +286,6 @@ class Mechanics(Manifold):
         return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 
-_WORLD = pin.Convention.WORLD
 _OVERFLOW = 1e100
 """Largest |x_i| of a state above which products of its rates may overflow."""
 
@@ -312,7 +299,6 @@ class OpenSystem(Mechanics):
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
-        self._zero = np.zeros(self.nv)
         self._terms = OpenTerms(self.nv)
 
     def constraint_residual(self, t: float, state: FloatArray) -> float:
@@ -332,41 +318,23 @@ class OpenSystem(Mechanics):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            elements = self._forces.generalised(self.data, q, v, t)
-            force = elements if force is None else force + elements
+            force = force + self._forces.generalised(self.data, q, v, t)
         rate = self._terms.rate()
         rate[: self.nv] = v
-        rate[self.nv :] = pin.aba(
-            self.model, self.data, q, v, self._zero if force is None else force
-        )
+        rate[self.nv :] = pin.aba(self.model, self.data, q, v, force)
         if not np.isfinite(rate).all():
             raise EvaluationError("the acceleration is not finite")
         return self._terms
 
 
 @per_model
-def _kept_rows(mechanism: Mechanism) -> LoopKinematics:
-    """The kept, scaled rows of the closures."""
-    structure = mechanism.structure
-    return LoopKinematics(
-        mechanism.model,
-        mechanism.loops,
-        structure.row_scale,
-        structure.kept,
-        structure.eliminations,
-    )
-
-
-def _rows_in_use(mechanism: Mechanism) -> LoopKinematics | DrivenKinematics:
-    """The kept, scaled rows of closures and drives, with memory of their own."""
-    if not mechanism.drives:
-        return _kept_rows(mechanism).copy_workspace()
+def _rows_in_use(mechanism: Mechanism) -> DrivenKinematics:
+    """The kept, scaled rows of closures and drives; systems copy their workspace."""
     structure = mechanism.structure
     return DrivenKinematics(
         mechanism.model,
         mechanism.loops,
         mechanism.drives,
-        mechanism.drive_curves,
         structure.row_scale,
         structure.kept,
         structure.eliminations,
@@ -375,9 +343,7 @@ def _rows_in_use(mechanism: Mechanism) -> LoopKinematics | DrivenKinematics:
 
 @per_model
 def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
-    """The rows in use along the graph of the loops, if there are many coordinates."""
-    if mechanism.model.nv <= GRAPH_ORDER_ABOVE:  # every pivot order is cheap
-        return ()
+    """The rows in use along the graph of the loops; () for few coordinates."""
     return graph_order(_rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
 
 
@@ -397,37 +363,24 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
-        self._residual_scale = _residual_scale(mechanism)
+        self.residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
 
     @cached_property
-    def loops(self) -> LoopKinematics | DrivenKinematics:
+    def loops(self) -> DrivenKinematics:
         """The rows of closures and drives that are in use, with memory of their own."""
-        return _rows_in_use(self.mechanism)
-
-    @cached_property
-    def _driven(self) -> DrivenKinematics | None:
-        """Those rows, if there are drives."""
-        return self.loops if isinstance(self.loops, DrivenKinematics) else None
-
-    @cached_property
-    def _mass_matrix(self) -> FloatArray:
-        M: FloatArray = self.data.M  # a view on what crba writes
-        return M
-
-    @cached_property
-    def _terms(self) -> ClosedTerms:
-        return ClosedTerms(self.projection, self.loops, self._residual_scale)
+        curves = self.mechanism.drive_curves
+        return _rows_in_use(self.mechanism).copy_workspace().follow(curves)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
         own = super().constants()
-        return own if self._driven is None else own | {"drives": self._driven.drive_constants()}
+        return own | {"drives": self.loops.drive_constants()} if self.mechanism.drives else own
 
     def constants_of_start(self) -> dict[str, Any]:
         """As for open mechanisms, and the scales of the closures."""
-        return super().constants_of_start() | {"gap_scale": self._residual_scale}
+        return super().constants_of_start() | {"gap_scale": self.residual_scale}
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""
@@ -475,58 +428,43 @@ class ClosedSystem(Mechanics):
         t = min(max(t, self._first), self._last)
         model, data, nq = self.model, self.data, self.nq
         q, v = state[:nq], state[nq:]
-        pin.crba(model, data, q, _WORLD)
-        f = -pin.nonLinearEffects(model, data, q, v)
-        force = self.applied_force(t, q, v)
-        if force is not None:
-            f += force
+        pin.crba(model, data, q, pin.Convention.WORLD)
+        f = self.applied_force(t, q, v) - pin.nonLinearEffects(model, data, q, v)
         if self._forces is not None:
             f += self._forces.generalised(data, q, v, t)
         loops = self.loops
-        self._update(t, q)
+        loops.update(data, q)
+        loops.move_to(t)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
-        projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
-        terms = self._terms
-        terms.v = v
-        terms.sigma = projection.sigma
-        terms.rank_deficient = projection.rank_deficient
-        terms.predicted = None
+        projection.factor(data.M, loops.G, f, loops.bias, threshold)
+        predicted = None
         if projection.rank_deficient and zone is not None:
-            terms.predicted = zone.predict(t)
-            if terms.predicted is None:
+            predicted = zone.predict(t)
+            if predicted is None:
                 if zone.normals is None:
                     raise EvaluationError(
                         "the motion stays next to a singular configuration with too little "
                         "momentum to tell its branch"
-                        if self._driven is None
+                        if not self.mechanism.drives
                         else "the drives keep the motion next to a singular configuration, or "
                         "lead to one that it cannot pass"
                     )
                 projection.hold(zone.normals)
-        return terms
+        return ClosedTerms(self, v, predicted)
 
     def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""
         g, _ = self.residuals(state, t)
-        return float(np.max(np.abs(g) * self._residual_scale))
-
-    def _update(self, t: float, q: FloatArray, with_bias: bool = True) -> None:
-        """The rows at t and q, for which ``data`` has the kinematics."""
-        self.loops.update(self.data, q, with_bias)
-        if self._driven is not None:
-            self._driven.move_to(t)
+        return float(np.max(np.abs(g) * self.residual_scale))
 
     def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Scaled g - s (m,) and G v - s' (m,) of the kept rows at the time t (s)."""
         q, v = self.split(state)
-        pin.crba(self.model, self.data, q, _WORLD)
-        self._update(t, q, with_bias=False)
-        rates = self.loops.G @ v
-        return (
-            self.loops.g.copy(),
-            rates if self._driven is None else rates - self._driven.target_rate,
-        )
+        rows = self.loops
+        rows.evaluate(self.model, self.data, q)
+        rows.move_to(t)
+        return rows.g.copy(), rows.G @ v - rows.target_rate
 
 
 def make_system(

@@ -1,11 +1,12 @@
 """Units of coordinates, rows and rates.
 
-Tolerances and step rules count in them, so that the same mechanism in millimetres, with other
-masses or on another time scale, takes the same steps.
+Tolerances and rules for steps count in these units, so that the same mechanism in millimetres, with
+other masses or on another time scale, takes the same steps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,11 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
+from srm_mbs.dynamics.constraints.rheonomic import driven_closures
 from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.errors import EvaluationError
-from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 RELATIVE_ROUNDING = 1e-12
@@ -54,13 +56,21 @@ def row_angles(mechanism: MechanismData) -> BoolArray:
 
     Joint rows are in the unit of their first joint.
     """
-    model = mechanism.model
+    return _angles(mechanism.model, mechanism.loops)
+
+
+def constraint_angles(mechanism: MechanismData) -> BoolArray:
+    """Which rows (rows,) are in rad, those of the drives after those of the loops."""
+    driven = _angles(mechanism.model, driven_closures(mechanism.drives))
+    return np.concatenate([row_angles(mechanism), driven])
+
+
+def _angles(model: pin.Model, closures: Sequence[LoopClosure]) -> BoolArray:
     out: list[bool] = []
-    for loop in mechanism.loops:
-        lengths, alignments, _ = loop.rows.blocks
+    for closure in closures:
+        lengths, alignments, _ = closure.rows.blocks
         out += [False] * lengths.stop + [True] * (alignments.stop - alignments.start)
-        for row in loop.rows.joint_rows:
-            out.append(is_angle(model, row.joints[0]))
+        out += [is_angle(model, row.joints[0]) for row in closure.rows.joint_rows]
     return np.array(out, dtype=bool)
 
 
@@ -96,15 +106,6 @@ def periodic_coordinates(model: pin.Model) -> BoolArray:
     return out
 
 
-def constraint_angles(mechanism: MechanismData) -> BoolArray:
-    """Which rows (rows,) are in rad, those of the drives after those of the loops."""
-    driven = [
-        drive.joint is not None and is_angle(mechanism.model, drive.joint)
-        for drive in in_order_of_rows(mechanism.drives)
-    ]
-    return np.concatenate([row_angles(mechanism), np.array(driven, dtype=bool)])
-
-
 def row_dimensions(mechanism: MechanismData) -> tuple[str, ...]:
     """Units that closure errors have, drives included: "m", "rad" or both, in this order."""
     angles = constraint_angles(mechanism)
@@ -124,28 +125,25 @@ def row_units(mechanism: MechanismData, units: Units) -> FloatArray:
     the rounding of a large ratio nor the pitch of a screw makes it impossible to close.  Closure
     errors over these are pure numbers, independent of the unit of length.
     """
-    model = mechanism.model
-    out: list[float] = []
-    for loop in mechanism.loops:
-        lengths, alignments, _ = loop.rows.blocks
-        out += [units.length] * lengths.stop + [1.0] * (alignments.stop - alignments.start)
-        for row in loop.rows.joint_rows:
-            joints = (model.joints[model.getJointId(name)] for name in row.joints)
-            terms = zip(row.coefficients, joints)
-            out.append(max(abs(c) * float(units.coordinate[j.idx_v]) for c, j in terms))
-    return np.array(out)
+    return _units_of(mechanism.loops, mechanism.model, units)
 
 
 def constraint_units(mechanism: MechanismData, units: Units) -> FloatArray:
     """Units of all rows (rows,), those of the drives after those of the loops."""
-    model = mechanism.model
-    driven = [
-        units.length
-        if drive.joint is None
-        else units.coordinate[model.joints[model.getJointId(drive.joint)].idx_v]
-        for drive in in_order_of_rows(mechanism.drives)
-    ]
-    return np.concatenate([row_units(mechanism, units), driven])
+    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
+    return _units_of(closures, mechanism.model, units)
+
+
+def _units_of(closures: Sequence[LoopClosure], model: pin.Model, units: Units) -> FloatArray:
+    out: list[float] = []
+    for closure in closures:
+        lengths, alignments, _ = closure.rows.blocks
+        out += [units.length] * lengths.stop + [1.0] * (alignments.stop - alignments.start)
+        for row in closure.rows.joint_rows:
+            joints = (model.joints[model.getJointId(name)] for name in row.joints)
+            terms = zip(row.coefficients, joints)
+            out.append(max(abs(c) * float(units.coordinate[j.idx_v]) for c, j in terms))
+    return np.array(out)
 
 
 def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
@@ -178,39 +176,28 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
 
 def _gyration(model: pin.Model) -> float:
     """The largest radius of gyration (m) of a body about its centre of mass."""
-    return max(
-        (
-            # Lumping and shifting may round the trace of a point mass to a negative number.
-            float(np.sqrt(max(np.trace(body.inertia), 0.0) / body.mass))
-            for body in model.inertias.tolist()
-            if body.mass > 0.0
-        ),
-        default=0.0,
-    )
+    massive = [body for body in model.inertias.tolist() if body.mass > 0.0]
+    # Lumping and shifting may round the trace of a point mass to a negative number.
+    squares = [max(np.trace(body.inertia), 0.0) / body.mass for body in massive]
+    return float(np.sqrt(max(squares, default=0.0)))
 
 
 @per_model
 def _anchors(mechanism: MechanismData) -> list[tuple[int, FloatArray]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
-    found = []
-    driven = [anchor for drive in mechanism.drives for anchor in (drive.a, drive.b)]
-    for anchors in (*(loop.anchors for loop in mechanism.loops), driven):
-        for anchor in anchors:
-            if anchor is None:
-                continue
-            joint, placement = anchor.resolve(mechanism.model)
-            found.append((joint, placement.translation.copy()))
-    return found
+    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
+    places = [anchor.resolve(mechanism.model) for loop in closures for anchor in loop.anchors]
+    return [(joint, placement.translation.copy()) for joint, placement in places]
 
 
 def _acceleration_by_forces(mechanism: MechanismData, q: FloatArray) -> FloatArray:
     """M^-1 tau (nv,) of the force elements at rest; zero where they cannot be evaluated."""
     model = mechanism.model
     forces = resolved_forces(mechanism)
-    data = workspace(model)
     rest = np.zeros(model.nv)
     if forces is None:
         return rest
+    data = workspace(model)
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, rest)
     try:
@@ -218,5 +205,4 @@ def _acceleration_by_forces(mechanism: MechanismData, q: FloatArray) -> FloatArr
         U = cholesky(data.M)
     except EvaluationError:  # a run from here reports the fault
         return rest
-    out: FloatArray = unwhiten(U, whiten(U, tau))
-    return out
+    return unwhiten(U, whiten(U, tau))

@@ -116,9 +116,9 @@ class SingularityAnalysis:
         1 rad for angles, the scene diagonal (m) for translations.
     rate_unit
         Characteristic rate (1/s).
-    equations
-        (q (nq,), t (s) or None) -> the closure equations with units measured at q, and the laws of
-        the drives as they are at t
+    geometry
+        (q (nq,), t (s) or None, the default) -> the closure equations with units measured at q,
+        and the laws of the drives as they are at t
         (:func:`~srm_mbs.dynamics.constraints.geometry.geometry_of`).
     """
 
@@ -127,11 +127,7 @@ class SingularityAnalysis:
     sigma_reference: float
     coordinate_unit: FloatArray
     rate_unit: float
-    equations: Callable[[FloatArray, float | None], ClosureGeometry]
-
-    def geometry(self, q: FloatArray, t: float | None = None) -> ClosureGeometry:
-        """The ``equations`` for the configuration q (nq,) and the time t (s), if it is given."""
-        return self.equations(q, t)
+    geometry: Callable[..., ClosureGeometry]
 
     def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Views (q, v) of a state (nx,), or of states (n, nx)."""

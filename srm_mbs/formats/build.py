@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -20,82 +19,60 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
 from srm_mbs.formats.csv_table import CsvFolder
-from srm_mbs.formats.toml.description import Description, parse_description
+from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.coordinates import write_position, write_rate
 from srm_mbs.model.mechanism import SimulationDefaults, Source
-from srm_mbs.model.validation import check_inertia, check_tree, undetermined_joint
+from srm_mbs.model.validation import check_inertia, undetermined_joint
 
 log = logging.getLogger(__name__)
 
 
-def _joints_that_must_move(description: Description) -> list[tuple[str, Sequence[str]]]:
-    """Keys of the elements that act on joints, and the names there."""
-    return [
-        *(
-            (f"force[{i}].joint", [force.joint])
-            for i, force in enumerate(description.force)
-            if hasattr(force, "joint")
-        ),
-        *((f"loop[{i}].joints", loop.joints or []) for i, loop in enumerate(description.loop)),
-        *((f"drive[{i}].joint", [d.joint]) for i, d in enumerate(description.drive) if d.joint),
-    ]
+def _acting_joints(description: Description) -> Iterator[tuple[str, str]]:
+    """Keys of the elements that act on joints, and the names of these."""
+    for kind, key in (("force", "joint"), ("loop", "joints"), ("drive", "joint")):
+        for i, entry in enumerate(getattr(description, kind)):
+            names = getattr(entry, key, None) or ()
+            for name in [names] if isinstance(names, str) else names:
+                yield f"{kind}[{i}].{key}", name
 
 
-def _check_joint_names(description: Description, model: pin.Model, file: str) -> None:
-    """Refuse names in [initial] and lock that are no moving joints."""
+def _check_joint_names(description: Description, model: pin.Model) -> None:
+    """Refuse names that are no moving joints, and joints that are locked but act or are given
+    twice."""
     known = tuple(model.names)[1:]
-    places: list[tuple[str, Sequence[str]]] = [
-        ("lock", description.lock),
-        ("initial.q", list(description.initial.q)),
-        ("initial.v", list(description.initial.v)),
-        ("initial.guess", list(description.initial.guess)),
-        *_joints_that_must_move(description),
-    ]
-    for where, names in places:
-        for name in names:
-            if name not in known:
-                raise InputError(
-                    f"there is no moving joint {name!r}",
-                    file=file,
-                    element=where,
-                    remedy=f"Known: {', '.join(known)}",
-                )
-    for where, names in _joints_that_must_move(description):
-        for name in names:
-            if name in description.lock:
-                raise InputError(
-                    f"joint {name!r} is locked",
-                    file=file,
-                    element=where,
-                    remedy=f"Remove the {where.partition('[')[0]}, or the joint from lock",
-                )
+    initial = description.initial
+    given = [("lock", name) for name in description.lock]
+    for part in ("q", "v", "guess"):
+        given += [(f"initial.{part}", name) for name in getattr(initial, part)]
+    acting = list(_acting_joints(description))
+    for where, name in (*given, *acting):
+        if name not in known:
+            raise InputError(
+                f"there is no moving joint {name!r}",
+                element=where,
+                remedy=f"Known: {', '.join(known)}",
+            )
+    for where, name in acting:
+        if name in description.lock:
+            raise InputError(
+                f"joint {name!r} is locked",
+                element=where,
+                remedy=f"Remove the {where.partition('[')[0]}, or the joint from lock",
+            )
     for i, name in enumerate(description.lock):
         if name in description.lock[:i]:
-            raise InputError(
-                f"joint {name!r} is named twice", file=file, element="lock", remedy="Keep one"
-            )
-    for name in description.initial.q:
-        if name in description.initial.guess:
+            raise InputError(f"joint {name!r} is named twice", element="lock", remedy="Keep one")
+    for name in initial.q:
+        if name in initial.guess:
             raise InputError(
                 f"joint {name!r} is held in initial.q and guessed in initial.guess",
-                file=file,
                 element="initial.guess",
                 remedy="Keep one of the two",
             )
-
-
-@contextmanager
-def _element(where: str) -> Iterator[None]:
-    """Name the key of the description in errors that do not name one."""
-    try:
-        yield
-    except InputError as error:
-        error.element = error.element or where
-        raise
 
 
 def _check_frames(description: Description, model: pin.Model) -> None:
@@ -103,11 +80,10 @@ def _check_frames(description: Description, model: pin.Model) -> None:
     for where, anchor in description.anchors():
         if anchor.frame is None:
             continue
-        first, *others = [f for f in model.frames if f.name == anchor.frame] or [None]
-        for other in others:
-            if other.parentJoint != first.parentJoint or not other.placement.isApprox(
-                first.placement, 1e-12
-            ):
+        frames = [frame for frame in model.frames if frame.name == anchor.frame]
+        for other in frames[1:]:
+            same = other.placement.isApprox(frames[0].placement, 1e-12)
+            if other.parentJoint != frames[0].parentJoint or not same:
                 raise InputError(
                     f"the name {anchor.frame!r} belongs to a joint and to another joint's link",
                     element=f"{where}.frame",
@@ -116,28 +92,26 @@ def _check_frames(description: Description, model: pin.Model) -> None:
 
 
 def _without_locked(
-    description: Description, model: pin.Model, file: str
+    description: Description, model: pin.Model
 ) -> tuple[pin.Model, dict[str, Any], dict[str, Any], dict[str, Any]]:
     """The model without the locked joints, and q, v and guess of those that remain."""
     initial = description.initial
     q, v, guess = dict(initial.q), dict(initial.v), dict(initial.guess)
     if not description.lock:
         return model, q, v, guess
-    check_tree(model)
     frozen = pin.neutral(model)
     for name in description.lock:
         joint = model.joints[model.getJointId(name)]
         for where, values in (("initial.q", q), ("initial.guess", guess)):
             if name in values:
-                with _element(where):
+                with naming(element=where):
                     write_position(joint, frozen, name, values.pop(name))
         rate = np.zeros(model.nv)
-        with _element("initial.v"):
+        with naming(element="initial.v"):
             write_rate(joint, rate, name, v.pop(name, np.zeros(joint.nv)))
         if rate.any():
             raise InputError(
                 f"joint {name!r} is locked but has an initial rate",
-                file=file,
                 element="initial.v",
                 remedy="Remove the rate, or the joint from lock",
             )
@@ -169,7 +143,7 @@ def _friction_note(model: pin.Model, q: FloatArray, friction_speed: float) -> tu
     try:
         time = friction_time(model, q, friction_speed)
     except EvaluationError:  # in gimbal lock, which is reported elsewhere
-        return ()
+        time = np.inf
     if time == np.inf:
         return ()
     return (
@@ -179,51 +153,60 @@ def _friction_note(model: pin.Model, q: FloatArray, friction_speed: float) -> tu
     )
 
 
-def unassembled(
-    description: Description,
-    tree: Element,
-    source: Source,
-    notes: Sequence[str] = (),
-    tables: bool = True,
-) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
-    """The mechanism with the guess as its q0, and the held positions and rates by joint.
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A file as it was read.
 
-    Parameters
+    Attributes
     ----------
-    description, tree
-        The checked description, and the root element of its URDF, which is changed.
+    description, entries
+        The checked description, and its tables.
+    tree
+        Root element of its URDF; building the mechanism changes it.
     source
         The texts of both.
     notes
-        Sentences of the translator that made them.
-    tables
-        Whether to read the drives and forces that may need tables from other files.
+        Sentences about approximations and ignored elements.
+    """
+
+    description: Description
+    entries: Mapping[str, Any]
+    tree: Element
+    source: Source
+    notes: tuple[str, ...] = ()
+
+
+def unassembled(
+    reading: Reading, tables: bool = True
+) -> tuple[Mechanism, dict[str, Any], dict[str, Any]]:
+    """The mechanism with the guess as its q0, and the held positions and rates by joint.
+
+    Without ``tables``, drives and forces that may need tables from other files are left out.
 
     Raises
     ------
     InputError
         Naming file, element and remedy.
     """
-    file = source.path
+    description, source = reading.description, reading.source
     built = build_urdf(
-        tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
+        reading.tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
     )
     built.model.gravity.linear = np.array(source.gravity)
-    _check_joint_names(description, built.model, file)
-    model, q, v, guess = _without_locked(description, built.model, file)
+    _check_joint_names(description, built.model)
+    model, q, v, guess = _without_locked(description, built.model)
     check_inertia(model, source.urdf_path)
     _check_frames(description, model)
-    check_tree(model)
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
-            with _element(where):
+            with naming(element=where):
                 write_position(model.joints[model.getJointId(name)], start, name, value)
     for name, value in v.items():
-        with _element("initial.v"):
+        with naming(element="initial.v"):
             write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
-    csv = CsvFolder(Path(file).parent) if tables else None
+    csv = CsvFolder(Path(source.path).parent) if tables else None
     friction_speed = description.friction_speed
     mechanism = Mechanism(
         model,
@@ -235,7 +218,7 @@ def unassembled(
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(*notes, *built.notes, *_friction_note(model, start, friction_speed)),
+        notes=(*reading.notes, *built.notes, *_friction_note(model, start, friction_speed)),
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
@@ -243,6 +226,7 @@ def unassembled(
 
 
 def _with_limit_springs(mechanism: Mechanism) -> Mechanism:
+    """The mechanism with springs at its joint limits, and a note about them."""
     springs = limit_springs(mechanism)
     values = ", ".join(f"{s.joint} {s.stiffness:.3g} and {s.damping:.3g}" for s in springs)
     note = (
@@ -257,9 +241,10 @@ def _with_limit_springs(mechanism: Mechanism) -> Mechanism:
 def rebuild(source: Source) -> Mechanism:
     """The mechanism of a saved run without its drives; its q0 is the guess of the description, not
     assembled."""
-    description = parse_description(source.description, source.path)
+    entries = parse_toml(source.description, source.path)
+    description = check_description(entries, source.path)
     tree = parse_xml(source.urdf, source.urdf_path)
-    return unassembled(description, tree, source, tables=False)[0]
+    return unassembled(Reading(description, entries, tree, source), tables=False)[0]
 
 
 def _in_gimbal_lock(source: Source, why: str) -> InputError:
@@ -272,17 +257,16 @@ def _in_gimbal_lock(source: Source, why: str) -> InputError:
     )
 
 
-def assembled(
-    description: Description, tree: Element, source: Source, notes: Sequence[str] = ()
-) -> Mechanism:
-    """The mechanism with its loops closed; parameters as in :func:`unassembled`.
+def assembled(reading: Reading) -> Mechanism:
+    """The mechanism with its loops closed.
 
     Raises
     ------
     InputError, AssemblyError
         As :func:`srm_mbs.load`.
     """
-    mechanism, q, v = unassembled(description, tree, source, notes)
+    description, source = reading.description, reading.source
+    mechanism, q, v = unassembled(reading)
     # Assembly analyses this copy, of the guess; the mechanism is analysed at its assembled state.
     guess = copy(mechanism)
     try:
@@ -293,9 +277,8 @@ def assembled(
         _ = mechanism.structure
     except AssemblyError as error:
         if description.lock:
-            error.remedy = f"{error.remedy}. Locked, so that they cannot help: " + ", ".join(
-                map(repr, description.lock)
-            )
+            locked = ", ".join(map(repr, description.lock))
+            error.remedy = f"{error.remedy}. Locked, so that they cannot help: {locked}"
         raise
     except EvaluationError as error:
         raise _in_gimbal_lock(source, str(error)) from error

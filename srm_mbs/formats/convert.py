@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 import tomli_w
 
-from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.errors import CHECK_WRITING, InputError, naming
 from srm_mbs.formats.build import unassembled
 from srm_mbs.formats.load import Overrides, read
 
@@ -56,10 +56,8 @@ def convert(
     reading = read(path, Overrides(cut=tuple(cut)))
     source = reading.source
     written = _with_meshes_from(reading.tree, source.urdf, Path(source.urdf_path), urdf)
-    try:
-        mechanism, _, _ = unassembled(reading.description, reading.tree, source, reading.notes)
-    except InputError as error:
-        raise error.located(source.path) from error.__cause__
+    with naming(file=source.path):
+        mechanism, _, _ = unassembled(reading)
     inputs = {Path(name).resolve() for name in (path, source.path, source.urdf_path)}
     for target in (description, urdf):
         if target.resolve() in inputs:

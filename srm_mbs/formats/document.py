@@ -44,31 +44,22 @@ class Document:
         """
         try:
             return cls(path.read_text(encoding="utf-8-sig"), str(path))  # Windows editors mark it
-        except FileNotFoundError as error:
-            raise InputError(
-                "there is no such file", file=str(path), remedy="Check the path"
-            ) from error
-        except UnicodeDecodeError as error:
-            if path.suffix.lower() == ".npz":
-                raise InputError(
-                    "it is not the file of a mechanism",
-                    file=str(path),
-                    remedy="Give a saved run to srm.load_solution, or to srm-mbs plot, play or "
-                    "report",
-                ) from error
-            raise InputError(
-                f"it is not UTF-8 text: {error}", file=str(path), remedy="Save it as UTF-8"
-            ) from error
-        except OSError as error:
-            raise InputError(
-                f"it cannot be read: {error.strerror}",
-                file=str(path),
-                remedy="Give the path of a readable file",
-            ) from error
-        except ValueError as error:  # a null character
-            raise InputError(
-                f"it is not a file name: {error}", file=repr(path), remedy="Correct the path"
-            ) from error
+        except (OSError, ValueError) as error:
+            file = str(path)
+            if isinstance(error, FileNotFoundError):
+                problem, remedy = "there is no such file", "Check the path"
+            elif isinstance(error, OSError):
+                problem = f"it cannot be read: {error.strerror}"
+                remedy = "Give the path of a readable file"
+            elif not isinstance(error, UnicodeDecodeError):  # a null character
+                problem, remedy = f"it is not a file name: {error}", "Correct the path"
+                file = repr(path)
+            elif path.suffix.lower() == ".npz":
+                problem = "it is not the file of a mechanism"
+                remedy = "Give a saved run to srm.load_solution, or to srm-mbs plot, play or report"
+            else:
+                problem, remedy = f"it is not UTF-8 text: {error}", "Save it as UTF-8"
+            raise InputError(problem, file=file, remedy=remedy) from error
 
     @cached_property
     def toml(self) -> dict[str, Any]:

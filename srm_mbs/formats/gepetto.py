@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 import reprlib  # of nested anchors and aliases: repr would write out all of them
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -43,34 +44,25 @@ def translate(document: Document, options: Options) -> Translation:
     Raises
     ------
     InputError
-        Naming the file and key at fault.
+        Naming the key at fault.
     """
-    file = document.file
-    lists = _read(document.text, file)
-    urdf_path = _urdf_beside(Path(file))
-    try:
-        urdf = urdf_path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"it cannot be read: {error}",
-            file=str(urdf_path),
-            remedy="Put a readable URDF in UTF-8 there",
-        ) from error
-    plain = urdf_loops.translate(Document(urdf, str(urdf_path)), options)
+    lists = _read(document.text)
+    urdf = Document.read(_urdf_beside(Path(document.file)))
+    plain = urdf_loops.translate(urdf, options)
     root = plain.tree
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
     frames = {*joints, *(link.get("name", "") for link in root.findall("link"))}
     fixed = []
     for name, kind in zip(lists["joint_name"], lists["joint_type"]):
         if name not in joints:
-            raise _unknown("joint_name", "joint", name, joints, file)
-        if _retype(joints[name], name, kind, file):
+            raise _unknown("joint_name", "joint", name, joints)
+        if _retype(joints[name], name, kind):
             fixed.append(name)
     loops = []
     for pair, kind in zip(lists["closed_loop"], lists["type"]):
         for name in pair:
             if name not in frames:
-                raise _unknown("closed_loop", "frame", name, frames, file)
+                raise _unknown("closed_loop", "frame", name, frames)
         a, b = ({"frame": name} for name in pair)
         closure = CLOSURES[kind.lower()]
         loops.append({"name": "_".join(pair), "type": closure, "a": a, "b": b})
@@ -80,27 +72,25 @@ def translate(document: Document, options: Options) -> Translation:
         entries["lock"] = fixed
     notes = list(plain.notes)
     motors = lists["name_mot"]
-    if motors:
-        notes.append(
-            f"joints with motors (name_mot), which exert nothing here: {', '.join(motors)}"
-        )
     missing = [name for name in motors if name not in joints]
-    if missing:
-        notes.append(f"name_mot names no joints of the URDF: {', '.join(missing)}")
-    return Translation(root, "", entries, tuple(notes), urdf_file=str(urdf_path))
+    for note, names in (
+        ("joints with motors (name_mot), which exert nothing here", motors),
+        ("name_mot names no joints of the URDF", missing),
+    ):
+        if names:
+            notes.append(f"{note}: {', '.join(names)}")
+    return Translation(root, "", entries, tuple(notes), urdf_file=urdf.file)
 
 
-def _fault(file: str, element: str, problem: str, remedy: str) -> InputError:
-    return InputError(problem, file=file, element=element, remedy=remedy)
+def _fault(element: str, problem: str, remedy: str) -> InputError:
+    return InputError(problem, element=element, remedy=remedy)
 
 
-def _unknown(key: str, what: str, name: str, known: Any, file: str) -> InputError:
-    return _fault(
-        file, key, f"the URDF has no {what} {name!r}", f"Known: {', '.join(sorted(known))}"
-    )
+def _unknown(key: str, what: str, name: str, known: Iterable[str]) -> InputError:
+    return _fault(key, f"the URDF has no {what} {name!r}", f"Known: {', '.join(sorted(known))}")
 
 
-def _read(text: str, file: str) -> dict[str, list[Any]]:
+def _read(text: str) -> dict[str, list[Any]]:
     """The lists by key, of equal length where they belong together; empty where there is none."""
     import yaml
 
@@ -108,23 +98,22 @@ def _read(text: str, file: str) -> dict[str, list[Any]]:
         raw = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         where = " ".join(str(error).split())
-        raise _fault(file, "", f"this is not valid YAML: {where}", "Correct the file") from error
+        raise _fault("", f"this is not valid YAML: {where}", "Correct the file") from error
     if not isinstance(raw, dict):
-        raise _fault(file, "", "it holds no keys", f"Give {', '.join(KEYS)}")
+        raise _fault("", "it holds no keys", f"Give {', '.join(KEYS)}")
     for key in raw:
         if key not in KEYS:
-            raise _fault(file, str(key), "this key is unknown", f"Known: {', '.join(KEYS)}")
+            raise _fault(str(key), "this key is unknown", f"Known: {', '.join(KEYS)}")
     lists: dict[str, list[Any]] = {}
     for key in KEYS:
         value = raw.get(key)
         value = [] if value is None else value
         if not isinstance(value, list):
-            raise _fault(file, key, "a list is wanted", "Write [...]")
+            raise _fault(key, "a list is wanted", "Write [...]")
         lists[key] = value
     for key, other in PAIRED.items():
         if len(lists[key]) != len(lists[other]):
             raise _fault(
-                file,
                 other,
                 f"it has {len(lists[other])} entries, {key} has {len(lists[key])}",
                 "Give both the same length",
@@ -132,7 +121,6 @@ def _read(text: str, file: str) -> dict[str, list[Any]]:
     for pair in lists["closed_loop"]:
         if not isinstance(pair, list) or len(pair) != 2 or not all(map(_is_name, pair)):
             raise _fault(
-                file,
                 "closed_loop",
                 f"{reprlib.repr(pair)} is not a pair of frames",
                 'Write ["first", "second"]',
@@ -140,13 +128,13 @@ def _read(text: str, file: str) -> dict[str, list[Any]]:
     for key in ("type", "name_mot", "joint_name", "joint_type"):
         for entry in lists[key]:
             if not _is_name(entry):
-                raise _fault(file, key, f"{reprlib.repr(entry)} is not text", "Put it in quotes")
+                raise _fault(key, f"{reprlib.repr(entry)} is not text", "Put it in quotes")
     for kind in lists["type"]:
         if kind.lower() not in CLOSURES:
-            raise _fault(file, "type", f"there is no type {kind!r}", "Known: 3d, 6d")
+            raise _fault("type", f"there is no type {kind!r}", "Known: 3d, 6d")
     for name in lists["joint_name"]:
         if lists["joint_name"].count(name) > 1:
-            raise _fault(file, "joint_name", f"{name!r} is given twice", "Keep one")
+            raise _fault("joint_name", f"{name!r} is given twice", "Keep one")
     return lists
 
 
@@ -162,7 +150,6 @@ def _urdf_beside(path: Path) -> Path:
     found = sorted(path.parent.glob("*.urdf"))
     if len(found) != 1:
         raise _fault(
-            str(path),
             "",
             f"there is no {path.with_suffix('.urdf').name!r} and no 'robot.urdf' beside it",
             "Put the URDF there; it describes the links and joints",
@@ -170,19 +157,16 @@ def _urdf_beside(path: Path) -> Path:
     return found[0]
 
 
-def _retype(joint: Element, name: str, kind: str, file: str) -> bool:
+def _retype(joint: Element, name: str, kind: str) -> bool:
     """Give ``joint`` the type in the YAML file; True if it is to be locked instead."""
     old = joint.get("type")
     if old not in REPLACEABLE:
-        raise _fault(
-            file, "joint_type", f"the joint {name!r} is of type {old!r}: it stays", "Remove it"
-        )
+        raise _fault("joint_type", f"the joint {name!r} is of type {old!r}: it stays", "Remove it")
     if kind == "FIXED":
         return True
     universal = UNIVERSAL.match(kind)
     if kind != "SPHERICAL" and universal is None:
         raise _fault(
-            file,
             "joint_type",
             f"there is no type {kind!r}",
             "Known: SPHERICAL, FIXED, UJOINT_XY and the other pairs of X, Y, Z",
@@ -195,7 +179,7 @@ def _retype(joint: Element, name: str, kind: str, file: str) -> bool:
         return False
     first, second = universal.groups()
     if first == second:
-        raise _fault(file, "joint_type", f"the axes of {kind!r} are in line", "Give different ones")
+        raise _fault("joint_type", f"the axes of {kind!r} are in line", "Give different ones")
     joint.set("type", "universal")
     SubElement(joint, "axis", xyz=AXES[first])
     SubElement(joint, "axis2", xyz=AXES[second])

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import logging
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import tomli_w
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
-from srm_mbs.formats.build import assembled, rebuild
+from srm_mbs.errors import InputError, naming
+from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document
-from srm_mbs.formats.generators import n_four_bar as _n_four_bar_texts
 from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.translation import Options, merged
@@ -27,7 +25,10 @@ from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array
 
-_GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
+log = logging.getLogger(__name__)
+
+GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
+"""Names of generated mechanisms, with the number of loops."""
 
 
 def models_folder() -> Path:
@@ -45,18 +46,9 @@ def bundled_models() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in models_folder().glob("*.toml")))
 
 
-def generated_size(name: str) -> int | None:
-    """N if ``name`` is ``n_four_bar_<N>``, else None."""
-    match = _GENERATED.match(name)
-    return int(match[1]) if match else None
-
-
-log = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True)
 class Overrides:
-    """Arguments of :func:`load` that replace values of the file; None: the file's."""
+    """Arguments of :func:`load` that replace values of the file; None or empty: the file's."""
 
     gravity: Sequence[float] | None = None
     base: str | None = None
@@ -71,30 +63,8 @@ def _gravity(value: Any) -> tuple[float, float, float]:
             element="gravity",
             remedy="Give [x, y, z] in m/s^2",
         )
-    return (float(array[0]), float(array[1]), float(array[2]))
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """A file as it was read: what :mod:`srm_mbs.formats.build` takes.
-
-    Attributes
-    ----------
-    description, entries
-        The checked description, and its tables.
-    tree
-        Root element of its URDF; building the mechanism changes it.
-    source
-        The texts of both.
-    notes
-        Sentences about approximations and ignored elements.
-    """
-
-    description: Description
-    entries: Mapping[str, Any]
-    tree: Element
-    source: Source
-    notes: tuple[str, ...] = ()
+    x, y, z = array.tolist()
+    return (x, y, z)
 
 
 def _translated(
@@ -114,20 +84,19 @@ def _translated(
         entries = merged(entries, translation.entries, urdf_name)
         text = tomli_w.dumps(entries)
         description = check_description(entries, own.file)
-    base = overrides.base
-    base = description.base if base is None else base
+    base = description.base if overrides.base is None else overrides.base
     if not isinstance(base, str) or base not in ROOT_JOINTS:
         raise InputError(
             f"there is no base {base!r}", element="base", remedy=f"Known: {', '.join(ROOT_JOINTS)}"
         )
-    gravity = overrides.gravity
+    gravity = description.gravity if overrides.gravity is None else overrides.gravity
     source = Source(
         description=text,
         urdf=translation.urdf,
         urdf_path=translation.urdf_file or model.file,
         path=own.file,
         base=base,
-        gravity=_gravity(description.gravity if gravity is None else gravity),
+        gravity=_gravity(gravity),
         format=found.name,
     )
     log.debug("%s: read as %s", model.file, found.name)
@@ -145,11 +114,12 @@ def _of_description(own: Document, overrides: Overrides, urdf: str | None = None
         try:
             model = Document.read(path)
         except InputError as error:
+            relative = "Check the path, which is relative to the description"
             raise InputError(
                 f"the {key.upper()} {name!r} cannot be read ({error.problem}: {str(path)!r})",
                 file=own.file,
                 element=key,
-                remedy="Check the path, which is relative to the description",
+                remedy=error.remedy if os.path.isfile(path) else relative,
             ) from error
     found = of_key(key, path, model)
     return _translated(own, own.toml, description, found, model, overrides)
@@ -163,8 +133,7 @@ def _of_file(path: Path, overrides: Overrides) -> Reading:
     if found is DESCRIPTION:
         return _of_description(document, overrides)
     entries = {"format": 1, "urdf": path.name}
-    # A JSON string is a TOML string too.
-    own = Document(f"format = 1\nurdf = {json.dumps(path.name)}\n", document.file)
+    own = Document(tomli_w.dumps(entries), document.file)
     description = check_description(entries, own.file)
     return _translated(own, entries, description, found, document, overrides)
 
@@ -182,17 +151,15 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
     if is_name and name in bundled_models():
         name = str(models_folder() / f"{name}.toml")
     elif is_name and not (name and Path(name).exists()):  # "" would be the working folder
-        size = generated_size(name)
-        if size is None:
+        generated = GENERATED.match(name)
+        if generated is None:
             raise InputError(
                 f"there is no bundled mechanism {name!r}",
                 remedy=f"Known: {', '.join(bundled_models())}; or give the path of a file",
             )
-        return _generated(size, overrides)
-    try:
+        return _generated(int(generated[1]), overrides)
+    with naming(file=name):
         return _of_file(Path(name), overrides)
-    except InputError as error:
-        raise error.located(name) from error.__cause__
 
 
 def load(
@@ -226,10 +193,8 @@ def load(
         If the loops cannot close or held values contradict each other.
     """
     reading = read(path, Overrides(gravity, base, tuple(cut)))
-    try:
-        return assembled(reading.description, reading.tree, reading.source, reading.notes)
-    except InputError as error:
-        raise error.located(reading.source.path) from error.__cause__
+    with naming(file=reading.source.path):
+        return assembled(reading)
 
 
 LARGEST_N, LARGEST_DENSE_N = 1000, 300
@@ -244,6 +209,25 @@ def largest_n() -> int:
     return LARGEST_DENSE_N if core is None else LARGEST_N
 
 
+def n_four_bar_texts(n: int) -> tuple[str, str]:
+    """Description and URDF of the N-four-bar with ``n`` loops (n >= 1)."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["number"] = "{:.10g}".format  # without the noise of rounding
+    toml, urdf = (
+        environment.get_template(f"n_four_bar.{suffix}.j2").render(n=n)
+        for suffix in ("toml", "urdf")
+    )
+    return toml, urdf
+
+
 def _generated(n: int, overrides: Overrides) -> Reading:
     largest = largest_n()
     if n > largest:
@@ -253,12 +237,24 @@ def _generated(n: int, overrides: Overrides) -> Reading:
             remedy=f"Take N <= {largest}"
             + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
         )
-    text, urdf = _n_four_bar_texts(n)
+    text, urdf = n_four_bar_texts(n)
     return _of_description(Document(text, f"n_four_bar_{n}, generated"), overrides, urdf)
 
 
 def n_four_bar(n: int) -> Mechanism:
     """The IFToMM N-four-bar benchmark with ``n`` loops (n >= 1), assembled.
+
+    Benchmark A02 of the IFToMM Technical Committee for Multibody Dynamics (Library of
+    Computational Benchmark Problems): 2 N + 1 uniform rods of 1 m and 1 kg, of which N + 1
+    are cranks pivoted at (i, 0, 0) and N are couplers between neighbouring crank tips, under
+    gravity of 9.81 m/s^2.  It starts with the cranks upright and the first crank tip moving at
+    1 m/s in +x.  It has one degree of freedom, and N + 1 whenever the cranks are horizontal.  The
+    common crank angle obeys
+
+        I theta'' = -g W cos(theta),   I = (N + 1)/3 + N,   W = (N + 1)/2 + N,
+
+    with theta(0) = pi/2, theta'(0) = -1/s; at t = 10 s the first crank tip is
+    at x = 0.3284581115, z = 0.9445185382 (N = 2) and x = 0.1805122267, z = 0.9835727406 (N = 40).
 
     Raises
     ------
@@ -269,8 +265,4 @@ def n_four_bar(n: int) -> Mechanism:
         raise InputError(
             f"an N-four-bar needs n >= 1, not {n!r}", element="n", remedy="Give a positive integer"
         )
-    reading = _generated(int(n), Overrides())
-    return assembled(reading.description, reading.tree, reading.source)
-
-
-__all__ = ["bundled_models", "load", "n_four_bar", "rebuild"]
+    return assembled(_generated(int(n), Overrides()))

@@ -79,6 +79,10 @@ FORMATS: tuple[Format, ...] = (
 )
 
 
+def _by_content(document: Document) -> Format | None:
+    return next((known for known in FORMATS if known.recognises(document)), None)
+
+
 def find_format(path: Path, document: Document) -> Format:
     """The format of a file: by its content or, failing that, its suffix.
 
@@ -87,12 +91,10 @@ def find_format(path: Path, document: Document) -> Format:
     InputError
         If it is none that is read.
     """
-    for found in FORMATS:
-        if found.recognises(document):
-            return found
-    for found in FORMATS:
-        if path.suffix.lower() in found.suffixes:
-            return found
+    by_suffix = (known for known in FORMATS if path.suffix.lower() in known.suffixes)
+    found = _by_content(document) or next(by_suffix, None)
+    if found is not None:
+        return found
     tag = document.root_tag
     what = f"a file with the root element <{tag}>" if tag else f"a file of type {path.suffix!r}"
     raise InputError(
@@ -108,30 +110,22 @@ def of_key(key: str, path: Path, document: Document) -> Format:
     Raises
     ------
     InputError
-        If this version does not read that format, or the file is of another one.
+        If the file is of another format.
     """
-    wanted = next((known for known in FORMATS if known.key == key), None)
-    if wanted is None:
+    wanted = next(known for known in FORMATS if known.key == key)
+    if wanted.recognises(document):
+        return wanted
+    other, tag, remedy = _by_content(document), document.root_tag, f"Give a {wanted.name}"
+    if other is not None:
         raise InputError(
-            f"files of this format ({key}) are not read by this version",
+            f"{path.name!r} is a {other.name}, not a {wanted.name}",
             element=key,
-            remedy="Convert the file to one of the formats in docs/formats.md",
+            remedy=f'Write {other.key} = "{path.name}"' if other.key else remedy,
         )
-    tag = document.root_tag
-    if not wanted.recognises(document):
-        other = next((known for known in FORMATS if known.recognises(document)), None)
-        if other is not None:
-            raise InputError(
-                f"{path.name!r} is a {other.name}, not a {wanted.name}",
-                element=key,
-                remedy=f'Write {other.key} = "{path.name}"'
-                if other.key
-                else f"Give a {wanted.name}",
-            )
-        if tag is not None and wanted.key != "urdf":
-            raise InputError(
-                f"the root element of {path.name!r} is <{tag}>: it is not a {wanted.name}",
-                element=key,
-                remedy=f"Give a {wanted.name}",
-            )
+    if tag is not None and key != "urdf":  # the URDF reader names the fault
+        raise InputError(
+            f"the root element of {path.name!r} is <{tag}>: it is not a {wanted.name}",
+            element=key,
+            remedy=remedy,
+        )
     return wanted

@@ -6,8 +6,8 @@ Every reader makes a :class:`Translation`; from there one path leads to the mech
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 from xml.etree.ElementTree import Element, indent, tostring
 
@@ -59,6 +59,15 @@ class Translation:
         if not self.urdf:
             indent(self.tree)
             object.__setattr__(self, "urdf", tostring(self.tree, encoding="unicode") + "\n")
+
+    def extended(self, notes: Iterable[str], **more: Any) -> Translation:
+        """With further notes and entries: lists follow those of the same key, and what is empty is
+        left out."""
+        entries = dict(self.entries)
+        for key, value in more.items():
+            if value:
+                entries[key] = [*entries.get(key, ()), *value] if key in LISTS else value
+        return replace(self, entries=entries, notes=(*self.notes, *notes))
 
 
 LISTS = ("lock", "loop", "force", "drive")

@@ -17,24 +17,26 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
+
+def words(text: str) -> tuple[str, ...]:
+    """The words of ``text``, for tables of names."""
+    return tuple(text.split())
+
+
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LIMIT = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
-ACTING = (
-    "joint",
-    "constraint",
-    "bushing",
-    "spring",
-    "damper",
-    "inertia",
-    "gear",
-    "mimic",
-    "coupling",
-    "tendon",
-)
+ACTING = words("joint constraint bushing spring damper inertia gear mimic coupling tendon")
 """Words in the names of other tools' elements that act, such as ``drake:rotor_inertia``."""
 LARGEST_NESTING = 300
 """Largest depth of nested elements."""
+LARGEST_INCLUDE_DEPTH = 20
+"""Largest number of files that include each other."""
 NAMESPACED = re.compile(r"\{[^}]*\}")
+
+
+def local_name(node: Element) -> str:
+    """The tag without its namespace."""
+    return node.tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
 
 
 def parse_numbers(text: str, largest: float = LARGEST_MAGNITUDE) -> list[float] | None:
@@ -48,7 +50,7 @@ def parse_numbers(text: str, largest: float = LARGEST_MAGNITUDE) -> list[float] 
 
 
 class XmlFile:
-    """One XML file for messages: its faults, and a count of what is ignored in it.
+    """One XML file for messages: its faults, its numbers, and a count of what is ignored in it.
 
     Parameters
     ----------
@@ -64,6 +66,10 @@ class XmlFile:
         """The error to raise about the element ``where``."""
         return InputError(problem, file=self.file, element=where, remedy=remedy)
 
+    def unknown(self, where: str, problem: str, known: Iterable[str]) -> InputError:
+        """The error to raise about a name in ``where`` that is none of those ``known``."""
+        return self.fault(where, problem, f"Known: {', '.join(known) or 'none'}")
+
     def ignore(self, what: str) -> None:
         """Count something that is left out knowingly, as ``<sensor> element``."""
         self._ignored[what] = self._ignored.get(what, 0) + 1
@@ -74,39 +80,45 @@ class XmlFile:
             f"{count} {what}(s) do not act and are ignored" for what, count in self._ignored.items()
         )
 
-    def attribute_numbers(
+    def only(
+        self, node: Element, where: str, known: Iterable[str], passed: Iterable[str] = ()
+    ) -> None:
+        """Refuse attributes of ``node`` that are neither ``known`` nor ``passed`` over."""
+        known = tuple(known)
+        for key in node.attrib:
+            if key not in known and key not in passed:
+                problem = f"<{local_name(node)}> has an unknown attribute {key!r}"
+                raise self.unknown(where, problem, known)
+
+    def numbers(
         self,
-        node: Element,
-        key: str,
-        count: int,
+        text: str | None,
+        count: int | Sequence[int],
         where: str,
+        what: str,
         largest: float = LARGEST_MAGNITUDE,
-    ) -> list[float]:
-        """``count`` finite numbers of attribute ``key``, which is rewritten in one form.
+    ) -> FloatArray:
+        """Exactly ``count`` finite numbers (or as many as one of several counts).
 
         Raises
         ------
         InputError
-            If the attribute is missing or anything else.
+            Saying what stands there instead, if it is anything else.
         """
-        text = node.get(key)
+        counts = (count,) if isinstance(count, int) else tuple(count)
         values = parse_numbers(text or "", largest)
-        if values is None or len(values) != count:
-            tag = node.tag.rsplit("}", 1)[-1]
-            wanted = "a finite number" if count == 1 else f"{count} finite numbers in a row"
-            raise self.fault(
-                where,
-                f"<{tag}> has no {key!r}"
-                if text is None
-                else f"<{tag} {key}={text!r}> is not {wanted}",
-                f"Write {wanted}",
+        if values is None or len(values) not in counts:
+            wanted = " or ".join(
+                "a finite number" if n == 1 else f"{n} finite numbers" for n in counts
             )
-        node.set(key, " ".join(map(repr, values)))
-        return values
+            parts = (text or "").split()
+            given = repr(" ".join(parts)[:60]) if parts else "nothing"
+            raise self.fault(where, f"{what} is {given}, not {wanted}", f"Write {wanted}")
+        return np.array(values)
 
 
 class XmlValues(XmlFile):
-    """Reads values of one SDF or MJCF file; counts what it ignores."""
+    """Reads values of one SDF or MJCF file, and collects notes of what it assumes or ignores."""
 
     def __init__(self, file: str) -> None:
         super().__init__(file)
@@ -121,27 +133,6 @@ class XmlValues(XmlFile):
         remarks = (f"{what}: {', '.join(where)}" for what, where in self._remarks.items())
         return (*remarks, *self.ignored_notes())
 
-    def numbers(
-        self, text: str | None, count: int | Sequence[int], where: str, what: str
-    ) -> FloatArray:
-        """Exactly ``count`` finite numbers (or as many as one of several counts).
-
-        Raises
-        ------
-        InputError
-            Saying what stands there instead, if it is anything else.
-        """
-        counts = (count,) if isinstance(count, int) else tuple(count)
-        values = parse_numbers(text or "")
-        if values is None or len(values) not in counts:
-            wanted = " or ".join(
-                "a finite number" if n == 1 else f"{n} finite numbers" for n in counts
-            )
-            parts = (text or "").split()
-            given = repr(" ".join(parts)[:60]) if parts else "nothing"
-            raise self.fault(where, f"{what} is {given}, not {wanted}", f"Write {wanted}")
-        return np.array(values)
-
     def limit(self, text: str, where: str, what: str) -> float:
         """A number that may be infinite."""
         if LIMIT.fullmatch(text.strip()):
@@ -154,6 +145,16 @@ class XmlValues(XmlFile):
         if word not in ("true", "false", "1", "0"):
             raise self.fault(where, f"{what} is {word!r}", "Write true or false")
         return word in ("true", "1")
+
+    def child_number(self, node: Element | None, tag: str, where: str, default: float) -> float:
+        """The number in the child ``tag``; ``default`` without one."""
+        text = None if node is None else node.findtext(tag)
+        return default if text is None else float(self.numbers(text, 1, where, f"<{tag}>")[0])
+
+    def child_truth(self, node: Element, tag: str, where: str, default: bool) -> bool:
+        """The truth in the child ``tag``; ``default`` without one."""
+        text = node.findtext(tag)
+        return default if text is None else self.truth(text, where, f"<{tag}>")
 
     def direction(self, values: FloatArray, where: str, what: str) -> FloatArray:
         """``values`` (3,) as a unit vector."""
@@ -175,6 +176,13 @@ class XmlValues(XmlFile):
                 )
             level = [child for node in level for child in node]
             depth += 1
+
+    def check_include(self, depth: int, where: str) -> None:
+        """Refuse the include ``where``, which is in ``depth`` others, if that are too many."""
+        if depth >= LARGEST_INCLUDE_DEPTH:
+            raise self.fault(
+                where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
+            )
 
     def children(
         self,
@@ -209,11 +217,8 @@ class XmlValues(XmlFile):
             elif NAMESPACED.match(tag) or ":" in tag:
                 self._other_tool(NAMESPACED.sub("", tag), where)
             else:
-                raise self.fault(
-                    where or f"<{tag}>",
-                    f"unknown element <{tag}> in <{node.tag}>",
-                    f"Known: {', '.join((*read, *ignored))}",
-                )
+                problem = f"unknown element <{tag}> in <{node.tag}>"
+                raise self.unknown(where or f"<{tag}>", problem, (*read, *ignored))
 
     def _other_tool(self, tag: str, where: str) -> None:
         """Refuse an element with a namespace prefix that acts, by its name; count the others."""
@@ -226,22 +231,12 @@ class XmlValues(XmlFile):
             )
         self.ignore(f"<{tag}> element of another tool")
 
-    def attributes(
-        self, node: Element, where: str, read: Iterable[str], ignored: Iterable[str] = ()
-    ) -> None:
-        """Refuse unknown attributes; count those that are ignored."""
-        read, ignored = tuple(read), tuple(ignored)
-        for key in node.attrib:
-            if key in ignored:
-                self.ignore(f"<{node.tag} {key}> attribute")
-            elif NAMESPACED.match(key):
-                self.ignore(f"<{node.tag} {NAMESPACED.sub('', key)}> attribute of another tool")
-            elif key not in read:
-                raise self.fault(
-                    where,
-                    f"<{node.tag}> has an unknown attribute {key!r}",
-                    f"Known: {', '.join((*read, *ignored)) or 'none'}",
-                )
+    def attributes(self, node: Element, where: str, read: Iterable[str]) -> None:
+        """Refuse unknown attributes; count those of other tools."""
+        foreign = [key for key in node.attrib if NAMESPACED.match(key)]
+        for key in foreign:
+            self.ignore(f"<{node.tag} {NAMESPACED.sub('', key)}> attribute of another tool")
+        self.only(node, where, read, foreign)
 
 
 _PROLOG = re.compile(

@@ -172,9 +172,7 @@ class BreakpointHandler:
 
     Parameters
     ----------
-    pieces
-        Of the run.
-    system, method, norm
+    intervals, system, method, norm
         Of the run.
     evaluator
         Evaluates the first stage of an interval.
@@ -189,13 +187,13 @@ class BreakpointHandler:
 
     def __init__(
         self,
-        pieces: SmoothIntervals,
+        intervals: SmoothIntervals,
         system: System,
         method: Method,
         norm: ErrorNorm,
         evaluator: Any = None,
     ) -> None:
-        self.pieces = pieces
+        self._intervals = intervals
         self._system = system
         self._method = method
         self._norm = norm
@@ -209,11 +207,11 @@ class BreakpointHandler:
     @property
     def end(self) -> float:
         """End of the current interval (s)."""
-        return float(self.pieces.ends[self._index])
+        return float(self._intervals.ends[self._index])
 
     def _evaluate_within(self, index: int) -> None:
-        pieces = self.pieces
-        self._evaluator.between(float(pieces.first[index]), float(pieces.last[index]))
+        first, last = self._intervals.first[index], self._intervals.last[index]
+        self._evaluator.between(float(first), float(last))
 
     def enter(self, index: int, t: float, state: FloatArray) -> None:
         """Enter the interval ``index``, which starts at ``t`` (s): the system is evaluated in it.
@@ -223,7 +221,7 @@ class BreakpointHandler:
         ControllerError
             If the sampled controller fails.
         """
-        if self.sample is not None and self.pieces.given[index - 1]:
+        if self.sample is not None and self._intervals.given[index - 1]:
             self.sample(t, state)
         self._index = index
         self._evaluate_within(index)
@@ -241,7 +239,7 @@ class BreakpointHandler:
         self.enter(self._index + 1, t, state)
         fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
         if self._nearness.matters(fresh, self._norm, self.end - t, self._system.multiplier_size):
-            return self._resolved(t, state, fresh)
+            return self._beside_singular(t, state, fresh)
         return fresh
 
     def resolved(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
@@ -254,9 +252,11 @@ class BreakpointHandler:
             If it cannot be evaluated, or the motion from there is not determined.
         """
         fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
-        return self._resolved(t, state, fresh)
+        return self._beside_singular(t, state, fresh)
 
-    def _resolved(self, t: float, state: FloatArray, fresh: IntegratorState) -> IntegratorState:
+    def _beside_singular(
+        self, t: float, state: FloatArray, fresh: IntegratorState
+    ) -> IntegratorState:
         return beside_singular(
             self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
         )

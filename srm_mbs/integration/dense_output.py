@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -304,12 +304,6 @@ def _corrections(steps: Sequence[StepResult]) -> FloatArray:
     return np.array(rows).reshape(len(steps), size)
 
 
-@lru_cache(maxsize=64)
-def _abscissae(scheme: ButcherTableau) -> FloatArray:
-    """Abscissae of the stages, and of the end."""
-    return np.append(scheme.c, 1.0)
-
-
 class DenseOutput:
     """Evaluates the continuous extension of a run.
 
@@ -326,7 +320,7 @@ class DenseOutput:
     def __init__(self, system: System, scheme: ButcherTableau, steps: StepData) -> None:
         self._system = system
         self._extension = scheme.dense
-        self._abscissae = _abscissae(scheme)
+        self._abscissae = scheme.abscissae
         self._smooth: dict[int, HermiteStep] = {}
         self._steps = steps
         self._extra: dict[int, FloatArray] = {}

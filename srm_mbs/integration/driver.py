@@ -16,18 +16,9 @@ from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop
-from srm_mbs.integration.messages import (
-    DAE,
-    MECHANISM,
-    ProblemVocabulary,
-    RunFailure,
-    StopReason,
-    failure_message,
-)
+from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, RunFailure, StopReason
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
-
-__all__ = ["DAE", "MECHANISM", "RunRecord", "RunStatus", "integrate"]
 
 SMALLEST_STEP = 1e-14
 """Shortest step, over the length of the run."""
@@ -42,6 +33,8 @@ RESIDUAL_EXAMINED = 1e-9
 """Constraint residual before a correction, in row units, from which the closures are examined."""
 LARGEST_RESIDUAL = 1e-2
 """Constraint residual after the correction, in row units, from which a run is meaningless."""
+NAMED_SIGMA = 0.05
+"""sigma below which the message of a failure names the singular configuration."""
 
 
 class RunStatus(StrEnum):
@@ -122,13 +115,12 @@ class RunRecord:
 
     def mark_aborted(self, t: float, error: BaseException) -> None:
         """Mark it as interrupted, or failed because a function of the user raised, at ``t``."""
-        kept = "verything up to there is kept."
         if isinstance(error, KeyboardInterrupt):
             self.status = RunStatus.INTERRUPTED
-            self.message = f"Interrupted at t = {t:.6g} s; e{kept}"
+            self.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
             self.status = RunStatus.FAILED
-            self.message = f"Stopped at t = {t:.6g} s: {error}. E{kept}"
+            self.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
 
     def mark_failed(
         self,
@@ -139,10 +131,26 @@ class RunRecord:
         adaptive: bool,
         words: ProblemVocabulary = MECHANISM,
     ) -> None:
-        """Mark it as failed at ``t`` (s); parameters as for
-        :func:`~srm_mbs.integration.messages.failure_message`."""
+        """Mark it as failed.
+
+        Parameters
+        ----------
+        t, h
+            Where it stopped, and the length of the last step that was tried (s).
+        sigma
+            sigma there.
+        adaptive
+            Whether steps follow a tolerance.
+        words
+            How the message names the problem.
+        """
+        near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < NAMED_SIGMA else ""
         self.status, self.stop_reason = RunStatus.FAILED, failure.reason
-        self.message = failure_message(failure, t, h, sigma, adaptive, words)
+        self.message = (
+            f"Stopped at t = {t:.6g} s with step {h:.1e} s: {failure.sentence}.{near} "
+            f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, "
+            f"another tableau, or check that {words.check}."
+        )
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""

@@ -9,10 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
-
-NEAR_SINGULAR_SIGMA = 0.05
-"""sigma below which the message of a failure names the singular configuration."""
 TIMES_LISTED = 5
 """Times listed in a sentence, at most."""
 
@@ -30,6 +26,7 @@ class StopReason(Enum):
         "closures that seemed to follow from the others open: no motion was found that keeps all "
         "loops closed and follows all drives, the mechanism is locked there"
     )
+    UNSTABLE_SWEEPS = "the sweeps do not damp their constraint errors"
 
 
 @dataclass(frozen=True)
@@ -66,35 +63,6 @@ DAE = ProblemVocabulary(
 )
 
 
-def failure_message(
-    failure: RunFailure,
-    t: float,
-    h: float,
-    sigma: float,
-    adaptive: bool,
-    words: ProblemVocabulary = MECHANISM,
-) -> str:
-    """The message of a run that failed.
-
-    Parameters
-    ----------
-    t, h
-        Where it stopped, and the length of the last step that was tried (s).
-    sigma
-        sigma there.
-    adaptive
-        Whether steps follow a tolerance.
-    words
-        Names of the problem.
-    """
-    near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < NEAR_SINGULAR_SIGMA else ""
-    return (
-        f"Stopped at t = {t:.6g} s with step {h:.1e} s: {failure.sentence}.{near} "
-        f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, another "
-        f"tableau, or check that {words.check}."
-    )
-
-
 def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
     """A sentence naming the times at which the motion may have changed its branch.
 
@@ -116,9 +84,3 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
         f" Next to singular configurations, up to t = {listed} s, {what} and no shorter step "
         f"mended it: the motion may have changed its branch. {remedy}"
     )
-
-
-def method_messages(method: Method, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
-    """Sentences of ``method`` about its limits that the accepted ``steps`` of a run met."""
-    own = getattr(method, "run_messages", None)
-    return "" if own is None else str(own(steps, norm))

@@ -331,10 +331,8 @@ def describe_branches(singular: SingularConfiguration, u: FloatArray) -> str:
     ]
     further = len(tangents) - BRANCHES_LISTED
     more = f" and {further} more" if further > 0 else ""
-    return (
-        f"{len(tangents)} branches cross there, with rates in the ratios "
-        f"({'), ('.join(listed)}){more}"
-    )
+    cross = "1 branch passes" if len(tangents) == 1 else f"{len(tangents)} branches cross"
+    return f"{cross} there, with rates in the ratios ({'), ('.join(listed)}){more}"
 
 
 def _refusal(singular: SingularConfiguration, u: FloatArray, why: str) -> InputError:

@@ -404,8 +404,7 @@ def find_crossings(
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
-    abscissae = np.append(scheme.c, 1.0)
-    t, sigma = _recorded(abscissae, steps)
+    t, sigma = _recorded(scheme.abscissae, steps)
     inside = t <= steps.end
     t, sigma = t[inside], sigma[inside]
     if len(t) < 3 or not np.isfinite(sigma).all():
@@ -498,21 +497,6 @@ class Bifurcation:
         )
 
 
-def _reversals(nq: int, steps: StepData, unit: FloatArray) -> set[int]:
-    """Indices of the steps next to a singular configuration in which the motion reverses."""
-    v = steps.states[:, nq:] / unit
-    reverses = (v[:-1] * v[1:]).sum(axis=1) <= 0.0
-    close = steps.sigmas.min(axis=1) < REVERSAL_SIGMA
-    return set(np.flatnonzero(reverses & close).tolist())
-
-
-def _slow(nq: int, steps: StepData, unit: FloatArray) -> bool:
-    """Whether the run ends slowly, compared with its largest speed: one that cannot continue while
-    it moves fails for another reason."""
-    speeds = np.linalg.norm(steps.states[:, nq:] / unit, axis=1)
-    return bool(speeds[-1] <= WITHOUT_MOMENTUM * speeds.max())
-
-
 def _ranges(marked: list[int], steps: StepData) -> list[tuple[int, int]]:
     """First and last of the ``marked`` steps between which sigma stays small."""
     out: list[tuple[int, int]] = []
@@ -573,22 +557,25 @@ def find_bifurcations(
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
-    if not steps.held.any() and not steps.sigmas.min() < REVERSAL_SIGMA:
+    held, last = steps.held > 0.0, steps.count - 1
+    close = steps.sigmas.min(axis=1) < REVERSAL_SIGMA
+    if not (held.any() or close.any()):
         return ()
-    held = set(np.flatnonzero(steps.held).tolist())
-    nq, unit = len(analysis.q0), analysis.coordinate_unit
-    reversals = _reversals(nq, steps, unit)
-    last = steps.count - 1
-    stops = failed and steps.sigmas[last].min() < REVERSAL_SIGMA and _slow(nq, steps, unit)
-    marked = sorted(held | reversals | ({last} if stops else set()))
+    v = steps.states[:, len(analysis.q0) :] / analysis.coordinate_unit
+    speeds = np.linalg.norm(v, axis=1)
+    reverses = (v[:-1] * v[1:]).sum(axis=1) <= 0.0
+    # A run that cannot continue while it moves fails for another reason.
+    stops = bool(failed and close[-1] and speeds[-1] <= WITHOUT_MOMENTUM * speeds.max())
+    marked = held | (reverses & close)
+    marked[last] |= stops
+    if not marked.any():
+        return ()
     found: list[Bifurcation] = []
-    if not marked:
-        return ()
     monitor = ConstraintMonitor(analysis, dense)
-    for first, final in _ranges(marked, steps):
+    for first, final in _ranges(np.flatnonzero(marked).tolist(), steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
-        stayed = final > first or first in held
-        stopped = bool(stops and final == last)
+        stayed = bool(final > first or held[first])
+        stopped = stops and final == last
         # A motion may pass and come back within the step: whether it had the momentum to pass
         # follows from the place of its reversal.
         closest = _closest(monitor, t) if stayed or stopped else _reversal_time(monitor, t)

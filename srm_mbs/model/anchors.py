@@ -1,4 +1,4 @@
-"""Anchors: frames fixed on bodies, at which closures, forces and drives act."""
+"""Anchors, frames fixed on bodies, and joints: where closures, forces and drives act."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from srm_mbs.model.numbers import vector
 
 WORLD = "world"
 """Reserved link name: the fixed ground."""
+
+_GIVE_ANCHOR = 'Give for example srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))'
 
 
 @dataclass(frozen=True)
@@ -68,16 +70,15 @@ class Anchor:
         offset = pin.SE3(pin.rpy.rpyToMatrix(np.array(self.rpy)), np.array(self.xyz))
         if self.link == WORLD:
             return 0, offset
+        body = pin.FrameType.BODY
         if self.link is not None:
-            known = model.existFrame(self.link, pin.FrameType.BODY)
-            index = model.getFrameId(self.link, pin.FrameType.BODY) if known else -1
+            index = model.getFrameId(self.link, body) if model.existFrame(self.link, body) else -1
         else:
             index = next((i for i, f in enumerate(model.frames) if f.name == self.frame), -1)
         if index < 0:
             kind = "link" if self.link is not None else "frame"
-            body = pin.FrameType.BODY
-            names = [f.name for f in model.frames if kind == "frame" or f.type == body]
-            shown = ", ".join(sorted(set(names) - {"universe"} | {WORLD}))
+            names = {f.name for f in model.frames if kind == "frame" or f.type == body}
+            shown = ", ".join(sorted(names - {"universe"} | {WORLD}))
             raise InputError(f"there is no {kind} {self.where!r}", remedy=f"Known: {shown}")
         frame = model.frames[index]
         return int(frame.parentJoint), frame.placement * offset
@@ -93,12 +94,17 @@ def name_places(element: str, *anchors: Any) -> list[str]:
     """
     for anchor in anchors:
         if not isinstance(anchor, Anchor | None):
-            raise InputError(
-                f"{anchor!r} is not an anchor",
-                element=element,
-                remedy='Give for example srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))',
-            )
+            raise InputError(f"{anchor!r} is not an anchor", element=element, remedy=_GIVE_ANCHOR)
     return [anchor.where for anchor in anchors if anchor is not None]
+
+
+def _resolve(model: pin.Model, anchor: Anchor, element: str) -> tuple[int, pin.SE3]:
+    """:meth:`Anchor.resolve`, with an error about ``element``."""
+    try:
+        return anchor.resolve(model)
+    except InputError as error:
+        error.element = element
+        raise
 
 
 def resolve_apart(
@@ -111,21 +117,16 @@ def resolve_apart(
     InputError
         If the model has no such link or frame, or both lie on the same body.
     """
-    resolved = []
-    for side, anchor in (("a", a), ("b", b)):
-        try:
-            resolved.append(anchor.resolve(model))
-        except InputError as error:
-            error.element = f"{element}, anchor {side}"
-            raise
-    if resolved[0][0] == resolved[1][0]:
+    at_a = _resolve(model, a, f"{element}, anchor a")
+    at_b = _resolve(model, b, f"{element}, anchor b")
+    if at_a[0] == at_b[0]:
         raise InputError(
             "both anchors lie on the same body",
             element=element,
             remedy="Anchor it on two bodies that move relative to each other "
             "(locked and fixed joints join bodies)",
         )
-    return resolved[0], resolved[1]
+    return at_a, at_b
 
 
 def resolve_moving(
@@ -144,20 +145,48 @@ def resolve_moving(
     for anchor in anchors:
         if not isinstance(anchor, Anchor):
             raise InputError(
-                f"{anchor!r} is not a point of a link",
-                element=element,
-                remedy='Give for example srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))',
+                f"{anchor!r} is not a point of a link", element=element, remedy=_GIVE_ANCHOR
             )
-        try:
-            joint, placement = anchor.resolve(model)
-        except InputError as error:
-            error.element = element
-            raise
+        joint, placement = _resolve(model, anchor, element)
         if joint == 0:
             raise InputError(
-                f"{anchor.where!r} lies on the ground and has no path",
+                f"{anchor.where!r} lies on the ground and does not move",
                 element=element,
                 remedy="Name a point of a link that moves",
             )
         found.append((joint, placement))
     return found
+
+
+def moving_joint(model: pin.Model, name: str | None, element: str) -> Any:
+    """Pinocchio's model of the joint ``name``, on which ``element`` acts.
+
+    Raises
+    ------
+    InputError
+        About ``element`` if there is no such moving joint; the message lists those there are.
+    """
+    names = list(model.names)[1:]
+    if name not in names:
+        raise InputError(
+            f"there is no moving joint {name!r}",
+            element=element,
+            remedy=f"Known: {', '.join(names) or 'none'}",
+        )
+    return model.joints[model.getJointId(name)]
+
+
+def one_degree_joint(model: pin.Model, name: str | None, element: str, instead: str) -> Any:
+    """:func:`moving_joint` with one degree of freedom; ``instead`` is the remedy for others.
+
+    Raises
+    ------
+    InputError
+        About ``element`` if there is no such moving joint, or it has several degrees of freedom.
+    """
+    joint = moving_joint(model, name, element)
+    if joint.nv != 1:
+        raise InputError(
+            f"joint {name!r} has {joint.nv} degrees of freedom", element=element, remedy=instead
+        )
+    return joint

@@ -32,8 +32,8 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import Anchor, name_places, resolve_apart
-from srm_mbs.model.numbers import finite_numbers, vector
+from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
+from srm_mbs.model.numbers import finite_number, finite_numbers, unit_vector
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -107,18 +107,14 @@ class RowSet:
         return slice(0, lengths), slice(lengths, joints), slice(joints, self.count)
 
 
-def _no_axis() -> FloatArray:
-    return np.zeros(3)
-
-
 @dataclass(frozen=True)
 class ClosureValues:
     """Constants of the rows of a closure: unit axes (3,) and a length (m), as far as its type has
     them."""
 
-    axis: FloatArray = field(default_factory=_no_axis)
-    axis_a: FloatArray = field(default_factory=_no_axis)
-    axis_b: FloatArray = field(default_factory=_no_axis)
+    axis: FloatArray = field(default_factory=lambda: np.zeros(3))
+    axis_a: FloatArray = field(default_factory=lambda: np.zeros(3))
+    axis_b: FloatArray = field(default_factory=lambda: np.zeros(3))
     length: float = np.nan
     joint_row: JointRow = field(default_factory=lambda: JointRow((), ()))
 
@@ -212,53 +208,42 @@ def _coupling(values: ClosureValues) -> RowSet:
 _ANCHORS = ("a", "b")
 _WITH_AXIS = (*_ANCHORS, "axis")
 
-CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType(
-    {
-        closure.name: closure
-        for closure in (
-            ClosureType("point", _ANCHORS, _point, "ball joint: the two origins coincide"),
-            ClosureType("frame", _ANCHORS, _frame, "weld: the two frames coincide"),
-            ClosureType("revolute", _WITH_AXIS, _revolute, "hinge: origins and axes coincide"),
-            ClosureType(
-                "prismatic", _WITH_AXIS, _prismatic, "slider: a moves in b along axis, without turn"
-            ),
-            ClosureType(
-                "cylindrical", _WITH_AXIS, _cylindrical, "a slides along axis and turns about it"
-            ),
-            ClosureType(
-                "universal",
-                (*_ANCHORS, "axis_a", "axis_b"),
-                _universal,
-                "Hooke joint: the origins coincide, axis_a of a is perpendicular to axis_b of b",
-            ),
-            ClosureType(
-                "planar", _WITH_AXIS, _planar, "a moves in the plane of b with normal axis"
-            ),
-            ClosureType(
-                "point_on_line",
-                _WITH_AXIS,
-                _point_on_line,
-                "a's origin on the line of b along axis",
-            ),
-            ClosureType(
-                "point_on_plane",
-                _WITH_AXIS,
-                _point_on_plane,
-                "a's origin in the plane through b's origin with normal axis",
-            ),
-            ClosureType(
-                "distance", _ANCHORS, _distance, "rod: the origins keep their distance", ("length",)
-            ),
-            ClosureType(
-                "coupling",
-                ("joints",),
-                _coupling,
-                "gear: a linear relation of joint coordinates",
-                ("ratio", "coefficients", "offset"),
-            ),
-        )
-    }
+_TYPES = (
+    ClosureType("point", _ANCHORS, _point, "ball joint: the two origins coincide"),
+    ClosureType("frame", _ANCHORS, _frame, "weld: the two frames coincide"),
+    ClosureType("revolute", _WITH_AXIS, _revolute, "hinge: origins and axes coincide"),
+    ClosureType(
+        "prismatic", _WITH_AXIS, _prismatic, "slider: a moves in b along axis, without turn"
+    ),
+    ClosureType("cylindrical", _WITH_AXIS, _cylindrical, "a slides along axis and turns about it"),
+    ClosureType(
+        "universal",
+        (*_ANCHORS, "axis_a", "axis_b"),
+        _universal,
+        "Hooke joint: the origins coincide, axis_a of a is perpendicular to axis_b of b",
+    ),
+    ClosureType("planar", _WITH_AXIS, _planar, "a moves in the plane of b with normal axis"),
+    ClosureType(
+        "point_on_line", _WITH_AXIS, _point_on_line, "a's origin on the line of b along axis"
+    ),
+    ClosureType(
+        "point_on_plane",
+        _WITH_AXIS,
+        _point_on_plane,
+        "a's origin in the plane through b's origin with normal axis",
+    ),
+    ClosureType(
+        "distance", _ANCHORS, _distance, "rod: the origins keep their distance", ("length",)
+    ),
+    ClosureType(
+        "coupling",
+        ("joints",),
+        _coupling,
+        "gear: a linear relation of joint coordinates",
+        ("ratio", "coefficients", "offset"),
+    ),
 )
+CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType({kind.name: kind for kind in _TYPES})
 """The closures by their type in a description."""
 
 
@@ -266,9 +251,9 @@ COINCIDENCE_TOLERANCE = 1e-9
 """Distance of two points, over their distance from the world's origin, that is rounding."""
 
 
-def _key(words: str, remedy: str) -> dict[str, str]:
-    """A key of a closure for messages: its name with an article, and how to give it."""
-    return {"words": words, "remedy": remedy}
+def _key(words: str, form: str) -> Any:
+    """A key of a closure, None by default; for messages its name with an article, and its form."""
+    return field(default=None, metadata={"words": words, "remedy": f"Give {form}"})
 
 
 @dataclass(frozen=True)
@@ -306,39 +291,26 @@ class LoopClosure:
     """
 
     type: str | ClosureType
-    a: Anchor | None = field(
-        default=None, metadata=_key("an anchor a", 'Give "a = { link = ... }"')
-    )
-    b: Anchor | None = field(
-        default=None, metadata=_key("an anchor b", 'Give "b = { link = ... }"')
-    )
-    axis: tuple[float, float, float] | None = field(
-        default=None, metadata=_key("an axis", 'Give "axis = [x, y, z]", in b\'s frame')
-    )
+    a: Anchor | None = _key("an anchor a", '"a = { link = ... }"')  # noqa: RUF009 - a field
+    b: Anchor | None = _key("an anchor b", '"b = { link = ... }"')  # noqa: RUF009 - a field
+    axis: tuple[float, float, float] | None = _key("an axis", '"axis = [x, y, z]", in b\'s frame')
     name: str = ""
-    axis_a: tuple[float, float, float] | None = field(
-        default=None, metadata=_key("an axis_a", 'Give "axis_a = [x, y, z]", in a\'s frame')
+    axis_a: tuple[float, float, float] | None = _key(
+        "an axis_a", '"axis_a = [x, y, z]", in a\'s frame'
     )
-    axis_b: tuple[float, float, float] | None = field(
-        default=None, metadata=_key("an axis_b", 'Give "axis_b = [x, y, z]", in b\'s frame')
+    axis_b: tuple[float, float, float] | None = _key(
+        "an axis_b", '"axis_b = [x, y, z]", in b\'s frame'
     )
-    length: float | None = field(
-        default=None, metadata=_key("a length", 'Give "length = ...", in m')
-    )
-    joints: tuple[str, ...] | None = field(
-        default=None, metadata=_key("joints", 'Give "joints = [first, second]"')
-    )
-    ratio: float | None = field(default=None, metadata=_key("a ratio", 'Give "ratio = ..."'))
-    coefficients: tuple[float, ...] | None = field(
-        default=None, metadata=_key("coefficients", 'Give "coefficients = [...]"')
-    )
-    offset: float | None = field(default=None, metadata=_key("an offset", 'Give "offset = ..."'))
+    length: float | None = _key("a length", '"length = ...", in m')
+    joints: tuple[str, ...] | None = _key("joints", '"joints = [first, second]"')
+    ratio: float | None = _key("a ratio", '"ratio = ..."')
+    coefficients: tuple[float, ...] | None = _key("coefficients", '"coefficients = [...]"')
+    offset: float | None = _key("an offset", '"offset = ..."')
 
     def __post_init__(self) -> None:
-        places = name_places(f"loop {self.name!r}", self.a, self.b)
+        places = name_places(self._element, self.a, self.b) or self.joints or ()
         if not self.name:
-            where = places or [*(self.joints or ())]
-            object.__setattr__(self, "name", "_".join((self.type_name, *where)))
+            object.__setattr__(self, "name", "_".join((self.type_name, *places)))
         if not isinstance(self.type, ClosureType) and self.type not in CLOSURE_TYPES:
             raise self._fault(
                 f"there is no closure type {self.type!r}",
@@ -346,43 +318,31 @@ class LoopClosure:
             )
         kind = self.kind
         for entry in fields(self):
-            key = entry.name
-            if key in ("type", "name"):
-                continue
-            given = getattr(self, key) is not None
-            if not given and key in kind.needs:
-                problem = f"a {self.type_name} closure needs {entry.metadata['words']}"
+            key, missing = entry.name, getattr(self, entry.name) is None
+            if missing and key in kind.needs:
+                problem = f"a {kind.name} closure needs {entry.metadata['words']}"
                 raise self._fault(problem, entry.metadata["remedy"])
-            if given and key not in (*kind.needs, *kind.takes):
-                raise self._fault(f"a {self.type_name} closure takes no {key}", f'Remove "{key}"')
+            if not missing and key not in ("type", "name", *kind.needs, *kind.takes):
+                raise self._fault(f"a {kind.name} closure takes no {key}", f'Remove "{key}"')
         for key in ("axis", "axis_a", "axis_b"):
-            if getattr(self, key) is not None:
-                self._take_axis(key)
+            given = getattr(self, key)
+            if given is not None:
+                object.__setattr__(self, key, unit_vector(given, key, self._element))
         if self.length is not None:
             self._take_length()
         if self.joints is not None:
             self._take_joints(self.joints)
 
+    @property
+    def _element(self) -> str:
+        """Its name in messages."""
+        return f"loop {self.name!r}"
+
     def _fault(self, problem: str, remedy: str) -> InputError:
-        return InputError(problem, element=f"loop {self.name!r}", remedy=remedy)
-
-    def _take_axis(self, key: str) -> None:
-        axis = np.array(vector(getattr(self, key), key))
-        size = float(np.linalg.norm(axis))
-        if size == 0.0:
-            raise self._fault(f"the {key} is zero", "Give a direction")
-        axis /= size
-        object.__setattr__(self, key, (float(axis[0]), float(axis[1]), float(axis[2])))
-
-    def _take_numbers(self, key: str, given: Any, count: int) -> tuple[float, ...]:
-        try:
-            return finite_numbers(given, count, key, f"Give {count} finite number(s)")
-        except InputError as error:
-            error.element = f"loop {self.name!r}"
-            raise
+        return InputError(problem, element=self._element, remedy=remedy)
 
     def _take_length(self) -> None:
-        (length,) = self._take_numbers("length", (self.length,), 1)
+        length = finite_number(self.length, "length", self._element)
         if length == 0.0:
             raise self._fault(
                 "a distance of 0 has no direction",
@@ -417,11 +377,14 @@ class LoopClosure:
                     f"a ratio relates two joints, not {len(joints)}",
                     "Name two joints, or give coefficients",
                 )
-            (ratio,) = self._take_numbers("ratio", (self.ratio,), 1)
+            ratio = finite_number(self.ratio, "ratio", self._element)
             object.__setattr__(self, "ratio", ratio)
             numbers: tuple[float, ...] = (ratio,)
         else:
-            numbers = self._take_numbers("coefficients", self.coefficients, len(joints))
+            remedy = "Give one number for each joint"
+            numbers = finite_numbers(
+                self.coefficients, len(joints), "coefficients", remedy, self._element
+            )
             object.__setattr__(self, "coefficients", numbers)
         if 0.0 in numbers:
             raise self._fault(
@@ -429,7 +392,7 @@ class LoopClosure:
                 "Remove that joint from the coupling; to hold a joint, name it in lock",
             )
         offset = 0.0 if self.offset is None else self.offset
-        object.__setattr__(self, "offset", self._take_numbers("offset", (offset,), 1)[0])
+        object.__setattr__(self, "offset", finite_number(offset, "offset", self._element))
         object.__setattr__(self, "joints", joints)
 
     @property
@@ -496,19 +459,10 @@ class LoopClosure:
         """
         if self.anchors:
             a, b = self.anchors
-            resolve_apart(model, a, b, f"loop {self.name!r}")
-        names = list(model.names)[1:]
+            resolve_apart(model, a, b, self._element)
         for name in self.joints or ():
-            if name not in names:
-                raise self._fault(
-                    f"there is no moving joint {name!r}", f"Known: {', '.join(names) or 'none'}"
-                )
-            joint = model.joints[model.getJointId(name)]
-            if joint.nv != 1:
-                raise self._fault(
-                    f"the joint {name!r} has {joint.nv} degrees of freedom",
-                    "Couple joints with one degree of freedom",
-                )
+            instead = "Couple joints with one degree of freedom"
+            joint = one_degree_joint(model, name, self._element, instead)
             if joint.nq != 1:
                 raise self._fault(
                     f"the joint {name!r} is stored as (cos, sin), which does not count turns",

@@ -1,8 +1,6 @@
 """Drives: motions prescribed over time, as the constraints g(q) = s(t).
 
 A drive removes one degree of freedom; the force that it exerts is ``solution.drive_forces``.
-The functions at the top collect the laws over time of a mechanism: until when they are defined, and
-where they are not smooth.
 
 The fields of :class:`Drive` are the one list of the keys of a drive: descriptions
 (:mod:`srm_mbs.formats.toml.schema`) and saved runs (:mod:`srm_mbs.simulation.storage`) read them.
@@ -10,9 +8,8 @@ The fields of :class:`Drive` are the one list of the keys of a drive: descriptio
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,48 +17,10 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import Anchor, name_places, resolve_apart
+from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
-
-NamedLaw = tuple[str, Law]
-"""An element, and a law over time that it follows."""
-
-
-def laws_over_time(drives: Sequence[Drive], forces: Sequence[ForceElement]) -> tuple[NamedLaw, ...]:
-    """Every law that drives and force elements follow."""
-    found = [(f"drive {drive.name!r}", drive.law) for drive in drives]
-    for force in forces:
-        given = getattr(force, "law", None) or ()
-        laws = given if isinstance(given, tuple) else (given,)
-        found += [(f"force {force.name!r}", law) for law in laws]
-    return tuple(found)
-
-
-def check_covers(laws: Sequence[NamedLaw], t_end: float) -> None:
-    """Refuse a run to ``t_end`` (s) that is longer than a table.
-
-    Raises
-    ------
-    InputError
-        Naming what has the table.
-    """
-    for element, law in laws:
-        last = law.span[1]
-        if last < t_end:
-            raise InputError(
-                f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
-                element=element,
-                remedy="Extend the table, or end the run earlier",
-            )
-
-
-def knots_between(laws: Sequence[NamedLaw], t0: float, t_end: float) -> tuple[float, ...]:
-    """Times (s) between ``t0`` and ``t_end`` at which a law is not smooth, in order."""
-    times = {knot for _, law in laws for knot in law.knots}
-    return tuple(sorted(knot for knot in times if t0 < knot < t_end))
-
+from srm_mbs.model.numbers import unit_vector
 
 LAWS_WITH_VALUES = (Table, Polynomial, Sine)
 """Laws with a value s(0) of their own, which can prescribe positions."""
@@ -111,7 +70,7 @@ class Drive:
     name: str = ""
 
     def __post_init__(self) -> None:
-        places = name_places(f"drive {self.name!r}", self.a, self.b)
+        places = name_places(self._element, self.a, self.b)
         if not self.name:
             object.__setattr__(self, "name", self.joint or "_".join(["drive", *places]))
         if not isinstance(self.law, Law):
@@ -122,9 +81,7 @@ class Drive:
                 "a drive moves either a joint or a point relative to another",
                 "Give joint, or a and b",
             )
-        if anchors == (self.axis is None and not self.distance) or (
-            self.axis is not None and self.distance
-        ):
+        if [self.axis is not None, bool(self.distance)].count(True) != anchors:
             raise self._fault(
                 "what is driven is not determined",
                 "Give axis = [x, y, z] or distance = true with a and b, and neither with a joint",
@@ -134,11 +91,16 @@ class Drive:
                 f"the law {self.law.type!r} starts from the initial value in any case",
                 "Remove absolute",
             )
-        if self.axis is not None and self.closure is not None:
-            object.__setattr__(self, "axis", self.closure.axis)
+        if self.axis is not None:
+            object.__setattr__(self, "axis", unit_vector(self.axis, "axis", self._element))
+
+    @property
+    def _element(self) -> str:
+        """Its name in messages."""
+        return f"drive {self.name!r}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
-        return InputError(problem, element=f"drive {self.name!r}", remedy=remedy)
+        return InputError(problem, element=self._element, remedy=remedy)
 
     @property
     def closure(self) -> LoopClosure | None:
@@ -147,8 +109,8 @@ class Drive:
             return None
         if self.distance:
             return LoopClosure("distance", self.a, self.b, name=self.name, length=NOMINAL_LENGTH)
-        x, y, z = self.axis or ()
-        return LoopClosure("point_on_plane", self.a, self.b, (x, y, z), self.name)
+        axis: Any = self.axis
+        return LoopClosure("point_on_plane", self.a, self.b, axis, self.name)
 
     def frozen(self, value: float) -> LoopClosure:
         """For a point: the closure that holds its coordinate at ``value`` (m).
@@ -182,19 +144,10 @@ class Drive:
             Naming the drive and the remedy.
         """
         if self.a is not None and self.b is not None:
-            resolve_apart(model, self.a, self.b, f"drive {self.name!r}")
-            return
-        names = list(model.names)[1:]
-        if self.joint not in names:
-            raise self._fault(
-                f"there is no moving joint {self.joint!r}", f"Known: {', '.join(names) or 'none'}"
-            )
-        joint = model.joints[model.getJointId(self.joint)]
-        if joint.nv != 1:
-            raise self._fault(
-                f"joint {self.joint!r} has {joint.nv} degrees of freedom",
-                "Drive a point with a, b and axis, or model it with joints of one degree",
-            )
+            resolve_apart(model, self.a, self.b, self._element)
+        else:
+            instead = "Drive a point with a, b and axis, or model it with joints of one degree"
+            one_degree_joint(model, self.joint, self._element, instead)
 
 
 def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
@@ -202,7 +155,7 @@ def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
     return tuple(sorted(drives, key=lambda drive: drive.joint is not None))
 
 
-def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> Mapping[str, float]:
+def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> dict[str, float]:
     """The driven coordinate of each drive (rad, m) at q (nq,); angles of continuous joints in
     (-pi, pi]."""
     data = workspace(model)
@@ -218,4 +171,4 @@ def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> Mapping[str,
         apart = (data.oMi[at_b] * in_b).actInv((data.oMi[at_a] * in_a).translation)
         axis = None if drive.axis is None else np.array(drive.axis)
         out[drive.name] = float(np.linalg.norm(apart) if axis is None else axis @ apart)
-    return MappingProxyType(out)
+    return out

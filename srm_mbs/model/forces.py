@@ -21,9 +21,38 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.anchors import Anchor, name_places, resolve_apart
+from srm_mbs.model.anchors import (
+    Anchor,
+    moving_joint,
+    name_places,
+    one_degree_joint,
+    resolve_apart,
+    resolve_moving,
+)
 from srm_mbs.model.laws import Law
-from srm_mbs.model.numbers import finite_numbers
+from srm_mbs.model.numbers import finite_array
+
+
+def quantity(
+    unit: str, default: Any, *, nonnegative: bool = False, count: int = 0, needed: bool = False
+) -> Any:
+    """A numerical field of a force element, which the element checks and stores.
+
+    Parameters
+    ----------
+    unit
+        For tables; "N m, N": that for angles, then that for lengths.
+    default
+        Its default; None: the element decides.
+    nonnegative
+        Whether it must not be negative.
+    count
+        Length of a list of numbers; 0: one number.
+    needed
+        Whether a description must give it, because the element refuses the default.
+    """
+    facts = {"unit": unit, "nonnegative": nonnegative, "count": count, "needed": needed}
+    return field(default=default, metadata=facts)
 
 
 class ForceElement(ABC):
@@ -52,6 +81,57 @@ class ForceElement(ABC):
         InputError
             Naming the element and the remedy.
         """
+
+    @property
+    def _element(self) -> str:
+        """Its name in messages."""
+        return f"force {self.name or self.type!r}"
+
+    def _fault(self, problem: str, remedy: str) -> InputError:
+        return InputError(problem, element=self._element, remedy=remedy)
+
+    def _set(self, key: str, value: Any) -> None:
+        object.__setattr__(self, key, value)
+
+    def _take_name(self, *places: str) -> None:
+        """The default name, if none is given."""
+        self._set("name", self.name or "_".join((self.type, *places)))
+
+    def _take_number(self, key: str, count: int, nonnegative: bool = False) -> None:
+        """Check a number (``count`` 0) or ``count`` numbers and store them as float or tuple."""
+        given = getattr(self, key)
+        wanted = f"a list of {count} finite numbers" if count else "a finite number"
+        numbers = finite_array(given, (count,) if count else ())
+        if numbers is None:
+            raise self._fault(f"{key} = {given!r} is not {wanted}", f"Give {wanted}")
+        if nonnegative and numbers.min() < 0.0:
+            raise self._fault(f"{key} = {given!r} is negative", "Give a value >= 0")
+        self._set(key, tuple(numbers.tolist()) if count else float(numbers))
+
+    def _take_quantities(self) -> None:
+        """Check and store every :func:`quantity` that is not None."""
+        for key in fields(self):  # type: ignore[arg-type]
+            if "unit" in key.metadata and getattr(self, key.name) is not None:
+                self._take_number(key.name, key.metadata["count"], key.metadata["nonnegative"])
+
+    def _refuse_zeros(self, *keys: str) -> None:
+        """Refuse an element without effect: all its quantities ``keys`` are zero."""
+        if not np.any([getattr(self, key) for key in keys]):
+            raise self._fault(
+                f"{' and '.join(keys)} are zero", "Give one of them, or remove the element"
+            )
+
+    def _take_law(self, count: int) -> tuple[Law, ...]:
+        """Check the field ``law``, one law or ``count`` of them; returns them, () for None."""
+        law = getattr(self, "law")  # noqa: B009 - a field of subclasses
+        if law is None:
+            return ()
+        laws = tuple(law) if isinstance(law, list | tuple) else (law,)
+        if len(laws) not in (1, count) or not all(isinstance(each, Law) for each in laws):
+            several = f" or a list of {count}" if count > 1 else ""
+            raise self._fault(f"law is not a law{several}", "Give srm.Sine(...) or alike")
+        self._set("law", laws[0] if len(laws) == 1 else laws)
+        return laws
 
 
 @dataclass(frozen=True)
@@ -85,147 +165,13 @@ class UserForce(ForceElement):
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise InputError(
-                f"{self.function!r} cannot be called",
-                element=f"force {self.name or 'user'!r}",
-                remedy="Give a function of (t, q, v)",
-            )
-        if not self.name:
-            made = getattr(self.function, "__name__", "function").strip("<>")
-            object.__setattr__(self, "name", f"user_{made}")
-        name_places(f"force {self.name!r}", self.at)
+            raise self._fault(f"{self.function!r} cannot be called", "Give a function of (t, q, v)")
+        self._take_name(getattr(self.function, "__name__", "function").strip("<>"))
+        name_places(self._element, self.at)
 
     def check(self, model: pin.Model) -> None:
-        if self.at is None:
-            return
-        try:
-            joint, _ = self.at.resolve(model)
-        except InputError as error:
-            error.element = f"force {self.name!r}, anchor at"
-            raise
-        if joint == 0:
-            raise InputError(
-                f"{self.at.where!r} does not move",
-                element=f"force {self.name!r}",
-                remedy="Let the force act on a moving link",
-            )
-
-
-def quantity(
-    unit: str, default: Any, *, lowest: float = -np.inf, count: int = 0, needed: bool = False
-) -> Any:
-    """A numerical field of a force element; :func:`take_quantities` checks and stores it.
-
-    Parameters
-    ----------
-    unit
-        For tables; "N m, N": that for angles, then that for lengths.
-    default
-        Its default; None: the element decides.
-    lowest
-        The least value.
-    count
-        Length of a list of numbers; 0: one number.
-    needed
-        Whether a description must give it, because the element refuses the default.
-    """
-    facts = {"unit": unit, "lowest": lowest, "count": count, "needed": needed}
-    return field(default=default, metadata=facts)
-
-
-def fault(force: ForceElement, problem: str, remedy: str) -> InputError:
-    """The error of ``force``, to be raised."""
-    return InputError(problem, element=f"force {force.name!r}", remedy=remedy)
-
-
-def take_name(force: ForceElement, *places: str) -> None:
-    """The default name, if none is given."""
-    if not force.name:
-        object.__setattr__(force, "name", "_".join((force.type, *places)))
-
-
-def take(force: ForceElement, key: str, count: int = 0, lowest: float = -np.inf) -> Any:
-    """Check a number, or ``count`` numbers, of ``force`` and store them as float or tuple.
-
-    Raises
-    ------
-    InputError
-        If they are not finite, or below ``lowest``.
-    """
-    given = getattr(force, key)
-    remedy = f"Give a list of {count} finite numbers" if count else "Give a finite number"
-    try:
-        numbers = finite_numbers(given if count else (given,), count or 1, key, remedy)
-    except InputError as error:
-        raise fault(force, f"{key} = {given!r} cannot be", remedy) from error
-    if min(numbers) < lowest:
-        raise fault(force, f"{key} = {given!r} is negative", "Give a value >= 0")
-    value = numbers if count else numbers[0]
-    object.__setattr__(force, key, value)
-    return value
-
-
-def take_quantities(force: Any) -> None:
-    """Check and store every :func:`quantity` of ``force`` that is not None.
-
-    Raises
-    ------
-    InputError
-        If one is not finite, too small, or of the wrong length.
-    """
-    for key in fields(force):
-        if "unit" in key.metadata and getattr(force, key.name) is not None:
-            take(force, key.name, key.metadata["count"], key.metadata["lowest"])
-
-
-def refuse_without_effect(force: ForceElement, *keys: str) -> None:
-    """Refuse an element whose quantities ``keys`` are all zero.
-
-    Raises
-    ------
-    InputError
-        Naming them.
-    """
-    if not np.any([getattr(force, key) for key in keys]):
-        raise fault(
-            force, f"{' and '.join(keys)} are zero", "Give one of them, or remove the element"
-        )
-
-
-def moving_joint(force: ForceElement, model: pin.Model, name: str) -> Any:
-    """Pinocchio's joint ``name``, on which ``force`` acts.
-
-    Raises
-    ------
-    InputError
-        If there is no such moving joint; the message lists those there are.
-    """
-    names = list(model.names)[1:]
-    if name not in names:
-        raise fault(
-            force, f"there is no moving joint {name!r}", f"Known: {', '.join(names) or 'none'}"
-        )
-    return model.joints[model.getJointId(name)]
-
-
-def take_law(force: ForceElement, count: int) -> bool:
-    """Check the law of ``force``, one or ``count`` of them; whether there is any.
-
-    Raises
-    ------
-    InputError
-        If it is no law, or there is another number of them.
-    """
-    law = getattr(force, "law")  # noqa: B009 - the fields of subclasses
-    if law is None:
-        return False
-    laws = tuple(law) if isinstance(law, list | tuple) else (law,)
-    if len(laws) not in (1, count) or not all(isinstance(each, Law) for each in laws):
-        raise fault(
-            force, "law is not a law", f"Give srm.Sine(...) or alike, or a list of {count} of them"
-        )
-    object.__setattr__(force, "law", laws[0] if len(laws) == 1 else laws)
-    return True
+        if self.at is not None:
+            resolve_moving(model, [self.at], f"{self._element}, anchor at")
 
 
 OPEN_LIMIT = 1e30
@@ -233,7 +179,24 @@ OPEN_LIMIT = 1e30
 
 
 @dataclass(frozen=True)
-class SpringDamper(ForceElement):
+class _BetweenLinks(ForceElement):
+    """A spring and damper between anchors on different bodies."""
+
+    has_potential: ClassVar[bool] = True
+    a: Anchor
+    b: Anchor
+
+    def __post_init__(self) -> None:
+        self._take_name(*name_places(self._element, self.a, self.b))
+        self._take_quantities()
+        self._refuse_zeros("stiffness", "damping")
+
+    def check(self, model: pin.Model) -> None:
+        resolve_apart(model, self.a, self.b, self._element)
+
+
+@dataclass(frozen=True)
+class SpringDamper(_BetweenLinks):
     """Spring and damper between two points, along the line that joins them.
 
     With the distance l of the points it pulls them together with F = k (l - l0) + c dl/dt.
@@ -261,27 +224,19 @@ class SpringDamper(ForceElement):
     """
 
     type: ClassVar[str] = "spring_damper"
-    has_potential: ClassVar[bool] = True
-    a: Anchor
-    b: Anchor
-    stiffness: float = quantity("N/m", 0.0, lowest=0.0)
-    damping: float = quantity("N s/m", 0.0, lowest=0.0)
-    rest_length: float | None = quantity("m", None, lowest=0.0)
+    stiffness: float = quantity("N/m", 0.0, nonnegative=True)
+    damping: float = quantity("N s/m", 0.0, nonnegative=True)
+    rest_length: float | None = quantity("m", None, nonnegative=True)
     name: str = ""
 
     def __post_init__(self) -> None:
-        take_name(self, *name_places(f"force {self.name or self.type!r}", self.a, self.b))
-        take_quantities(self)
-        refuse_without_effect(self, "stiffness", "damping")
+        super().__post_init__()
         if self.rest_length is None:
             if self.stiffness:
-                raise fault(
-                    self, "a spring needs a rest_length", "Give the length without force, in m"
+                raise self._fault(
+                    "a spring needs a rest_length", "Give the length without force, in m"
                 )
-            object.__setattr__(self, "rest_length", 0.0)
-
-    def check(self, model: pin.Model) -> None:
-        resolve_apart(model, self.a, self.b, f"force {self.name!r}")
+            self._set("rest_length", 0.0)
 
 
 @dataclass(frozen=True)
@@ -313,22 +268,20 @@ class JointTorque(ForceElement):
     law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
-        take_name(self, self.joint)
+        self._take_name(self.joint)
         given: Any = self.torque
-        follows = take_law(self, max(1, np.size(given)))
+        laws = self._take_law(max(1, np.size(given)))
         if given is None:
-            object.__setattr__(self, "torque", 1.0 if follows else 0.0)
-        take(self, "torque", np.size(given) if np.ndim(given) else 0)
+            self._set("torque", 1.0 if laws else 0.0)
+        self._take_number("torque", np.size(given) if np.ndim(given) else 0)
 
     def check(self, model: pin.Model) -> None:
-        joint = moving_joint(self, model, self.joint)
-        numbers: Any = self.torque
-        if np.size(numbers) != joint.nv:
-            raise fault(
-                self,
-                f"torque = {self.torque!r} does not fit the {joint.nv} degrees of freedom of "
+        count = moving_joint(model, self.joint, self._element).nv
+        if np.size(self.torque) != count:  # type: ignore[arg-type]
+            raise self._fault(
+                f"torque = {self.torque!r} does not fit the {count} degrees of freedom of "
                 f"joint {self.joint!r}",
-                "Give one number" if joint.nv == 1 else f"Give a list of {joint.nv} numbers",
+                "Give one number" if count == 1 else f"Give a list of {count} numbers",
             )
 
 
@@ -357,27 +310,22 @@ class TorsionSpring(ForceElement):
     type: ClassVar[str] = "torsion_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = quantity("N m/rad, N/m", 0.0, lowest=0.0)
-    damping: float = quantity("N m s/rad, N s/m", 0.0, lowest=0.0)
+    stiffness: float = quantity("N m/rad, N/m", 0.0, nonnegative=True)
+    damping: float = quantity("N m s/rad, N s/m", 0.0, nonnegative=True)
     rest_angle: float = quantity("rad, m", 0.0)
     name: str = ""
 
     def __post_init__(self) -> None:
-        take_name(self, self.joint)
-        take_quantities(self)
-        refuse_without_effect(self, "stiffness", "damping")
+        self._take_name(self.joint)
+        self._take_quantities()
+        self._refuse_zeros("stiffness", "damping")
 
     def check(self, model: pin.Model) -> None:
-        joint = moving_joint(self, model, self.joint)
-        if joint.nv != 1:
-            raise fault(
-                self,
-                f"joint {self.joint!r} has {joint.nv} degrees of freedom",
-                "Use a bushing between its links",
-            )
+        joint = one_degree_joint(
+            model, self.joint, self._element, "Use a bushing between its links"
+        )
         if joint.nq != 1 and self.stiffness:
-            raise fault(
-                self,
+            raise self._fault(
                 f"the angle of the continuous joint {self.joint!r} does not count turns",
                 'Make the joint "revolute" in the URDF, with wide limits: they do not act',
             )
@@ -416,30 +364,21 @@ class Wrench(ForceElement):
     law: Law | tuple[Law, ...] | None = None
 
     def __post_init__(self) -> None:
-        take_name(self, *name_places(f"force {self.name or self.type!r}", self.at))
-        several = take_law(self, 6) and not isinstance(self.law, Law)
-        if several and not np.any([self.force, self.moment]):
-            object.__setattr__(self, "force", (1.0, 1.0, 1.0))
-            object.__setattr__(self, "moment", (1.0, 1.0, 1.0))
-        take_quantities(self)
-        refuse_without_effect(self, "force", "moment")
+        self._take_name(*name_places(self._element, self.at))
+        if len(self._take_law(6)) == 6 and not np.any([self.force, self.moment]):
+            self._set("force", (1.0, 1.0, 1.0))
+            self._set("moment", (1.0, 1.0, 1.0))
+        self._take_quantities()
+        self._refuse_zeros("force", "moment")
         if self.frame not in ("world", "link"):
-            raise fault(self, f"there is no frame {self.frame!r}", 'Give "world" or "link"')
+            raise self._fault(f"there is no frame {self.frame!r}", 'Give "world" or "link"')
 
     def check(self, model: pin.Model) -> None:
-        try:
-            joint, _ = self.at.resolve(model)
-        except InputError as error:
-            error.element = f"force {self.name!r}, anchor at"
-            raise
-        if joint == 0:
-            raise fault(
-                self, f"{self.at.where!r} does not move", "Let the wrench act on a moving link"
-            )
+        resolve_moving(model, [self.at], f"{self._element}, anchor at")
 
 
 @dataclass(frozen=True)
-class Bushing(ForceElement):
+class Bushing(_BetweenLinks):
     """Spring and damper in all six directions between two frames.
 
     Let p be the position of a's origin in b's frame and phi the rotation vector (log3) of a's axes
@@ -465,20 +404,9 @@ class Bushing(ForceElement):
     """
 
     type: ClassVar[str] = "bushing"
-    has_potential: ClassVar[bool] = True
-    a: Anchor
-    b: Anchor
-    stiffness: Sequence[float] = quantity("N m/rad, N/m", (0.0,) * 6, lowest=0.0, count=6)
-    damping: Sequence[float] = quantity("N m s/rad, N s/m", (0.0,) * 6, lowest=0.0, count=6)
+    stiffness: Sequence[float] = quantity("N m/rad, N/m", (0.0,) * 6, nonnegative=True, count=6)
+    damping: Sequence[float] = quantity("N m s/rad, N s/m", (0.0,) * 6, nonnegative=True, count=6)
     name: str = ""
-
-    def __post_init__(self) -> None:
-        take_name(self, *name_places(f"force {self.name or self.type!r}", self.a, self.b))
-        take_quantities(self)
-        refuse_without_effect(self, "stiffness", "damping")
-
-    def check(self, model: pin.Model) -> None:
-        resolve_apart(model, self.a, self.b, f"force {self.name!r}")
 
 
 @dataclass(frozen=True)
@@ -511,24 +439,24 @@ class LimitSpring(ForceElement):
     type: ClassVar[str] = "limit_spring"
     has_potential: ClassVar[bool] = True
     joint: str
-    stiffness: float = quantity("N m/rad, N/m", 0.0, lowest=0.0, needed=True)
-    damping: float = quantity("N m s/rad, N s/m", 0.0, lowest=0.0)
+    stiffness: float = quantity("N m/rad, N/m", 0.0, nonnegative=True, needed=True)
+    damping: float = quantity("N m s/rad, N s/m", 0.0, nonnegative=True)
     lower: float | None = quantity("rad, m", None)
     upper: float | None = quantity("rad, m", None)
     depth: float | None = quantity("rad, m", None)
     name: str = ""
 
     def __post_init__(self) -> None:
-        take_name(self, self.joint)
-        take_quantities(self)
+        self._take_name(self.joint)
+        self._take_quantities()
         if not self.stiffness > 0.0:
-            raise fault(self, "a limit needs a stiffness", "Give a positive stiffness")
+            raise self._fault("a limit needs a stiffness", "Give a positive stiffness")
         if self.depth is not None and not self.depth > 0.0:
-            raise fault(self, f"depth = {self.depth:g} is not positive", "Give a positive depth")
+            raise self._fault(f"depth = {self.depth:g} is not positive", "Give a positive depth")
 
     def resolved(self, model: pin.Model) -> tuple[float, float, float]:
         """Lower and upper limit, infinite where open, and depth."""
-        joint = moving_joint(self, model, self.joint)
+        joint = moving_joint(model, self.joint, self._element)
         low = float(model.lowerPositionLimit[joint.idx_q]) if self.lower is None else self.lower
         high = float(model.upperPositionLimit[joint.idx_q]) if self.upper is None else self.upper
         low, high = (
@@ -538,17 +466,15 @@ class LimitSpring(ForceElement):
         return low, high, 0.01 * width if self.depth is None else self.depth
 
     def check(self, model: pin.Model) -> None:
-        joint = moving_joint(self, model, self.joint)
+        joint = moving_joint(model, self.joint, self._element)
         if not joint.nq == joint.nv == 1:
-            raise fault(
-                self,
+            raise self._fault(
                 f"the position of joint {self.joint!r} is not one number",
                 "Give limits to revolute and prismatic joints only",
             )
         low, high, _ = self.resolved(model)
         if not low < high or not np.isfinite([low, high]).any():
-            raise fault(
-                self,
+            raise self._fault(
                 f"joint {self.joint!r} has no limits ({low:g} to {high:g})",
                 "Give lower or upper, or limits in the model",
             )

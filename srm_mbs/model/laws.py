@@ -80,10 +80,6 @@ class Curve:
         }
 
 
-ALL_TIMES = (-math.inf, math.inf)
-"""s."""
-
-
 @runtime_checkable
 class Law(Protocol):
     """A law over time."""
@@ -102,7 +98,7 @@ class Law(Protocol):
     @property
     def span(self) -> tuple[float, float]:
         """First and last time (s) for which it is defined; all times by default."""
-        return ALL_TIMES
+        return (-math.inf, math.inf)
 
 
 def _fault(law: Law, problem: str, remedy: str) -> InputError:
@@ -124,7 +120,7 @@ def _take(law: Law, key: str, above: float = -math.inf) -> float:
 def _take_list(law: Law, key: str, least: int) -> tuple[float, ...]:
     """Check a list of at least ``least`` numbers of ``law`` and store it as a tuple of floats."""
     array = finite_array(getattr(law, key), (None,))
-    remedy = f"Give a list of at least {least} finite numbers"
+    remedy = f"Give a list of finite numbers, at least {least}"
     if array is None:
         raise _fault(law, f"{key} is not a list of finite numbers", remedy)
     if len(array) < least:

@@ -20,23 +20,15 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.drives import (
-    Drive,
-    NamedLaw,
-    check_covers,
-    knots_between,
-    laws_over_time,
-    positions,
-)
+from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
-from srm_mbs.model.laws import Curve
+from srm_mbs.model.laws import Curve, Law
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,
     closures_from_pinocchio,
     to_pinocchio,
 )
 from srm_mbs.model.validation import (
-    check_names,
     check_tree,
     checked_elements,
     checked_friction_speed,
@@ -83,19 +75,12 @@ class SimulationDefaults:
     atol: float | None = None
 
 
-class Results:
-    """Results of functions of one object, by the function that computed them."""
-
-    def __init__(self) -> None:
-        self.by_function: dict[Any, Any] = {}
-
-
 class ResultOwner:
     """Base of :class:`MechanismData`: holds the results of :class:`per_model` and
-    :class:`per_start`."""
+    :class:`per_start`, by function."""
 
-    _model_results: Results
-    _start_results: Results
+    _model_results: dict[Any, Any]
+    _start_results: dict[Any, Any]
 
 
 Owner = TypeVar("Owner", bound=ResultOwner, contravariant=True)
@@ -135,14 +120,14 @@ class per_model(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
     """
 
     def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
-        return mechanism._model_results.by_function
+        return mechanism._model_results
 
 
 class per_start(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
     """Decorator: evaluate a function of a mechanism once for each initial state."""
 
     def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
-        return mechanism._start_results.by_function
+        return mechanism._start_results
 
 
 FRICTION_SPEED = 0.01
@@ -172,30 +157,21 @@ class MechanismData(ResultOwner):
         model = self.model
         set_ = object.__setattr__
         check_tree(model)
-        set_(self, "loops", checked_elements("loop", self.loops, "LoopClosure"))
         set_(self, "name", self.name or model.name)
         self._take_start(
             pin.neutral(model) if self.q0 is None else self.q0,
             np.zeros(model.nv) if self.v0 is None else self.v0,
         )
-        check_names("loop", [loop.name for loop in self.loops])
-        for loop in self.loops:
-            loop.check(model)
-        set_(self, "loops", tuple(loop.measured(model, self.q0) for loop in self.loops))
-        set_(self, "forces", checked_elements("force", self.forces, "SpringDamper"))
-        check_names("force", [force.name for force in self.forces])
-        for force in self.forces:
-            force.check(model)
-        set_(self, "drives", checked_elements("drive", self.drives, "Drive"))
-        check_names("drive", [drive.name for drive in self.drives])
-        for drive in self.drives:
-            drive.check(model)
+        loops = checked_elements(model, "loop", self.loops, "LoopClosure")
+        set_(self, "loops", tuple(loop.measured(model, self.q0) for loop in loops))
+        set_(self, "forces", checked_elements(model, "force", self.forces, "SpringDamper"))
+        set_(self, "drives", checked_elements(model, "drive", self.drives, "Drive"))
         set_(self, "friction_speed", checked_friction_speed(model, self.friction_speed))
 
     def _forget(self) -> None:
         """Begin without results."""
-        object.__setattr__(self, "_model_results", Results())
-        object.__setattr__(self, "_start_results", Results())
+        object.__setattr__(self, "_model_results", {})
+        object.__setattr__(self, "_start_results", {})
 
     def with_loop(self, loop: LoopClosure) -> Self:
         """The same mechanism with one more closure, for :class:`srm_mbs.Switch`.
@@ -279,7 +255,7 @@ class MechanismData(ResultOwner):
         for entry in fields(self):
             object.__setattr__(changed, entry.name, getattr(self, entry.name))
         object.__setattr__(changed, "_model_results", self._model_results)
-        object.__setattr__(changed, "_start_results", Results())
+        object.__setattr__(changed, "_start_results", {})
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
@@ -339,12 +315,20 @@ class MechanismData(ResultOwner):
         InputError
             Naming what has the table.
         """
-        check_covers(_laws(self), t_end)
+        for element, law in _laws(self):
+            last = law.span[1]
+            if last < t_end:
+                raise InputError(
+                    f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
+                    element=element,
+                    remedy="Extend the table, or end the run earlier",
+                )
 
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
         """Times (s) between ``t0`` and ``t_end`` at which a part of it that depends on time is not
         smooth: knots of tables, switches of drives.  Runs take no step across them."""
-        return knots_between(_laws(self), t0, t_end)
+        times = {knot for _, law in _laws(self) for knot in law.knots}
+        return tuple(sorted(knot for knot in times if t0 < knot < t_end))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -380,8 +364,14 @@ def _joint_names(mechanism: MechanismData) -> tuple[str, ...]:
 
 
 @per_model
-def _laws(mechanism: MechanismData) -> tuple[NamedLaw, ...]:
-    return laws_over_time(mechanism.drives, mechanism.forces)
+def _laws(mechanism: MechanismData) -> tuple[tuple[str, Law], ...]:
+    """Drives and force elements that follow laws over time, each with one of its laws."""
+    found = [(f"drive {drive.name!r}", drive.law) for drive in mechanism.drives]
+    for force in mechanism.forces:
+        given = getattr(force, "law", None) or ()
+        laws = given if isinstance(given, tuple) else (given,)
+        found += [(f"force {force.name!r}", law) for law in laws]
+    return tuple(found)
 
 
 @per_start

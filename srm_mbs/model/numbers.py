@@ -30,38 +30,74 @@ def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> Fl
         array: FloatArray = given.astype(float)
     except (TypeError, ValueError, OverflowError):
         return None
-    if shape is not None and array.shape != shape:
-        fits = len(shape) == array.ndim and all(
-            length in (None, actual) for length, actual in zip(shape, array.shape)
-        )
-        if not fits:
-            return None
-    return array if np.isfinite(array).all() else None
+    fits = shape is None or (
+        len(shape) == array.ndim
+        and all(length in (None, actual) for length, actual in zip(shape, array.shape))
+    )
+    return array if fits and np.isfinite(array).all() else None
 
 
-def finite_numbers(values: Any, count: int, name: str, remedy: str) -> tuple[float, ...]:
-    """``values`` as a tuple of ``count`` finite floats.
+def finite_number(value: Any, name: str, element: str) -> float:
+    """``value``, called ``name`` in messages, as a finite float.
 
     Raises
     ------
     InputError
-        About the element ``name``, with that ``remedy``, if they are anything else.
+        About ``element``, if it is anything else.
+    """
+    array = finite_array(value, ())
+    if array is None:
+        raise InputError(
+            f"{name} = {value!r} is not a finite number",
+            element=element,
+            remedy="Give a finite number",
+        )
+    return float(array)
+
+
+def finite_numbers(
+    values: Any, count: int, name: str, remedy: str, element: str | None = None
+) -> tuple[float, ...]:
+    """``values``, called ``name`` in messages, as a tuple of ``count`` finite floats.
+
+    Raises
+    ------
+    InputError
+        About ``element``, by default ``name``, with that ``remedy``, if they are anything else.
     """
     array = finite_array(values, (count,))
     if array is None:
         raise InputError(
-            f"{name} must be {count} finite numbers, not {values!r}", element=name, remedy=remedy
+            f"{name} must be {count} finite numbers, not {values!r}",
+            element=element or name,
+            remedy=remedy,
         )
     return tuple(array.tolist())
 
 
-def vector(values: Any, name: str) -> tuple[float, float, float]:
-    """``values`` as three finite floats.
+def vector(values: Any, name: str, element: str | None = None) -> tuple[float, float, float]:
+    """``values``, called ``name`` in messages, as three finite floats.
 
     Raises
     ------
     InputError
-        About the element ``name``, if they are anything else.
+        About ``element``, by default ``name``, if they are anything else.
     """
-    x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]")
+    x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]", element)
+    return (x, y, z)
+
+
+def unit_vector(values: Any, name: str, element: str) -> tuple[float, float, float]:
+    """The direction of ``values``, called ``name`` in messages: three floats of norm 1.
+
+    Raises
+    ------
+    InputError
+        About ``element``, if they are not three finite numbers, or all zero.
+    """
+    direction = np.array(vector(values, name, element))
+    size = float(np.linalg.norm(direction))
+    if size == 0.0:
+        raise InputError(f"the {name} is zero", element=element, remedy="Give a direction")
+    x, y, z = (direction / size).tolist()
     return (x, y, z)

@@ -9,7 +9,7 @@ Pinocchio has two closures: the point (3 rows) and the frame (6 rows), each in a
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,6 @@ from srm_mbs.model.drives import Drive
 
 _KINDS = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
 _ANCHORS = {pin.PointAnchorConstraintModel: "point", pin.FrameAnchorConstraintModel: "frame"}
-_SHIFTED = {
-    "desired_constraint_offset": "a desired offset",
-    "desired_constraint_velocity": "a desired velocity",
-}
 _KNOWN = (
     "Use RigidConstraintModel, PointAnchorConstraintModel or FrameAnchorConstraintModel, or give "
     "the closure as a srm.LoopClosure"
@@ -96,12 +92,12 @@ def closures_from_pinocchio(model: pin.Model, constraint_models: Any) -> tuple[L
     for k, constraint in enumerate(models):
         closure = _closure(model, constraint, f"constraint_models[{k}]")
         if any(closure.name == other.name for other in closures):
-            closure = _closure(model, constraint, f"constraint_models[{k}]", f"_{k}")
+            closure = replace(closure, name=f"{closure.name}_{k}")
         closures.append(closure)
     return tuple(closures)
 
 
-def _closure(model: pin.Model, constraint: Any, place: str, suffix: str = "") -> LoopClosure:
+def _closure(model: pin.Model, constraint: Any, place: str) -> LoopClosure:
     if isinstance(constraint, pin.ConstraintModel):
         constraint = constraint.extract()
     kind = _ANCHORS.get(type(constraint))
@@ -112,16 +108,15 @@ def _closure(model: pin.Model, constraint: Any, place: str, suffix: str = "") ->
             raise _fault("it has a desired placement or velocity", place)
     if kind is None:
         raise _fault(f"there is no closure for a {type(constraint).__name__}", place)
-    for name, words in _SHIFTED.items():
-        if np.any(np.asarray(getattr(constraint, name, 0.0))):
-            raise _fault(f"it has {words}", place)
+    for what in ("offset", "velocity"):
+        if np.any(np.asarray(getattr(constraint, f"desired_constraint_{what}", 0.0))):
+            raise _fault(f"it has a desired {what}", place)
     one = int(constraint.joint1_id), constraint.joint1_placement
     two = int(constraint.joint2_id), constraint.joint2_placement
     if two[0] == 0:  # the world is b
         one, two = two, one
     a, b = _anchor(model, *two, place), _anchor(model, *one, place)
-    name = str(getattr(constraint, "name", "") or "") or f"{kind}_{a.where}_{b.where}"
-    return LoopClosure(kind, a, b, name=name + suffix)
+    return LoopClosure(kind, a, b, name=str(getattr(constraint, "name", "") or ""))
 
 
 def _fault(problem: str, place: str) -> InputError:
@@ -134,9 +129,9 @@ def _anchor(model: pin.Model, joint: int, placement: pin.SE3, place: str) -> Anc
     where: dict[str, str] = {"link": WORLD}
     inside = placement
     if joint:
-        name, found = _frame_of(model, joint, place)
-        where = {"link" if found.type == pin.FrameType.BODY else "frame": name}
-        inside = found.placement.actInv(placement)
+        frame = _frame_of(model, joint, place)
+        where = {"link" if frame.type == pin.FrameType.BODY else "frame": frame.name}
+        inside = frame.placement.actInv(placement)
     return Anchor(
         **where,
         xyz=tuple(inside.translation.tolist()),
@@ -144,16 +139,14 @@ def _anchor(model: pin.Model, joint: int, placement: pin.SE3, place: str) -> Anc
     )
 
 
-def _frame_of(model: pin.Model, joint: int, place: str) -> tuple[str, pin.Frame]:
+def _frame_of(model: pin.Model, joint: int, place: str) -> pin.Frame:
     """A frame on a joint that can be named: a link, or one whose name is no other's."""
     own = [frame for frame in model.frames if frame.parentJoint == joint]
-    for frame in own:
-        if frame.type == pin.FrameType.BODY:
-            return frame.name, frame
     names = [frame.name for frame in model.frames]
+    own.sort(key=lambda frame: frame.type != pin.FrameType.BODY)  # links come first
     for frame in own:
-        if names.count(frame.name) == 1:
-            return frame.name, frame
+        if frame.type == pin.FrameType.BODY or names.count(frame.name) == 1:
+            return frame
     raise InputError(
         f"the joint {model.names[joint]!r} has no frame of its own name",
         element=place,

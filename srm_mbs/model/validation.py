@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dpotrf
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.model.numbers import finite_array, finite_numbers
+from srm_mbs.model.numbers import finite_array
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
@@ -103,11 +103,7 @@ def undetermined_joint(model: pin.Model, q: FloatArray, file: str | None = None)
             return None
         failed = int(small[0]) if small.size else info - 1
     component = model.nv - 1 - failed
-    return next(i for i in range(1, model.njoints) if component < _velocity_end(model, i))
-
-
-def _velocity_end(model: pin.Model, joint: int) -> int:
-    return int(model.joints[joint].idx_v + model.joints[joint].nv)
+    return int(np.searchsorted(model.idx_vs, component, side="right")) - 1
 
 
 def check_tree(model: pin.Model) -> None:
@@ -156,37 +152,35 @@ def _check_order(model: pin.Model) -> None:
             )
 
 
-Element = TypeVar("Element")
+class _Part(Protocol):
+    @property
+    def name(self) -> str: ...
+    def check(self, model: pin.Model) -> None: ...
 
 
-def checked_elements(what: str, given: Iterable[Element], example: str) -> tuple[Element, ...]:
-    """The elements of the kind ``what`` as a tuple.
+Part = TypeVar("Part", bound=_Part)
+
+
+def checked_elements(
+    model: pin.Model, what: str, given: Iterable[Part], example: str
+) -> tuple[Part, ...]:
+    """The parts of the kind ``what`` (loop, force, drive) of a mechanism as a tuple.
 
     Raises
     ------
     InputError
-        If they are not several, or one has no name and cannot check itself.
+        If they are not several, one has no name and cannot check itself, names repeat, or one does
+        not fit ``model``.
     """
     several = isinstance(given, Iterable) and not isinstance(given, str)
-    elements: tuple[Any, ...] = tuple(given) if several else (given,)
-    for element in elements:
-        if not (several and hasattr(element, "name") and hasattr(element, "check")):
-            raise InputError(
-                f"{what}s = {given!r} is not a list of {what}s",
-                element=f"{what}s",
-                remedy=f"Give a list of them, such as [srm.{example}(...)]",
-            )
-    return elements
-
-
-def check_names(what: str, names: Sequence[str]) -> None:
-    """Refuse names that repeat, of elements of the kind ``what``.
-
-    Raises
-    ------
-    InputError
-        Naming the first that does.
-    """
+    parts: tuple[Any, ...] = tuple(given) if several else (given,)
+    if not several or not all(hasattr(part, "name") and hasattr(part, "check") for part in parts):
+        raise InputError(
+            f"{what}s = {given!r} is not a list of {what}s",
+            element=f"{what}s",
+            remedy=f"Give a list of them, such as [srm.{example}(...)]",
+        )
+    names = [part.name for part in parts]
     for name in names:
         if names.count(name) > 1:
             raise InputError(
@@ -194,6 +188,24 @@ def check_names(what: str, names: Sequence[str]) -> None:
                 element=f"{what} {name!r}",
                 remedy=f"Give every {what} its own name",
             )
+    for part in parts:
+        part.check(model)
+    return parts
+
+
+def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
+    """``parts`` (loops, drives) without the one of that name.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message lists those there are.
+    """
+    kept = tuple(part for part in parts if part.name != name)
+    if len(kept) == len(parts):
+        known = ", ".join(repr(part.name) for part in parts) or "none"
+        raise InputError(f"there is no {what} {name!r}", remedy=f"Known: {known}")
+    return kept
 
 
 def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, FloatArray]:
@@ -240,34 +252,11 @@ def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
             element="model.friction",
             remedy="Give values >= 0",
         )
-    speed = finite_numbers((friction_speed,), 1, "friction_speed", "Give rad/s or m/s")[0]
-    if speed <= 0.0:
+    speed = finite_array(friction_speed, ())
+    if speed is None or speed <= 0.0:
         raise InputError(
-            f"friction_speed = {speed:g} is not positive",
+            f"friction_speed = {friction_speed!r} is not a finite positive number",
             element="friction_speed",
             remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
         )
-    return speed
-
-
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-Part = TypeVar("Part", bound=_Named)
-
-
-def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
-    """``parts`` (loops, drives) without the one of that name.
-
-    Raises
-    ------
-    InputError
-        If there is none; the message lists those there are.
-    """
-    kept = tuple(part for part in parts if part.name != name)
-    if len(kept) == len(parts):
-        known = ", ".join(repr(part.name) for part in parts) or "none"
-        raise InputError(f"there is no {what} {name!r}", remedy=f"Known: {known}")
-    return kept
+    return float(speed)

@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
 from srm_mbs.simulation.result import SimulationResult
 
@@ -96,13 +95,8 @@ def _columns(solution: SimulationResult) -> dict[str, FloatArray]:
             rates[f"{name}.{component}"] = solution.v[:, joint.idx_v + i]
     columns = {"t (s)": solution.t, **positions, **rates}
     if mechanism.constrained:
-        lengths, speeds = _drift_units(mechanism)
+        units = row_dimensions(mechanism)  # joined by semicolons, so that nothing is quoted
+        lengths, speeds = "; ".join(units), "; ".join(f"{unit}/s" for unit in units)
         columns[f"||g|| ({lengths})"], columns[f"||G v|| ({speeds})"] = solution.drift.T
     columns["energy (J)"] = solution.energy
     return columns
-
-
-def _drift_units(mechanism: Mechanism) -> tuple[str, str]:
-    """Units of the closure errors and of their rates; semicolons, so that nothing is quoted."""
-    parts = row_dimensions(mechanism)
-    return "; ".join(parts), "; ".join(f"{part}/s" for part in parts)

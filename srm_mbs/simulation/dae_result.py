@@ -43,7 +43,7 @@ class DaeResult(RunOutcome):
     settings
         :class:`~srm_mbs.simulation.result.Settings`.
     attempts : (k,)
-        The steps that did not stand, a structured array of
+        The rejected and redone steps, a structured array of
         :data:`~srm_mbs.simulation.result.ATTEMPT`.
     steps
         :class:`~srm_mbs.integration.dense_output.StepData`: what the stepping recorded, sigma

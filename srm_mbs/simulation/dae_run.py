@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,16 +12,15 @@ from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.errors import ControllerError, EvaluationError, InputError
 from srm_mbs.integration.control.prescribed_times import suspected
 from srm_mbs.integration.control.step_size import ControlWrapper
-from srm_mbs.integration.dense_output import step_data
-from srm_mbs.integration.driver import DAE, RunRecord, RunStatus
+from srm_mbs.integration.driver import RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import branch_changes, method_messages
-from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.messages import DAE, branch_changes
+from srm_mbs.integration.methods.base import ErrorNorm, Method, method_messages
 from srm_mbs.integration.methods.thesis.dae_stability import instability
 from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.simulation.dae_result import DaeResult
-from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
+from srm_mbs.simulation.monitoring import log_end, log_start
 from srm_mbs.simulation.options import (
     LOOSEST_RTOL,
     TIGHTEST_RTOL,
@@ -33,11 +31,9 @@ from srm_mbs.simulation.options import (
 )
 from srm_mbs.simulation.result import attempt_array
 from srm_mbs.simulation.runner import (
-    chosen_first_step,
     failed_start,
     finished,
     integrate_steps,
-    placed_control,
     settings,
     statistics,
 )
@@ -46,17 +42,17 @@ Result = TypeVar("Result", bound=DaeResult)
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""
-MENDED = (
+TURN_REMEDY = (
     'Try a smaller rtol or step, restarted sweeps with T = "inverse" (restart=True, carry=True), '
     "or PSRM in its split form."
 )
 """What to do about a passage that may have changed the branch."""
-CARRIED = (
+CARRIED_Y_REMEDY = (
     'Use T = "inverse", which carries B y (SRM: with restart=True, carry=True), or PSRM in its '
     "split form."
 )
 """The same for sweeps that carry y, for which no shorter step does."""
-UNSTABLE = (
+INSTABILITY_REMEDY = (
     " Sweeps with T = I or (GB)^T are stable only while h |G B T|/eps is about 1 or less: try "
     'T = "inverse", or a larger eps.'
 )
@@ -133,131 +129,94 @@ def run_dae(
             element="problem",
             remedy="Give srm.SemiExplicitDAE(f=..., B=..., g=..., G=...)",
         )
-    options = _checked_options(t_span, options)
-    state = _start(x0)
-    norm = ErrorNorm(
-        _absolute_tolerance(options.atol, options.rtol, state.size),
-        options.rtol,
-        options.negligible,
-    )
-    T = getattr(options.method, "T", "identity")
-    system = DaeSystem(problem, options.t0, state, options.t_end, T)
-    _check_start(system, options.method, options.t0, state)
+    span, method = _interval(t_span), checked_method(options.method, options.tableau)
+    rtol_range = float(TIGHTEST_RTOL), LOOSEST_RTOL
+    options = options.checked(method, rtol_range, span, unit="", arguments="(t, h, x)")
+    state, t0 = _start(x0), options.t0
+    tolerance = _absolute_tolerance(options.atol, options.rtol, state.size)
+    norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+    system = DaeSystem(problem, t0, state, options.t_end, getattr(method, "T", "identity"))
+    _check_start(system, method, t0, state)
     log_start("DAE", options, norm, "python")
-    run = _integrate(system, options, norm, state)
-    result = _collect(system, options, norm, state, run, result_type)
+    watch = None
+    if options.events is not None:
+        prepared = prepare_events(options.events, lambda event: event)
+        watch = EventWatch(system, method.scheme, prepared, state.size)
+    record, wrappers, first_sweeps = _integrate(system, options, norm, state, watch)
+    turned = suspected(wrappers)
+    if first_sweeps:
+        _add_sweep_failure(system, options, record, first_sweeps, turned)
+    else:
+        record.message += branch_changes(turned, "x' turned", TURN_REMEDY)
+    data = record.data(method.scheme, system.tangent_size)
+    result = result_type(
+        system,
+        method,
+        data,
+        carried_multipliers(first_sweeps, record.steps),
+        t_eval=options.t_eval,
+        attempts=attempt_array(record.attempts),
+        settings=settings(options, norm, False, "python"),
+        events=None if watch is None else watch.found(),
+        status=record.status,
+        message=record.message + method_messages(method, record.steps, norm),
+        stats=statistics(system, record, data, wrappers),
+    )
     log_end("DAE", result)
     return finished(result, options)
 
 
-def _checked_options(t_span: Any, options: RunOptions) -> RunOptions:
-    span = _interval(t_span)
-    method = checked_method(options.method, options.tableau)
-    rtol_range = float(TIGHTEST_RTOL), LOOSEST_RTOL
-    return options.checked(method, rtol_range, span, unit="", arguments="(t, h, x)")
+def _integrate(
+    system: DaeSystem,
+    options: RunOptions,
+    norm: ErrorNorm,
+    state: FloatArray,
+    watch: EventWatch | None,
+) -> tuple[RunRecord, Sequence[ControlWrapper], tuple[SweepNode, ...]]:
+    """The record of the run, the wrappers of its control, and the sweeps at its start.
 
-
-@dataclass(eq=False)
-class _DaeRun:
-    """A run, and what its sweeps and its control know of it."""
-
-    record: RunRecord
-    watch: EventWatch | None
+    A start that cannot be evaluated ends in the record.
+    """
     wrappers: Sequence[ControlWrapper] = ()
     first_sweeps: tuple[SweepNode, ...] = ()
-
-
-def _integrate(
-    system: DaeSystem, options: RunOptions, norm: ErrorNorm, state: FloatArray
-) -> _DaeRun:
-    """The run; a start that cannot be evaluated ends in its record."""
-    method, t0 = options.method, options.t0
-    run = _DaeRun(RunRecord(t0, state.copy()), None)
-    if options.events is not None:
-        prepared = prepare_events(options.events, lambda event: event)
-        run.watch = EventWatch(system, method.scheme, prepared, state.size)
     try:
-        memory = method.start(system, t0, state, norm)
+        memory = options.method.start(system, options.t0, state, norm)
         if memory.sigma < SINGULAR_START:
             raise InputError(
                 f"G B is singular at the start, or almost (sigma = {memory.sigma:.1e})",
                 element="x0",
                 remedy="Start beside that point",
             )
-        run.first_sweeps = sweep_nodes(memory)
-        control, run.wrappers = placed_control(
-            system,
-            options,
-            lambda: chosen_first_step(system, norm, options, memory, state),
-        )
-        with progress_of(options.progress, system, options.t_end) as tick:
-            run.record = integrate_steps(
-                system, options, control, norm, memory, state, tick, run.watch, words=DAE
-            )
+        first_sweeps = sweep_nodes(memory)
+        record, wrappers = integrate_steps(system, options, norm, memory, state, watch, words=DAE)
     except (EvaluationError, ControllerError) as error:
-        run.record = failed_start(t0, state, error)
-    return run
+        record = failed_start(options.t0, state, error)
+    return record, wrappers, first_sweeps
 
 
 def _add_sweep_failure(
-    system: DaeSystem, options: RunOptions, run: _DaeRun, turned: Sequence[float]
+    system: DaeSystem,
+    options: RunOptions,
+    record: RunRecord,
+    first_sweeps: Sequence[SweepNode],
+    turned: Sequence[float],
 ) -> None:
     """Mark and explain in the record that sweeps were unstable, or took another branch of g = 0."""
-    record, unstable = run.record, ""
+    unstable = None
     carries_y = not system.carries_yhat
     if record.status is RunStatus.FAILED and carries_y:
         eps = getattr(options.method, "regularisation", None)
-        unstable = instability(system, options.method.scheme, record, run.first_sweeps, eps)
-    if unstable:
+        unstable = instability(system, options.method.scheme, record, first_sweeps, eps)
+    if unstable is not None:
         if turned:  # that they turned follows from it
             end = record.times[-1] if record.times else options.t0
             record.message = f"Stopped at t = {end:.6g}: x' turned. Everything up to there is kept."
-        record.message += unstable
+        record.stop_reason = unstable.reason
+        record.message += f" {unstable.sentence}"
     elif turned:
         if record.status is not RunStatus.FAILED:  # within the passage
             record.status = RunStatus.FAILED
             record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
-        record.message += " " + (CARRIED if carries_y else MENDED)
+        record.message += " " + (CARRIED_Y_REMEDY if carries_y else TURN_REMEDY)
     elif record.status is RunStatus.FAILED and carries_y:
-        record.message += UNSTABLE
-
-
-def _collect(
-    system: DaeSystem,
-    options: RunOptions,
-    norm: ErrorNorm,
-    state: FloatArray,
-    run: _DaeRun,
-    result_type: type[Result],
-) -> Result:
-    record, method = run.record, options.method
-    sweeps = bool(run.first_sweeps)
-    turned = suspected(run.wrappers)
-    if sweeps:
-        _add_sweep_failure(system, options, run, turned)
-    data = step_data(
-        options.t0,
-        state,
-        record.times,
-        record.steps,
-        method.scheme,
-        system.tangent_size,
-        record.stop,
-    )
-    placed = sum(wrapper.placed for wrapper in run.wrappers)
-    replaced = sum(wrapper.replaced for wrapper in run.wrappers)
-    return result_type(
-        system,
-        method,
-        data,
-        carried_multipliers(run.first_sweeps, record.steps),
-        t_eval=options.t_eval,
-        attempts=attempt_array(record.attempts),
-        settings=settings(options, norm, False, "python"),
-        events=None if run.watch is None else run.watch.found(),
-        status=record.status,
-        message=record.message
-        + ("" if sweeps else branch_changes(turned, "x' turned", MENDED))
-        + method_messages(method, record.steps, norm),
-        stats=statistics(system, record, data, placed, replaced),
-    )
+        record.message += INSTABILITY_REMEDY

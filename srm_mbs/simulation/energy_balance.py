@@ -1,4 +1,4 @@
-r"""Energy balance of a run: what kinetic and potential energy gained is the work of what acts.
+r"""Energy balance of a run: the energy gained is the work of controller, damping, forces, drives.
 
     K + V - (K + V)(t_0) = sum of the works W_i,   W_i' = tau_i . v,
 
@@ -132,7 +132,8 @@ def _joints(run: BalancedRun, system: _System) -> Powers:
 
 
 def _elements(run: BalancedRun, system: _System) -> Powers:
-    """Of springs and bushings what is left when their force at rest is taken off."""
+    """Power of force elements; of springs and bushings without their force at rest, which has a
+    potential."""
     mechanism = run.mechanism
     model, data = mechanism.model, workspace(mechanism.model)
     rest = np.zeros(model.nv)
@@ -214,7 +215,7 @@ def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
 
 
 def joined_balance(
-    segments: Sequence[BalancedRun], parts: Sequence[BalancedRun], order: IndexArray | None
+    segments: Sequence[BalancedRun], parts: Sequence[BalancedRun], order: IndexArray | slice
 ) -> EnergyBalance:
     """The balance of a run of several segments, with what happened between them as ``events``.
 
@@ -225,7 +226,7 @@ def joined_balance(
     parts
         The same ones, read at the times that are wanted.
     order
-        Where the rows of all parts go; None where they stay.
+        Index of the rows of all parts, one part after the other, that puts them in order.
     """
     balances = [part.energy_balance for part in parts]
     ends = [segment.at([segment.steps.end]).energy_balance for segment in segments]
@@ -242,8 +243,8 @@ def joined_balance(
             jumped += ends[k + 1].start - float(end.kinetic[-1] + end.potential[-1])
 
     def joined(pieces: Sequence[FloatArray]) -> FloatArray:
-        whole = np.concatenate(pieces)
-        return whole if order is None else whole[order]
+        whole: FloatArray = np.concatenate(pieces)[order]
+        return whole
 
     return EnergyBalance(
         joined([balance.t for balance in balances]),

@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.errors import EvaluationError
+from srm_mbs.errors import EvaluationError, SimulationError
 from srm_mbs.integration.breakpoints import SingularProximity, beside_singular, smooth_intervals
 from srm_mbs.integration.control.step_size import (
     ControlWrapper,
@@ -24,64 +26,18 @@ from srm_mbs.integration.control.step_size import (
 )
 from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
-from srm_mbs.integration.kernel.run import BREAKPOINT, CHUNK, CHUNK_FULL, FINISHED, CompiledRun
+from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.simulation.options import RunOptions
-
-MakeControl = Callable[[float], tuple[StepSizeControl, Any]]
-"""First step (s) -> step-size control, and the wrappers in it that count."""
-LAST_GOOD = "The state is the last good one"
+from srm_mbs.simulation.result import Statistics
+from srm_mbs.simulation.runner import placed_control
 
 
-class _IncrementalRun:
-    """Base of the runs of both backends.
-
-    Attributes
-    ----------
-    t, state
-        Current time (s) and state (nq + nv,).
-    """
-
-    t: float
-    state: FloatArray
-
-    def __init__(
-        self,
-        system: OpenSystem | ClosedSystem,
-        held: HeldForce,
-        norm: ErrorNorm,
-        options: RunOptions,
-        evaluator: Any,
-    ) -> None:
-        self.system, self.norm, self.options = system, norm, options
-        self.method: Method = options.method
-        self._held = held
-        self._evaluator = evaluator
-
-    def _first(self, t: float, state: FloatArray, span: float) -> tuple[IntegratorState, float]:
-        """Integrator state at ``state``, and the length of the first step of ``span`` (s)."""
-        memory = start(self.system, self.method, t, state, self.norm, np.inf, self._evaluator)
-        order = self.method.scheme.controller_order or 1
-        first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
-        return memory, first
-
-    def _matters(self, fresh: IntegratorState, span: float) -> bool:
-        """Whether the singular configuration next to ``fresh`` does; the kernel has asked."""
-        return True
-
-    def _renewed(self, memory: IntegratorState, end: float) -> IntegratorState:
-        fresh = self.method.resume(self._evaluator, self.t, self.state, memory, self.norm)
-        if not self._matters(fresh, end - self.t):
-            return fresh
-        return beside_singular(
-            self.system, self.method, self.t, self.state, self.norm, end, self._evaluator, fresh
-        )
-
-
-class KernelRun(_IncrementalRun):
-    """A run of the compiled kernel.
+@dataclass(eq=False, repr=False)
+class IncrementalRun(ABC):
+    """A run that continues call by call.
 
     Parameters
     ----------
@@ -91,49 +47,50 @@ class KernelRun(_IncrementalRun):
         Error norm and checked options.
     """
 
-    def __init__(
-        self,
-        system: OpenSystem | ClosedSystem,
-        held: HeldForce,
-        norm: ErrorNorm,
-        options: RunOptions,
-    ) -> None:
-        kernel_system = make_kernel_system(system)
-        super().__init__(system, held, norm, options, Evaluator(system, kernel_system))
-        nothing = np.zeros(2 * system.nv)
-        state = np.zeros(system.nq + system.nv)
-        pieces = smooth_intervals(nothing[:0], nothing[:0], 0.0, 1.0)
-        self._kernel_system = kernel_system
-        self._run = CompiledRun(
-            kernel_system,
-            options.method,
-            norm,
-            IntegratorState(nothing, 1.0, nothing),
-            state,
-            pieces,
-            step=options.step,
-            first_step=1.0,
-            max_step=options.longest_step,
-            placed=options.placement,
-        )
-        self._go_on = self._run.go_on
+    system: OpenSystem | ClosedSystem
+    held: HeldForce
+    norm: ErrorNorm
+    options: RunOptions
+
+    def __post_init__(self) -> None:
+        self.method: Method = self.options.method
+        self._evaluator: Any = self.system
+        self._systems: tuple[Any, ...] = (self.system,)
 
     @property
-    def t(self) -> float:  # type: ignore[override]
-        return float(self._run.t)
+    @abstractmethod
+    def t(self) -> float:
+        """Current time (s)."""
 
     @property
-    def state(self) -> FloatArray:  # type: ignore[override]
-        state: FloatArray = self._run.state
-        return state
+    @abstractmethod
+    def state(self) -> FloatArray:
+        """Current state (nq + nv,), a copy."""
 
     def begin(self, t: float, state: FloatArray, force: FloatArray, span: float) -> None:
-        """Start from ``state`` at ``t`` (s), under ``force`` (nv,), for steps of ``span`` (s)."""
-        self._held.only(force)
-        self._kernel_system.hold(t, force, False)
-        self._evaluator.between(-np.inf, np.inf)
-        self._run.begin(t, state, *self._first(t, state, span))
+        """Start from ``state`` at ``t`` (s), under ``force`` (nv,), for steps of ``span`` (s).
 
+        Raises
+        ------
+        EvaluationError
+            If the first stage cannot be evaluated.
+        """
+        self._hold(t, force)
+        self._evaluator.between(-np.inf, np.inf)
+        memory = start(self.system, self.method, t, state, self.norm, np.inf, self._evaluator)
+        order = self.method.scheme.controller_order or 1
+        first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
+        self._begin(t, state, memory, first)
+
+    def _hold(self, t: float, force: FloatArray) -> None:
+        """Let ``force`` (nv,) act from ``t`` (s) on."""
+        self.held.only(force)
+
+    @abstractmethod
+    def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
+        """Start from an integrator state with a step of length ``first`` (s)."""
+
+    @abstractmethod
     def go_on(
         self,
         end: float,
@@ -142,8 +99,8 @@ class KernelRun(_IncrementalRun):
         force: FloatArray,
         forces_jumped: bool,
         grid: float,
-    ) -> str:
-        """Go on to ``end`` (s); empty, or why that is not possible.
+    ) -> None:
+        """Go on to ``end`` (s).
 
         Parameters
         ----------
@@ -160,94 +117,146 @@ class KernelRun(_IncrementalRun):
         ------
         ValueError
             If ``force`` has another shape, or is not finite.
+        SimulationError
+            If the run cannot go on; it is then at the last good inner step.
         """
-        reason = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
-        self._held.only(force)  # snapshots need it, too
-        if reason == FINISHED:
-            return ""
-        self.system.between(first, last)
-        if reason == BREAKPOINT:
-            try:
-                self._run.remember(self._renewed(self._run.memory(), end))
-            except EvaluationError as error:
-                return f"Stopped at t = {self.t:.6g} s: {error}. {LAST_GOOD}."
-            reason = CHUNK_FULL
-        while reason == CHUNK_FULL:
-            reason = self._run.advance()
-        if reason == FINISHED:
-            return ""
-        run = self._run
-        why = why_stopped(reason, self.system, run)
-        return f"Stopped at t = {run.t:.6g} s with step {run.h:.1e} s: {why.sentence}. {LAST_GOOD}."
 
-    def snapshot(self) -> Any:
-        """Everything that the next step depends on."""
-        return self._run.snapshot(), self._held.values[-1]
+    def _matters(self, fresh: IntegratorState, span: float) -> bool:
+        """Whether the singular configuration next to ``fresh`` does; the kernel has asked."""
+        return True
 
-    def restore(self, snapshot: Any) -> None:
-        """Go on from a :meth:`snapshot` of another run like this."""
-        kept, force = snapshot
-        self._held.only(force)
-        self._kernel_system.hold(kept.t, force, False)
-        self._run.restore(kept)
+    def _renewed(self, memory: IntegratorState, end: float) -> IntegratorState:
+        """``memory`` after forces jumped."""
+        try:
+            fresh = self.method.resume(self._evaluator, self.t, self.state, memory, self.norm)
+            if not self._matters(fresh, end - self.t):
+                return fresh
+            return beside_singular(
+                self.system, self.method, self.t, self.state, self.norm, end, self._evaluator, fresh
+            )
+        except EvaluationError as error:
+            raise self._stopped("", error) from error
 
-    def counts(self) -> dict[str, int]:
-        """Work done, in the words of :class:`~srm_mbs.simulation.result.Statistics`."""
-        run, kernel_system, system = self._run, self._kernel_system, self.system
-        steps, rejected, zones = run.totals()
-        return {
-            "steps": steps,
-            "rejected": rejected,
-            "placements": run.placed,
-            "replaced": run.replaced,
-            "zone_steps": zones,
-            "evaluations": kernel_system.evaluations + system.evaluations,
-            "factorisations": kernel_system.factorisations + system.factorisations,
-        }
+    def _stopped(self, step: str, why: object) -> SimulationError:
+        message = f"Stopped at t = {self.t:.6g} s{step}: {why}. The state is the last good one."
+        return SimulationError(message, None)
+
+    @abstractmethod
+    def go_on_from(self, other: Self) -> None:
+        """Continue as ``other``, a run of the same mechanism, would; the counts start at 0."""
+
+    @abstractmethod
+    def _counts(self) -> tuple[int, int, int, int, int]:
+        """Steps, rejected, placements, replaced, zone steps."""
+
+    def statistics(self, wall_time: float) -> Statistics:
+        """Work done, in ``wall_time`` (s)."""
+        evaluations = sum(system.evaluations for system in self._systems)
+        factorisations = sum(system.factorisations for system in self._systems)
+        return Statistics(*self._counts(), evaluations, factorisations, wall_time)
 
 
-class ReferenceRun(_IncrementalRun):
-    """A run of the Python reference.
+class KernelRun(IncrementalRun):
+    """A run of the compiled kernel."""
 
-    Parameters
-    ----------
-    system, held
-        The mechanism, under what is held.
-    norm, options
-        Error norm and checked options.
-    make_control
-        Makes its step-size control.
-    """
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        system, options = self.system, self.options
+        self._kernel_system = make_kernel_system(system)
+        self._evaluator = Evaluator(system, self._kernel_system)
+        self._systems = (system, self._kernel_system)
+        nothing = np.zeros(2 * system.nv)
+        self._run = CompiledRun(
+            self._kernel_system,
+            options.method,
+            self.norm,
+            IntegratorState(nothing, 1.0, nothing),
+            np.zeros(system.nq + system.nv),
+            smooth_intervals(nothing[:0], nothing[:0], 0.0, 1.0),
+            step=options.step,
+            first_step=1.0,
+            max_step=options.longest_step,
+            placed=options.placement,
+        )
+        self._go_on = self._run.go_on
 
-    def __init__(
+    @property
+    def t(self) -> float:
+        return float(self._run.t)
+
+    @property
+    def state(self) -> FloatArray:
+        state: FloatArray = self._run.state
+        return state
+
+    def _hold(self, t: float, force: FloatArray) -> None:
+        super()._hold(t, force)
+        self._kernel_system.hold(t, force, False)
+
+    def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
+        self._run.begin(t, state, memory, first)
+
+    def go_on(
         self,
-        system: OpenSystem | ClosedSystem,
-        held: HeldForce,
-        norm: ErrorNorm,
-        options: RunOptions,
-        make_control: MakeControl,
+        end: float,
+        first: float,
+        last: float,
+        force: FloatArray,
+        forces_jumped: bool,
+        grid: float,
     ) -> None:
-        super().__init__(system, held, norm, options, system)
-        self._make_control = make_control
-        self._control: StepSizeControl
-        self._wrappers: tuple[ControlWrapper, ...] = ()
-        self._memory: IntegratorState
+        run = self._run
+        returned = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
+        self.held.only(force)  # clones need it, too
+        if returned == ReturnReason.FINISHED:
+            return
+        self.system.between(first, last)
+        reason = ReturnReason(returned)
+        if reason is ReturnReason.BREAKPOINT:
+            run.remember(self._renewed(run.memory(), end))
+            reason = ReturnReason.CHUNK_FULL
+        while reason is ReturnReason.CHUNK_FULL:
+            reason = run.advance()
+        if reason is not ReturnReason.FINISHED:
+            failure = why_stopped(reason, self.system, run)
+            raise self._stopped(f" with step {run.h:.1e} s", failure.sentence)
+
+    def go_on_from(self, other: Self) -> None:
+        snapshot = other._run.snapshot()
+        self._hold(snapshot.t, other.held.values[-1])
+        self._run.restore(snapshot)
+
+    def _counts(self) -> tuple[int, int, int, int, int]:
+        steps, rejected, zones = self._run.totals()
+        return steps, rejected, self._run.placed, self._run.replaced, zones
+
+
+class ReferenceRun(IncrementalRun):
+    """A run of the Python reference."""
+
+    _t: float
+    _state: FloatArray
+    _control: StepSizeControl
+    _memory: IntegratorState
+    _nearness: SingularProximity
+    _wrappers: Sequence[ControlWrapper] = ()
+    _steps = _rejected = _zone_steps = 0
+    _placed = _replaced = 0
+    """Counts of former wrappers."""
+
+    @property
+    def t(self) -> float:
+        return self._t
+
+    @property
+    def state(self) -> FloatArray:
+        return self._state.copy()
+
+    def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
+        _, _, self._placed, self._replaced, _ = self._counts()
+        self._t, self._state, self._memory = t, state.copy(), memory
         self._nearness = SingularProximity()
-        self._counted = np.zeros(5, dtype=int)
-
-    def begin(self, t: float, state: FloatArray, force: FloatArray, span: float) -> None:
-        """See :meth:`KernelRun.begin`."""
-        self._held.only(force)
-        self.system.between(-np.inf, np.inf)
-        self._count_wrappers()
-        self.t, self.state = t, state.copy()
-        self._memory, first = self._first(t, state, span)
-        self._control, self._wrappers = self._make_control(first)
-
-    def _count_wrappers(self) -> None:
-        self._counted[2] += sum(wrapper.placed for wrapper in self._wrappers)
-        self._counted[3] += sum(wrapper.replaced for wrapper in self._wrappers)
-        self._wrappers = ()
+        self._control, self._wrappers = placed_control(self.system, self.options, lambda: first)
 
     def _matters(self, fresh: IntegratorState, span: float) -> bool:
         return self._nearness.matters(fresh, self.norm, span, self.system.nv)
@@ -260,62 +269,48 @@ class ReferenceRun(_IncrementalRun):
         force: FloatArray,
         forces_jumped: bool,
         grid: float,
-    ) -> str:
-        """See :meth:`KernelRun.go_on`."""
+    ) -> None:
         if force.shape != (self.system.nv,) or not np.isfinite(force).all():
             raise ValueError("not nv finite forces")
-        forces_jumped = forces_jumped or not np.array_equal(force, self._held.values[-1])
-        self._held.only(force)
+        forces_jumped = forces_jumped or not np.array_equal(force, self.held.values[-1])
+        self.held.only(force)
         self.system.between(first, last)
         if forces_jumped:
-            try:
-                self._memory = self._renewed(self._memory, end)
-            except EvaluationError as error:
-                return f"Stopped at t = {self.t:.6g} s: {error}. {LAST_GOOD}."
-        self._control.set_target_time(end, (self.t, grid) if grid else None)
+            self._memory = self._renewed(self._memory, end)
+        self._control.set_target_time(end, (self._t, grid) if grid else None)
         record = integrate(
             self.system,
             self.method,
             self._control,
             self.norm,
             self._memory,
-            self.state,
-            self.t,
+            self._state,
+            self._t,
             end,
             max_step=self.options.longest_step,
         )
         if record.times:
-            self.t, self.state = record.times[-1], record.steps[-1].state
-        rejected = sum(a.decision is StepDecision.REJECTED for a in record.attempts)
-        zones = sum(step.zone is not None for step in record.steps)
-        self._counted += [len(record.times), rejected, 0, 0, zones]
+            self._t, self._state = record.times[-1], record.steps[-1].state
+        self._steps += len(record.times)
+        self._rejected += sum(a.decision is StepDecision.REJECTED for a in record.attempts)
+        self._zone_steps += sum(step.zone is not None for step in record.steps)
         if record.status is RunStatus.INTERRUPTED:
             raise KeyboardInterrupt
-        return "" if record.status is RunStatus.FINISHED else record.message
+        if record.status is not RunStatus.FINISHED:
+            raise SimulationError(record.message, None)
 
-    def snapshot(self) -> Any:
-        """See :meth:`KernelRun.snapshot`."""
-        return self.t, self.state, self._memory, self._held.values[-1], self
-
-    def restore(self, snapshot: Any) -> None:
-        """See :meth:`KernelRun.restore`."""
-        self.t, state, memory, force, other = snapshot
-        self.state = state.copy()
-        self._nearness.looked = other._nearness.looked
-        self._held.only(force)
+    def go_on_from(self, other: Self) -> None:
+        self._t, self._state = other.t, other.state
+        self._nearness = copy.copy(other._nearness)
+        self._hold(self._t, other.held.values[-1])
         # Controls refer to what they are for: not to be copied, but to be exchanged.
         shared = {id(other.system): self.system, id(self.method.scheme): self.method.scheme}
-        self._memory = copy.deepcopy(memory, dict(shared))
+        self._memory = copy.deepcopy(other._memory, dict(shared))
         self._control, self._wrappers = copy.deepcopy((other._control, other._wrappers), shared)
-        self._counted = -np.array(
-            [0, 0, *(sum(getattr(w, n) for w in self._wrappers) for n in ("placed", "replaced")), 0]
-        )
+        _, _, placed, replaced, _ = self._counts()
+        self._placed, self._replaced = -placed, -replaced
 
-    def counts(self) -> dict[str, int]:
-        """See :meth:`KernelRun.counts`."""
-        names = ("steps", "rejected", "placements", "replaced", "zone_steps")
-        out = dict(zip(names, self._counted.tolist()))
-        out["placements"] += sum(wrapper.placed for wrapper in self._wrappers)
-        out["replaced"] += sum(wrapper.replaced for wrapper in self._wrappers)
-        system = self.system
-        return out | {"evaluations": system.evaluations, "factorisations": system.factorisations}
+    def _counts(self) -> tuple[int, int, int, int, int]:
+        placed = self._placed + sum(wrapper.placed for wrapper in self._wrappers)
+        replaced = self._replaced + sum(wrapper.replaced for wrapper in self._wrappers)
+        return self._steps, self._rejected, placed, replaced, self._zone_steps

@@ -76,7 +76,24 @@ class MobilityMap:
     @cached_property
     def changes(self) -> tuple[MobilityChange, ...]:
         """Singular configurations that the run met, in order of time."""
-        return _changes(self._solution)
+        solution = self._solution
+        mechanism = solution.mechanism
+        structural = mechanism.structure.loop_rank
+        if not structural:
+            return ()
+        met = [(c.time, c.configuration, c.loops) for c in solution.crossings]
+        met += [(b.start, b.configuration, b.loops) for b in solution.bifurcations]
+        geometry = ClosureGeometry(mechanism, mechanism.q0)
+        everything = np.arange(mechanism.model.nv)
+        changes = []
+        for time, q, loops in sorted(met, key=lambda entry: entry[0]):
+            if q is None:
+                continue
+            freedom = tangent_basis(geometry, q, everything)[0].shape[1]
+            # Where only the drives lose rank, what the closures leave free is the same.
+            if freedom > mechanism.model.nv - structural:
+                changes.append(MobilityChange(time, freedom, loops))
+        return tuple(changes)
 
 
 def mobility_map(solution: SimulationResult) -> MobilityMap:
@@ -96,45 +113,21 @@ def mobility_map(solution: SimulationResult) -> MobilityMap:
         )
     mechanism = solution.mechanism
     model = mechanism.model
-    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
-    everything = np.arange(model.nv)
-    bases, values = [], []
-    for q in solution.q:
-        basis, singular = tangent_basis(geometry, q, everything)
-        bases.append(basis)
-        values.append(singular)
-    freedom = np.array([basis.shape[1] for basis in bases], dtype=int)
+    geometry, everything = ClosureGeometry(mechanism, mechanism.q0), np.arange(model.nv)
+    # The last at q0, so that the arrays have their width without any time, too.
+    found = [tangent_basis(geometry, q, everything) for q in (*solution.q, mechanism.q0)]
+    bases, values = zip(*found)
+    freedom = np.array([basis.shape[1] for basis in bases[:-1]], dtype=int)
     structural = mechanism.structure.loop_rank
-    table = np.array(values)
-    if not len(table):  # as wide as at any configuration
-        table = np.zeros((0, len(tangent_basis(geometry, mechanism.q0, everything)[1])))
+    table = np.array(values)[:-1]
     parts = [np.linalg.norm(basis, axis=1) for basis in bases]
     return MobilityMap(
         solution.t,
         freedom,
         model.nv - freedom,
         table,
-        table[:, structural - 1] if structural else np.full(len(bases), np.inf),
-        np.array(parts).reshape(len(bases), model.nv),
+        table[:, structural - 1] if structural else np.full(len(freedom), np.inf),
+        np.array(parts)[:-1],
         coordinate_names(mechanism),
         solution,
     )
-
-
-def _changes(solution: SimulationResult) -> tuple[MobilityChange, ...]:
-    if not solution.mechanism.structure.loop_rank:
-        return ()
-    mechanism = solution.mechanism
-    geometry = ClosureGeometry(mechanism, np.array(mechanism.q0))
-    everything = np.arange(mechanism.model.nv)
-    met = [(passage.time, passage.configuration, passage.loops) for passage in solution.crossings]
-    met += [(stay.start, stay.configuration, stay.loops) for stay in solution.bifurcations]
-    changes = []
-    for time, q, loops in sorted(met, key=lambda entry: entry[0]):
-        if q is None:
-            continue
-        freedom = tangent_basis(geometry, q, everything)[0].shape[1]
-        # Where only the drives lose rank, what the closures leave free is the same.
-        if freedom > mechanism.model.nv - mechanism.structure.loop_rank:
-            changes.append(MobilityChange(time, freedom, loops))
-    return tuple(changes)

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.integration.driver import Tick
+from srm_mbs.integration.driver import RunStatus, Tick
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.options import RunOptions
@@ -46,9 +46,9 @@ def log_start(name: str, options: RunOptions, norm: ErrorNorm, by: str) -> None:
 
 
 def log_end(name: str, solution: RunOutcome) -> None:
-    """Statistics, and the passages, which are looked for only if they are wanted.
+    """Log the statistics, and for DEBUG the passages: a search for thousands takes seconds.
 
-    Looking for thousands of them takes seconds: who pressed Ctrl-C has the solution before it.
+    After Ctrl-C there is no search, so that the solution comes at once.
     """
     stats = solution.stats
     log.info(
@@ -63,11 +63,9 @@ def log_end(name: str, solution: RunOutcome) -> None:
         stats.wall_time,
     )
     log.info("%s: %s", name, solution.message)
-    if log.isEnabledFor(logging.DEBUG) and solution.status != "interrupted":
-        _log_passages(name, getattr(solution, "crossings", ()))
-
-
-def _log_passages(name: str, crossings: Sequence[Crossing]) -> None:
+    if not log.isEnabledFor(logging.DEBUG) or solution.status is RunStatus.INTERRUPTED:
+        return
+    crossings: Sequence[Crossing] = getattr(solution, "crossings", ())
     for crossing in crossings[:LISTED_PASSAGES]:
         log.debug(
             "%s: singular configuration of %s passed at t = %.9g s",

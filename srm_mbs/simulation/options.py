@@ -16,7 +16,6 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
-from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepSizeControl
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
@@ -194,7 +193,13 @@ def finite(value: Any, what: str) -> float:
     """``value`` as a finite number of seconds."""
     if type(value) is float and math.isfinite(value):
         return value
-    (number,) = numbers([value], what, "Give a number of seconds").tolist()
+    number = finite_array(value, ())
+    if number is None:
+        raise InputError(
+            f"{what} = {value!r} is not a finite number",
+            element=what,
+            remedy="Give a number of seconds",
+        )
     return float(number)
 
 
@@ -308,17 +313,20 @@ def checked_placement(placement: Any) -> str:
     return str(placement)
 
 
+def _given_times(values: Any, what: str, remedy: str) -> FloatArray:
+    """``values`` as times (k,) s."""
+    times = numbers(values, what, remedy)
+    if times.ndim != 1:
+        raise InputError(f"{what} has shape {times.shape}", element=what, remedy=remedy)
+    return times
+
+
 def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> FloatArray:
     """The given times within the run, in order."""
     if isinstance(singular_times, tuple) and not singular_times:
         return np.zeros(0)
     remedy = "Give times (s) between the start and the end of the run"
-    times = numbers(singular_times, "singular_times", remedy)
-    if times.ndim != 1:
-        raise InputError(
-            f"singular_times has shape {times.shape}", element="singular_times", remedy=remedy
-        )
-    times = np.unique(times)
+    times = np.unique(_given_times(singular_times, "singular_times", remedy))
     slack = AVOIDABLE * (t_end - t0)
     for end in (t0, t_end):
         if np.any(np.abs(times - end) <= slack):
@@ -336,12 +344,7 @@ def checked_breakpoints(breakpoints: Any) -> FloatArray:
     if isinstance(breakpoints, tuple) and not breakpoints:
         return np.zeros(0)
     remedy = "Give times (s) at which a force jumps or has a kink"
-    times = numbers(breakpoints, "breakpoints", remedy)
-    if times.ndim != 1:
-        raise InputError(
-            f"breakpoints has shape {times.shape}", element="breakpoints", remedy=remedy
-        )
-    return times
+    return _given_times(breakpoints, "breakpoints", remedy)
 
 
 def check_avoidable(singular_times: FloatArray, breakpoints: FloatArray, t_end: float) -> None:
@@ -432,23 +435,3 @@ def check_embedded(scheme: ButcherTableau, step: float | None) -> None:
             element="tableau",
             remedy="Give a step, or use tvd32, dopr54 or dop853",
         )
-
-
-def step_size_control(
-    scheme: ButcherTableau,
-    t0: float,
-    t_end: float,
-    step: float | None,
-    first_step: Callable[[], float],
-) -> StepSizeControl:
-    """Fixed steps if ``step`` is given, otherwise control of the embedded pair's error.
-
-    Raises
-    ------
-    InputError
-        If the scheme has no embedded pair.
-    """
-    check_embedded(scheme, step)
-    if step is not None:
-        return FixedStep(t0, t_end, step)
-    return PIControl(t_end, first_step(), scheme.controller_order or 1)

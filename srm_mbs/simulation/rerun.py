@@ -7,22 +7,23 @@ from typing import Any
 import numpy as np
 
 from srm_mbs.errors import InputError
+from srm_mbs.integration.driver import RunStatus
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.segmented_result import RESULTS
 from srm_mbs.simulation.segmented_run import run
 
-BEYOND = 0.1
+EXTENSION = 0.1
 """Extension of the rerun of a failed run, as a part of its length: the rerun may get further."""
 
 
-def unsupported_reason(solution: SimulationResult) -> str:
-    """Why ``solution`` cannot be made again; empty if it can."""
+def unsupported_reason(solution: SimulationResult) -> str | None:
+    """Why ``solution`` cannot be made again; None if it can."""
     request = solution.request
     if request is None:
         return "the file that it was loaded from does not hold how it was made"
     if request.lost:
         return f"saved runs hold no Python functions, and it had {', '.join(request.lost)}"
-    return ""
+    return None
 
 
 def rerun(
@@ -61,10 +62,10 @@ def rerun(
     settings = solution.settings
     start, end = solution.span
     t_end = request.t_end
-    if solution.status == "interrupted":
+    if solution.status is RunStatus.INTERRUPTED:
         t_end = end
-    elif solution.status == "failed":
-        t_end = min(t_end, end + BEYOND * max(end - start, BEYOND * (t_end - start)))
+    elif solution.status is RunStatus.FAILED:
+        t_end = min(t_end, end + EXTENSION * max(end - start, EXTENSION * (t_end - start)))
     asked = settings.rtol if rtol is None else rtol
     backend = request.backend
     if settings.backend == "python" and backend == "auto":

@@ -81,8 +81,9 @@ class Settings:
 
 
 ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
-"""A step that did not stand: its start and length (s), error estimate over tolerance, and whether
-it was ``"rejected"`` for its error or ``"replaced"`` because of a singular configuration."""
+"""A step that was not accepted: its start and length (s), its error estimate over the tolerance,
+and whether it was ``"rejected"`` for its error or ``"replaced"`` because of a singular
+configuration."""
 
 
 def attempt_array(attempts: Iterable[Any]) -> NDArray[np.void]:
@@ -156,7 +157,7 @@ class SimulationResult(RunOutcome):
     settings
         :class:`Settings`.
     attempts : (k,)
-        The steps that did not stand, a structured array of :data:`ATTEMPT`.
+        The rejected and redone steps, a structured array of :data:`ATTEMPT`.
     t_events, q_events, v_events
         For each event in turn its times (k,) s, and the states (k, nq), (k, nv) there; None if
         no events were given.

@@ -28,12 +28,14 @@ from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals, 
 from srm_mbs.integration.control.prescribed_times import placed, suspected
 from srm_mbs.integration.control.step_size import (
     ControlWrapper,
+    FixedStep,
+    PIControl,
     StepDecision,
     StepSizeControl,
     initial_step,
 )
 from srm_mbs.integration.dense_output import DenseOutput, StepData
-from srm_mbs.integration.driver import RunRecord, RunStatus, Tick
+from srm_mbs.integration.driver import RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import uses_kernel
@@ -41,13 +43,8 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.run import CompiledRun
 from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
-from srm_mbs.integration.messages import (
-    MECHANISM,
-    ProblemVocabulary,
-    branch_changes,
-    method_messages,
-)
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
+from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, branch_changes
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, method_messages
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
@@ -64,7 +61,6 @@ from srm_mbs.simulation.options import (
     checked_samples,
     checked_span,
     loosest_rtol,
-    step_size_control,
     tightest_rtol,
 )
 from srm_mbs.simulation.result import (
@@ -86,6 +82,9 @@ SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
 
 Result = TypeVar("Result", bound=SimulationResult)
 Outcome = TypeVar("Outcome", bound=RunOutcome)
+Counters = Sequence[ControlWrapper | CompiledRecord]
+"""Objects that counted placed and replaced steps, and know suspect times: the wrappers of a
+step-size control, or the record of a run of the kernel."""
 
 
 @dataclass(eq=False)
@@ -136,8 +135,8 @@ def run_segment(mechanism: Mechanism, options: RunOptions, result_type: type[Res
     problem = assemble_problem(mechanism, options)
     by = "kernel" if problem.on_kernel else "python"
     log_start(mechanism.name, options, problem.norm, by)
-    record, wrappers, kernel_system = integrate_problem(problem)
-    result = assemble_result(problem, record, wrappers, kernel_system, result_type)
+    record, counters, kernel_system = integrate_problem(problem)
+    result = assemble_result(problem, record, counters, kernel_system, result_type)
     result.message += bifurcation_sentences(result)
     log_end(mechanism.name, result)
     return result
@@ -235,6 +234,12 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
     return np.broadcast_to(array, (2 * nv,)).copy()
 
 
+def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
+    """The error norm with the tolerances of checked ``options``."""
+    atol = absolute_tolerance(mechanism, options.atol, options.rtol)
+    return ErrorNorm(atol, options.rtol, options.negligible)
+
+
 def initial_state(
     mechanism: Mechanism, t0: float, q0: Any, v0: Any
 ) -> tuple[Mechanism, FloatArray]:
@@ -311,28 +316,20 @@ def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
     check_avoidable(options.singular_times, intervals.ends, t_end - t0)
     on_kernel = uses_kernel(options.backend, method, options.placement, options.singular_times)
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
-    tolerance = absolute_tolerance(mechanism, options.atol, options.rtol)
-    norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+    norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
     system = make_system(mechanism, options.controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
         check_consistent(mechanism, t0)
-    watch = event_watch(options.events, system, method, state)
+    watch = None
+    if options.events is not None:
+
+        def adapt(event: Callable[..., Any]) -> StateFunction:
+            return lambda t, x: event(t, *system.split(x))
+
+        watch = EventWatch(system, method.scheme, prepare_events(options.events, adapt), state.size)
     return Problem(mechanism, options, system, norm, state, intervals, on_kernel, held, watch)
-
-
-def event_watch(
-    events: Any, system: OpenSystem | ClosedSystem, method: Method, state: FloatArray
-) -> EventWatch | None:
-    """The detector of the events (t, q, v) -> float; None if none are given."""
-    if events is None:
-        return None
-
-    def adapt(event: Callable[..., Any]) -> StateFunction:
-        return lambda t, x: event(t, *system.split(x))
-
-    return EventWatch(system, method.scheme, prepare_events(events, adapt), state.size)
 
 
 def sampler(
@@ -364,11 +361,16 @@ def placed_control(
     arrivals
         Whether the driver prepares for ends beside singular configurations.
     """
-    scheme, t_end = options.method.scheme, options.t_end
-    control = step_size_control(scheme, options.t0, t_end, options.step, first_step)
+    scheme, t_end, step = options.method.scheme, options.t_end, options.step
+    check_embedded(scheme, step)
+    control: StepSizeControl
+    if step is None:
+        control = PIControl(t_end, first_step(), scheme.controller_order or 1)
+    else:
+        control = FixedStep(options.t0, t_end, step)
     placement = options.placement if system.has_constraints else None
     times = options.singular_times
-    control, wrappers = placed(control, scheme, placement, times, t_end, options.step, arrivals)
+    control, wrappers = placed(control, scheme, placement, times, t_end, step, arrivals)
     if placement != "automatic":
         return control, wrappers
     guard = branch_guard(control, system, options.method)
@@ -378,21 +380,20 @@ def placed_control(
 # --- integrate ------------------------------------------------------------------------------------
 
 
-def integrate_problem(problem: Problem) -> tuple[RunRecord, Sequence[ControlWrapper], Any]:
-    """The record of the run, the wrappers of its control, and the kernel's system if there is one.
+def integrate_problem(problem: Problem) -> tuple[RunRecord, Counters, Any]:
+    """The record of the run, its counters, and the kernel's system if there is one.
 
     Whatever happens on the way ends in the record: a start that cannot be evaluated, too.
     """
     kernel_system: Any = None
     try:
         with workspace(problem.system) if problem.on_kernel else nullcontext() as kernel_system:
-            record, wrappers = _integrate(problem, kernel_system)
+            return *_integrate(problem, kernel_system), kernel_system
     except (EvaluationError, ControllerError) as error:
         return failed_start(problem.options.t0, problem.state, error, " s"), (), kernel_system
-    return record, wrappers, kernel_system
 
 
-def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Sequence[ControlWrapper]]:
+def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counters]:
     system, options, state, norm = problem.system, problem.options, problem.state, problem.norm
     method, t0 = options.method, options.t0
     evaluator: Any = system if kernel_system is None else Evaluator(system, kernel_system)
@@ -401,80 +402,72 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Sequenc
         handler.sample = sampler(system, problem.held, options.controller, kernel_system)
         handler.sample(t0, state)
     memory = start(system, method, t0, state, norm, options.t_end, evaluator)
-
-    def first_step() -> float:
-        return chosen_first_step(evaluator, norm, options, memory, state)
-
-    with progress_of(options.progress, system, options.t_end) as tick:
-        if kernel_system is not None:
-            run = kernel_run(problem, kernel_system, memory, handler.arrivals, first_step)
-            record = kernel_driver.integrate(
-                system, run, tick=tick, events=problem.watch, passing=handler
-            )
-            handler.done()
-            return record, ()
-        control, wrappers = placed_control(system, options, first_step, handler.arrivals)
-        steps = integrate_steps(
-            system, options, control, norm, memory, state, tick, problem.watch, handler
-        )
+    if kernel_system is None:
+        found = integrate_steps(system, options, norm, memory, state, problem.watch, handler)
         handler.done()
-        return steps, wrappers
+        return found
+    check_embedded(method.scheme, options.step)
+    run = CompiledRun(
+        kernel_system,
+        method,
+        norm,
+        memory,
+        state,
+        problem.intervals,
+        t0=t0,
+        step=options.step,
+        first_step=chosen_first_step(evaluator, norm, options, memory, state)
+        if options.step is None
+        else 0.0,
+        max_step=options.longest_step,
+        placed=options.placement,
+        arrivals=handler.arrivals,
+    )
+    with progress_of(options.progress, system, options.t_end) as tick:
+        record = kernel_driver.integrate(
+            system, run, tick=tick, events=problem.watch, passing=handler
+        )
+    handler.done()
+    return record, (record,)
 
 
 def integrate_steps(
     system: System,
     options: RunOptions,
-    control: StepSizeControl,
     norm: ErrorNorm,
     memory: IntegratorState,
     state: FloatArray,
-    tick: Tick | None,
     watch: EventWatch | None,
     handler: BreakpointHandler | None = None,
     words: ProblemVocabulary = MECHANISM,
-) -> RunRecord:
-    """The run with the Python reference; see :func:`srm_mbs.integration.driver.integrate`."""
-    return driver.integrate(
+) -> tuple[RunRecord, Sequence[ControlWrapper]]:
+    """The record of a run with the Python reference, and the wrappers of its control.
+
+    The parameters are those of :func:`srm_mbs.integration.driver.integrate`.
+    """
+    control, wrappers = placed_control(
         system,
-        options.method,
-        control,
-        norm,
-        memory,
-        state,
-        options.t0,
-        options.t_end,
-        max_step=options.longest_step,
-        tick=tick,
-        events=watch,
-        breakpoints=handler,
-        words=words,
+        options,
+        lambda: chosen_first_step(system, norm, options, memory, state),
+        handler is not None and handler.arrivals,
     )
-
-
-def kernel_run(
-    problem: Problem,
-    kernel_system: Any,
-    memory: IntegratorState,
-    arrivals: bool,
-    first_step: Callable[[], float],
-) -> CompiledRun:
-    """The run on the compiled kernel, before its first step."""
-    options = problem.options
-    check_embedded(options.method.scheme, options.step)
-    return CompiledRun(
-        kernel_system,
-        options.method,
-        problem.norm,
-        memory,
-        problem.state,
-        problem.intervals,
-        t0=options.t0,
-        step=options.step,
-        first_step=first_step() if options.step is None else 0.0,
-        max_step=options.longest_step,
-        placed=options.placement,
-        arrivals=arrivals,
-    )
+    with progress_of(options.progress, system, options.t_end) as tick:
+        record = driver.integrate(
+            system,
+            options.method,
+            control,
+            norm,
+            memory,
+            state,
+            options.t0,
+            options.t_end,
+            max_step=options.longest_step,
+            tick=tick,
+            events=watch,
+            breakpoints=handler,
+            words=words,
+        )
+    return record, wrappers
 
 
 def chosen_first_step(
@@ -509,15 +502,14 @@ def statistics(
     system: OpenSystem | ClosedSystem | DaeSystem,
     record: RunRecord,
     data: StepData,
-    placed: int,
-    replaced: int,
+    counters: Counters,
 ) -> Statistics:
-    """Counts of a run, ``placed`` and ``replaced`` by its step placement."""
+    """Counts of a run."""
     return Statistics(
         steps=data.count,
         rejected=sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
-        placements=placed,
-        replaced=replaced,
+        placements=sum(counter.placed for counter in counters),
+        replaced=sum(counter.replaced for counter in counters),
         zone_steps=len(data.zones),
         evaluations=system.evaluations,
         factorisations=system.factorisations,
@@ -543,7 +535,7 @@ def settings(options: RunOptions, norm: ErrorNorm, controlled: bool, backend: st
 def assemble_result(
     problem: Problem,
     record: RunRecord,
-    wrappers: Sequence[ControlWrapper],
+    counters: Counters,
     kernel_system: Any,
     result_type: type[Result],
 ) -> Result:
@@ -554,14 +546,10 @@ def assemble_result(
     dense: DenseOutput
     if isinstance(record, CompiledRecord):
         dense = CompiledDenseOutput(None if shared(system) else kernel_system, system, scheme, data)
-        placed, replaced, suspects = record.placed, record.replaced, record.suspects
     else:
         dense = DenseOutput(system, scheme, data)
-        placed = sum(wrapper.placed for wrapper in wrappers)
-        replaced = sum(wrapper.replaced for wrapper in wrappers)
-        suspects = suspected(wrappers)
     # Counted before anything below reads the dense output, which evaluates stages.
-    stats = statistics(system, record, data, placed, replaced)
+    stats = statistics(system, record, data, counters)
     controlled = options.controller is not None or system.has_user_forces
     by = "kernel" if problem.on_kernel else "python"
     return result_type(
@@ -575,7 +563,7 @@ def assemble_result(
         events=None if problem.watch is None else problem.watch.found(),
         status=record.status,
         message=record.message
-        + branch_changes(suspects, "the velocity turned", SMALLER_STEPS)
+        + branch_changes(suspected(counters), "the velocity turned", SMALLER_STEPS)
         + method_messages(options.method, record.steps, problem.norm)
         + _limits_left(mechanism, dense)
         + _driven_too_far(mechanism, record),

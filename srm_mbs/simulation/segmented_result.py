@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.integration.dense_output import StepData, check_within, checked_output_times
 from srm_mbs.integration.driver import RunStatus
@@ -47,13 +47,12 @@ class SegmentedResult(SimulationResult):
         self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
-        self.stats = _added([segment.stats for segment in self.segments])
+        self.stats = Statistics(*map(sum, zip(*(astuple(part.stats) for part in self.segments))))
         self.t_eval = t_eval
         self._parts: tuple[SimulationResult, ...] = self.segments
-        self._order = np.zeros(0, dtype=int)
+        self._order: IndexArray | slice = slice(None)
         if t_eval is not None:
-            t_eval = t_eval[t_eval <= self.segments[-1].steps.end]
-            self._read_at(t_eval)
+            self._read_at(t_eval[t_eval <= self.segments[-1].steps.end])
         self.t = self.rows_of_parts(lambda part: part.t)
         self.q = self.rows_of_parts(lambda part: part.q)
         self.v = self.rows_of_parts(lambda part: part.v)
@@ -70,22 +69,22 @@ class SegmentedResult(SimulationResult):
         """The smooth parts of the run, between the actions of events."""
         return self._segments
 
-    def _index(self, t: FloatArray) -> Any:
-        """The segment of each time; the later one at a jump."""
-        return np.clip(np.searchsorted(self._starts, t, side="right") - 1, 0, None)
-
     def _read_at(self, t: FloatArray) -> None:
-        index = self._index(t)
+        """Read each segment at those of ``t`` that lie in it; at a jump the later segment."""
+        index = np.clip(np.searchsorted(self._starts, t, side="right") - 1, 0, None)
         chosen = np.argsort(index, kind="stable")
         self._order = np.argsort(chosen, kind="stable")
         self._parts = tuple(segment.at(t[index == k]) for k, segment in enumerate(self.segments))
 
     def rows_of_parts(self, read: Callable[[Any], FloatArray]) -> FloatArray:
         """Rows that ``read`` returns for the segments, in the order of ``t``."""
-        rows = np.concatenate([read(part) for part in self._parts])
-        rows = rows if self._parts is self.segments else rows[self._order]
+        rows = self._ordered([read(part) for part in self._parts])
         rows.setflags(write=False)
         return rows
+
+    def _ordered(self, rows: list[FloatArray]) -> FloatArray:
+        joined: FloatArray = np.concatenate(rows)[self._order]
+        return joined
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
         """Dense output, right-continuous; see :class:`~srm_mbs.Solution`."""
@@ -136,10 +135,6 @@ class SegmentedResult(SimulationResult):
         rates = [rate for _, rate in pairs]
         return self._ordered(positions), self._ordered(rates)
 
-    def _ordered(self, rows: list[FloatArray]) -> FloatArray:
-        joined = np.concatenate(rows)
-        return joined if self._parts is self.segments else joined[self._order]
-
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
@@ -168,10 +163,10 @@ class SegmentedResult(SimulationResult):
     @cached_property
     def energy_balance(self) -> EnergyBalance:
         """See :attr:`~srm_mbs.Solution.energy_balance`; what actions change is in ``events``."""
-        order = None if self._parts is self.segments else self._order
-        return joined_balance(self.segments, self._parts, order)
+        return joined_balance(self.segments, self._parts, self._order)
 
     def _named(self, which: str) -> Mapping[str, FloatArray]:
+        """A table of rows by name; 0 in the segments whose mechanism has not that name."""
         tables = [getattr(part, which) for part in self._parts]
         shapes = {name: rows.shape[1:] for table in tables for name, rows in table.items()}
         return {
@@ -216,17 +211,9 @@ class SegmentedResult(SimulationResult):
         return tuple(dict.fromkeys(rows))
 
 
-def _added(parts: Sequence[Statistics]) -> Statistics:
-    names = [field.name for field in fields(Statistics)]
-    return Statistics(**{name: sum(getattr(part, name) for part in parts) for name in names})
-
-
 def _joined(parts: Sequence[StepData]) -> StepData:
     """One set of steps; the states are those before the jumps."""
     width = max(part.corrections.shape[1] for part in parts)
-    stopped = [
-        part.times if part.stop is None else np.append(part.times[:-1], part.stop) for part in parts
-    ]
     at = np.cumsum([0, *(part.count for part in parts)])
 
     def rows(name: str) -> FloatArray:
@@ -234,7 +221,9 @@ def _joined(parts: Sequence[StepData]) -> StepData:
 
     return replace(
         parts[-1],
-        times=np.concatenate([stopped[0][:1], *(times[1:] for times in stopped)]),
+        times=np.concatenate(
+            [parts[0].times[:1], *(np.append(part.times[:-1], part.end)[1:] for part in parts)]
+        ),
         states=np.concatenate([parts[0].states[:1], *(part.states[1:] for part in parts)]),
         corrections=np.concatenate(
             [

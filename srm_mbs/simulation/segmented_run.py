@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -159,33 +160,84 @@ def impact(
 
 log = logging.getLogger(__name__)
 
-MANY = 10
-CHATTERS = 1e-8
-"""An event that occurs MANY times within this part of the run chatters."""
-HELD = 1e-9
-"""Rounding of an event that closures hold at zero, over its values before."""
-SNAPS = 1e-4
+CHATTER_ACTIONS = 10
+"""Actions of an event after which it may chatter."""
+CHATTER_SPAN = 1e-8
+"""An event that acts CHATTER_ACTIONS times within this part of the run chatters."""
+HELD_EVENT_ROUNDING = 1e-9
+"""Rounding of the value of an event that closures hold at zero, over its values before."""
+LARGEST_PROJECTION = 1e-4
 """Largest motion (units) onto the closures of another mechanism: more is an inconsistent state."""
-INTERRUPTED = "Interrupted at t = {:.6g} s; everything up to there is kept."
-ON = 1e-13
+CLOSED_ROUNDING = 1e-13
 """Closure error that is rounding, in scaled rows, and over 1 + |v| that of rates."""
-LEFT = 1e-12
+NEGLIGIBLE_REST = 1e-12
 """Part of the run too short for another segment."""
 
 
-def _in_segment(
-    event: EventFunction, before: int, departs: bool, floor: float, start_tolerance: float | None
-) -> EventFunction:
-    """``event`` of a run as it is in a segment of it, after ``before`` occurrences."""
-    return replace(
-        event,
-        occurrences=event.occurrences - before,
-        action=None,
-        acts=event.action is not None,
-        departs=departs and floor == 0.0,
-        floor=floor,
-        start_tolerance=start_tolerance,
-    )
+@dataclass(eq=False)
+class _RunEvent:
+    """An event over the segments of a run.
+
+    Attributes
+    ----------
+    event
+        Of the whole run.
+    count
+        Occurrences in the segments so far.
+    acted
+        Whether its action ended the last segment.
+    floor, start_tolerance
+        As for :class:`~srm_mbs.integration.events.EventFunction`, in the next segment.
+    acted_at
+        The last times (s) of its action.
+    """
+
+    event: EventFunction
+    count: int = 0
+    acted: bool = False
+    floor: float = 0.0
+    start_tolerance: float | None = None
+    acted_at: deque[float] = field(default_factory=lambda: deque(maxlen=CHATTER_ACTIONS))
+
+    @property
+    def name(self) -> str:
+        return self.event.name.strip("'")
+
+    @property
+    def left(self) -> float:
+        """Number of further occurrences that ends the run."""
+        return self.event.occurrences - self.count
+
+    def in_segment(self) -> EventFunction:
+        """The event as it is in the next segment."""
+        return replace(
+            self.event,
+            occurrences=self.left,
+            action=None,
+            acts=self.event.action is not None,
+            departs=self.acted and self.floor == 0.0,
+            floor=self.floor,
+            start_tolerance=self.start_tolerance,
+        )
+
+    def act(self, t: float, q: FloatArray, v: FloatArray) -> Any:
+        """The answer of the action; None without one."""
+        action = self.event.action
+        try:
+            return None if action is None else action(t, q, v)
+        except Exception as error:
+            raise EventError(f"the action of the event {self.name!r} raised {error!r}") from error
+
+    def check_chatter(self, t: float, span: float) -> None:
+        """Record an action at ``t`` (s); refuse too many within a part of the length ``span``."""
+        self.acted_at.append(t)
+        within = t - self.acted_at[0]
+        if len(self.acted_at) == CHATTER_ACTIONS and within < CHATTER_SPAN * span:
+            raise EventError(
+                f"the event {self.name!r} occurred {CHATTER_ACTIONS} times within {within:.1e} s: "
+                "it chatters. Let its action hold what it hits (srm.Switch with a closure) when "
+                "the impact is slow"
+            )
 
 
 class _Sampled:
@@ -233,8 +285,7 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
 def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
     """The segments between the actions of events, joined."""
     t_end = options.t_end
-    prepared = prepare_events(options.events, lambda event: event)
-    names = [event.name.strip("'") for event in prepared]
+    events = [_RunEvent(event) for event in prepare_events(options.events, lambda event: event)]
     q0, v0 = options.q0, options.v0
     if options.t0 == 0.0 and not (q0 is None and v0 is None):
         # Drives begin with this state.
@@ -245,69 +296,41 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
     if options.sample_time is not None and options.controller is not None:
         period = positive(options.sample_time, "sample_time", " of seconds")
         here = here._replace(controller=_Sampled(options.controller, period))
-    counts = [0] * len(prepared)
-    last_times: list[list[float]] = [[] for _ in prepared]
-    floors = [0.0] * len(prepared)
     parts: list[R] = []
-    acted: list[int] = []
-    start_tolerances: list[float | None] = [None] * len(prepared)
     t = options.t0
     span = t_end - t
     status, message = RunStatus.RUNNING, ""
     while status is RunStatus.RUNNING:
-        events = [
-            _in_segment(event, counts[i], i in acted, floors[i], start_tolerances[i])
-            for i, event in enumerate(prepared)
-        ]
         try:
-            asked = here._replace(events=events)
+            asked = here._replace(events=[event.in_segment() for event in events])
             part = run_segment(mechanism, asked, types.plain)
             part.request = asked.repeatable()
+            parts.append(part)
+            status, message, t = part.status, part.message, part.steps.end
+            due = []
+            for event, times in zip(events, part.t_events or []):
+                event.count += len(times)
+                if len(times) and times[-1] == t:
+                    due.append(event)
+            if status is not RunStatus.EVENT or any(event.left <= 0 for event in due):
+                break
+            mechanism, q, v = _after_actions(events, due, part, span)
         except InputError as error:
             if not parts:
                 raise
             status = RunStatus.FAILED
             message = f"Stopped at t = {t:.9g} s: after the action {error}."
-            break
-        except KeyboardInterrupt:
-            if not parts:
-                raise
-            status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
-            break
-        parts.append(part)
-        status, message = part.status, part.message
-        found = part.t_events or []
-        counts = [n + len(times) for n, times in zip(counts, found)]
-        t = part.steps.end
-        due = [i for i, times in enumerate(found) if len(times) and times[-1] == t]
-        final = any(len(found[i]) >= events[i].occurrences for i in due)
-        if status is not RunStatus.EVENT or final:
-            break
-        acted = [i for i in due if prepared[i].action is not None]
-        # What was counted here is not counted again just after; the rest has still to be.
-        near = 2.0 * same_time(*part.steps.times[-2:].tolist())
-        start_tolerances = [
-            near if len(times) and times[-1] >= t - near else 0.0 for times in found
-        ]
-        try:
-            acting_events = ", ".join(names[i] for i in acted)
-            log.debug("%s: action of %s at t = %.9g s", mechanism.name, acting_events, t)
-            actions = [(prepared[i].action, names[i]) for i in acted]
-            mechanism, q, v = _after(part, t, actions)
-            switched = mechanism.loops != part.mechanism.loops
-            for i in acted:
-                floors[i] = _rounding(prepared[i].function, part) if switched else 0.0
-                last_times[i] = [*last_times[i][1 - MANY :], t]
-                _check_chatter(last_times[i], span, names[i])
         except EventError as error:
             status = RunStatus.FAILED
             message = f"Stopped at t = {t:.9g} s: {error}. Everything up to there is kept."
-            break
         except KeyboardInterrupt:
-            status, message = RunStatus.INTERRUPTED, INTERRUPTED.format(t)
-            break
-        here = here._replace(t0=t, q0=q, v0=v)
-        status = RunStatus.RUNNING if t_end - t > LEFT * span else RunStatus.FINISHED
+            if not parts:
+                raise
+            status = RunStatus.INTERRUPTED
+            message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
+        else:
+            here = here._replace(t0=t, q0=q, v0=v)
+            status = RunStatus.RUNNING if t_end - t > NEGLIGIBLE_REST * span else RunStatus.FINISHED
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
     return types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
@@ -316,34 +339,41 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
 def _rounding(event: Callable[..., Any], solution: SimulationResult) -> float:
     """Size of the value of an event that new closures hold at zero."""
     rows = zip(solution.t, solution.q, solution.v)
-    return HELD * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
-
-
-def _check_chatter(times: list[float], span: float, name: str) -> None:
-    if len(times) == MANY and times[-1] - times[0] < CHATTERS * span:
-        raise EventError(
-            f"the event {name!r} occurred {MANY} times within {times[-1] - times[0]:.1e} s: it "
-            "chatters. Let its action hold what it hits (srm.Switch with a closure) when the "
-            "impact is slow"
-        )
+    return HELD_EVENT_ROUNDING * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
 
 
 def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
-    """Whether ``x`` is on the closures to rounding.  Moving it onto them would gain nothing, and
-    next to a singular configuration take it off its branch by that rounding over sigma."""
+    """Whether ``x`` is on the closures to rounding.
+
+    A projection would then gain nothing, and next to a singular configuration it would move ``x``
+    off its branch by rounding over sigma.
+    """
     g, c = system.residuals(x, t)
     speed = 1.0 + float(np.abs(x[system.nq :]).max())
-    return bool((np.abs(g) < ON).all() and (np.abs(c) < ON * speed).all())
+    return bool((np.abs(g) < CLOSED_ROUNDING).all() and (np.abs(c) < CLOSED_ROUNDING * speed).all())
 
 
-def _after(
-    solution: SimulationResult, t: float, actions: list[tuple[Any, str]]
+def _after_actions(
+    events: list[_RunEvent], due: list[_RunEvent], part: SimulationResult, span: float
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
-    """Mechanism and state after ``actions``, given with the names of their events, at the end of a
-    segment."""
-    mechanism = solution.mechanism
+    """Mechanism and state after the actions of the events ``due`` at the end of a segment.
+
+    Raises
+    ------
+    EventError
+        If an action fails, or an event chatters.
+    """
+    mechanism, t = part.mechanism, part.steps.end
+    # What was counted here is not counted again just after; the rest has still to be.
+    near = 2.0 * same_time(*part.steps.times[-2:].tolist())
+    for event, times in zip(events, part.t_events or []):
+        event.start_tolerance = near if len(times) and times[-1] >= t - near else 0.0
+        event.acted = event in due and event.event.action is not None
+    acting_events = [event for event in events if event.acted]
+    names = ", ".join(event.name for event in acting_events)
+    log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
     nq = mechanism.model.nq
-    x = np.concatenate([solution.q[-1], solution.v[-1]])
+    x = np.concatenate([part.q[-1], part.v[-1]])
     try:
         # The dense output is on the closures within the tolerance only.
         system = make_system(mechanism)
@@ -352,11 +382,8 @@ def _after(
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
     q, v = x[:nq], x[nq:]
-    for action, name in actions:
-        try:
-            answer = action(t, q.copy(), v.copy())
-        except Exception as error:
-            raise EventError(f"the action of the event {name!r} raised {error!r}") from error
+    for event in acting_events:
+        answer = event.act(t, q.copy(), v.copy())
         if answer is None:
             continue
         try:
@@ -369,14 +396,21 @@ def _after(
                 q, v = moved.q0, moved.v0
         except (InputError, EvaluationError, TypeError, ValueError) as error:
             raise EventError(
-                f"the action of the event {name!r} cannot be carried out: {error}"
+                f"the action of the event {event.name!r} cannot be carried out: {error}"
             ) from error
+    switched = mechanism.loops != part.mechanism.loops
+    for event in acting_events:
+        event.floor = _rounding(event.event.function, part) if switched else 0.0
+        event.check_chatter(t, span)
     return mechanism, q, v
 
 
 def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:
-    """The motions of the drives of ``new`` from ``t`` (s) on: those that ``old`` has go on, others
-    engage where they find their coordinate, unless they prescribe positions."""
+    """The motions of the drives of ``new`` from ``t`` (s) on.
+
+    Drives that ``old`` has continue; others begin at the present value of their coordinate, unless
+    they prescribe positions.
+    """
     found = positions(new.model, new.drives, new.q0)
     curves = {}
     for drive in new.drives:
@@ -403,7 +437,7 @@ def _switched(
     given = np.concatenate([new.q0, new.v0])
     system = make_system(new)
     x = onto_closures(system, t, given)
-    if system.position_norm(system.difference(given, x)) > SNAPS:
+    if system.position_norm(system.difference(given, x)) > LARGEST_PROJECTION:
         check_consistent(new, t)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

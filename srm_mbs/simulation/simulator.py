@@ -16,32 +16,25 @@ from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel.backend import uses_kernel
-from srm_mbs.integration.methods.base import ErrorNorm, Method
+from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.simulation.incremental_run import KernelRun, ReferenceRun
-from srm_mbs.simulation.options import (
-    RunOptions,
-    check_embedded,
-    finite,
-    positive,
-)
+from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
+from srm_mbs.simulation.options import RunOptions, check_embedded, finite, positive
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
-    absolute_tolerance,
     check_consistent,
     check_mechanism,
     checked_accuracy,
-    placed_control,
+    error_norm,
 )
 
-SHORT = 8.0
+NEGLIGIBLE_DT = 8.0
 """Steps up to this many units of rounding of the time move nothing but the time."""
-LONGER = 1e10
-"""Where a step is longer than its predecessor by this factor, its length is chosen
-as at a start."""
-NEAR = 1e-14
+RESTART_GROWTH = 1e10
+"""Where a step is longer than its predecessor by this factor, its inner steps begin as at a
+start."""
+BREAKPOINT_ROUNDING = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
-_NONE = np.zeros(0)
 
 
 class Simulator:
@@ -80,24 +73,14 @@ class Simulator:
         placement: str = "automatic",
         backend: str = "auto",
     ) -> None:
+        given = locals()  # every other parameter is an option
+        del given["self"], given["mechanism"]
         check_mechanism(mechanism)
-        given = RunOptions(
-            math.inf,
-            method=method,
-            tableau=tableau,
-            rtol=rtol,
-            atol=atol,
-            step=step,
-            max_step=max_step,
-            placement=placement,
-            backend=backend,
-        )
-        options = checked_accuracy(mechanism, given, 0.0, math.inf)
+        options = checked_accuracy(mechanism, RunOptions(math.inf, **given), 0.0, math.inf)
         check_embedded(options.method.scheme, step)
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options
-        tolerance = absolute_tolerance(mechanism, atol, options.rtol)
-        self._norm = ErrorNorm(tolerance, options.rtol, options.negligible)
+        self._norm = error_norm(mechanism, options)
         self._on_kernel = uses_kernel(
             backend, options.method, options.placement, options.singular_times
         )
@@ -107,27 +90,16 @@ class Simulator:
 
     def _make(self) -> None:
         """A run of its own."""
-        mechanism, options, norm = self._mechanism, self._options, self._norm
         held = HeldForce()
         held.only(self._no_force)
-        system = make_system(mechanism, held)
-        self._system = system
-        self._run: KernelRun | ReferenceRun
-        if self._on_kernel:
-            self._run = KernelRun(system, held, norm, options)
-        else:
-            self._run = ReferenceRun(
-                system,
-                held,
-                norm,
-                options,
-                lambda first: placed_control(system, options, lambda: first),
-            )
-        self._nq = mechanism.model.nq
+        self._system = make_system(self._mechanism, held)
+        kind: type[IncrementalRun] = KernelRun if self._on_kernel else ReferenceRun
+        self._run = kind(self._system, held, self._norm, self._options)
+        self._nq = self._mechanism.model.nq
         self._wall_time = 0.0
-        self._last = math.inf
+        self._last_dt = math.inf
         # Where it starts, until the first step knows what acts.
-        self._begins: tuple[float, FloatArray] | None = None
+        self._pending_start: tuple[float, FloatArray] | None = None
 
     @property
     def mechanism(self) -> Mechanism:
@@ -137,7 +109,7 @@ class Simulator:
     @property
     def t(self) -> float:
         """Time (s)."""
-        return self._run.t if self._begins is None else self._begins[0]
+        return self._run.t if self._pending_start is None else self._pending_start[0]
 
     @property
     def q(self) -> FloatArray:
@@ -150,12 +122,12 @@ class Simulator:
         return self._state()[self._nq :]
 
     def _state(self) -> FloatArray:
-        return self._run.state.copy() if self._begins is None else self._begins[1].copy()
+        return self._run.state if self._pending_start is None else self._pending_start[1].copy()
 
     @property
     def stats(self) -> Statistics:
         """Work done since it was made: inner steps, evaluations, seconds within :meth:`step`."""
-        return Statistics(**self._run.counts(), wall_time=self._wall_time)
+        return self._run.statistics(self._wall_time)
 
     def step(self, dt: float, tau: Any = None) -> tuple[FloatArray, FloatArray]:
         """Move on by ``dt`` (s).
@@ -190,43 +162,41 @@ class Simulator:
             force = self._force(tau)
         t = self.t
         end = t + dt
-        if dt <= SHORT * math.ulp(t):
-            self._begins = self._later(t, end, dt), self._state()
+        if dt <= NEGLIGIBLE_DT * math.ulp(t):
+            if not end > t:
+                raise InputError(
+                    f"dt = {dt!r} s is below the rounding of t = {t!r} s",
+                    element="dt",
+                    remedy="Give a longer one, or reset to an earlier time",
+                )
+            self._pending_start = end, self._state()
             return self.q, self.v
-        if dt > LONGER * self._last:
-            self._begins = t, self._state()
-        self._last = dt
-        if self._begins is not None:
+        if dt > RESTART_GROWTH * self._last_dt:
+            self._pending_start = t, self._state()
+        self._last_dt = dt
+        if self._pending_start is not None:
             if not np.isfinite(force).all():
                 raise _bad_force(tau)
-            self._begin(*self._begins, force, dt)
+            try:
+                self._run.begin(*self._pending_start, force, dt)
+            except EvaluationError as error:
+                raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
+            self._pending_start = None
         run = self._run
         try:
             # Breakpoints at the ends count, too: forces just before and just after them differ.
-            beside = NEAR * (abs(t) + dt)
+            beside = BREAKPOINT_ROUNDING * (abs(t) + dt)
             kinks = self._mechanism.breakpoints(t - beside, end + beside)
             if len(kinks):
-                trouble = self._piecewise(np.asarray(kinks, dtype=float), t, end, force)
+                self._piecewise(np.asarray(kinks, dtype=float), t, end, force)
             else:
-                trouble = run.go_on(end, -math.inf, math.inf, force, False, self._grid(dt))
+                run.go_on(end, -math.inf, math.inf, force, False, self._grid(dt))
         except ValueError as error:
             raise _bad_force(tau) from error
         finally:
             self._wall_time += time.perf_counter() - started
-        if trouble:
-            raise SimulationError(trouble, None)
         state = run.state
         return state[: self._nq], state[self._nq :]
-
-    def _later(self, t: float, end: float, dt: float) -> float:
-        """``end`` (s), if that is later than ``t``."""
-        if end > t:
-            return end
-        raise InputError(
-            f"dt = {dt!r} s is below the rounding of t = {t!r} s",
-            element="dt",
-            remedy="Give a longer one, or reset to an earlier time",
-        )
 
     def _force(self, tau: Any) -> FloatArray:
         try:
@@ -242,24 +212,14 @@ class Simulator:
         step = self._options.step
         return 0.0 if step is None else length / math.ceil(length / step - 1e-9)
 
-    def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> str:
-        pieces = smooth_intervals(kinks, _NONE, t, end)
+    def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> None:
+        """Go on from ``t`` to ``end`` (s) across breakpoints."""
+        pieces = smooth_intervals(kinks, np.zeros(0), t, end)
         for k, until in enumerate(pieces.ends.tolist()):
             first, last = float(pieces.first[k]), float(pieces.last[k])
             forces_jumped = k > 0 or first > -math.inf
             grid = self._grid(until - self._run.t)
-            trouble = self._run.go_on(until, first, last, force, forces_jumped, grid)
-            if trouble:
-                return trouble
-        return ""
-
-    def _begin(self, t: float, state: FloatArray, force: FloatArray, dt: float) -> None:
-        """Start from where it was reset to."""
-        try:
-            self._run.begin(t, state, force, dt)
-        except EvaluationError as error:
-            raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
-        self._begins = None
+            self._run.go_on(until, first, last, force, forces_jumped, grid)
 
     def reset(
         self, q: Any = None, v: Any = None, t: float = 0.0, *, project: bool = False
@@ -293,8 +253,8 @@ class Simulator:
             q = mechanism.q0 if q is None else q
             v = mechanism.v0 if v is None else v
             state = self._consistent(q, v, t, project)
-        self._begins = t, state
-        self._last = math.inf
+        self._pending_start = t, state
+        self._last_dt = math.inf
         return self.q, self.v
 
     def set_state(self, q: Any = None, v: Any = None, *, project: bool = False) -> None:
@@ -316,7 +276,7 @@ class Simulator:
         """
         q = self.q if q is None else q
         v = self.v if v is None else v
-        self._begins = self.t, self._consistent(q, v, self.t, project)
+        self._pending_start = self.t, self._consistent(q, v, self.t, project)
 
     def _consistent(self, q: Any, v: Any, t: float, project: bool) -> FloatArray:
         if project:
@@ -340,15 +300,14 @@ class Simulator:
         other = Simulator.__new__(Simulator)
         other.__dict__.update(self.__dict__)
         other._make()
-        other._last = self._last
-        if self._begins is None:
-            other._run.restore(self._run.snapshot())
+        other._last_dt = self._last_dt
+        if self._pending_start is None:
+            other._run.go_on_from(self._run)
         else:
-            other._begins = self._begins[0], self._begins[1].copy()
+            other._pending_start = self._pending_start[0], self._pending_start[1].copy()
         return other
 
-    def __copy__(self) -> Simulator:
-        return self.clone()
+    __copy__ = clone
 
     def __deepcopy__(self, memo: Any) -> Simulator:
         return self.clone()

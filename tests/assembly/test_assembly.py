@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import Assembly
-from tests.support.bundled import load
+from tests.support.bundled import load, rewritten
 from tests.support.mechanisms import along_x, floating_ring, rescaled, rod
+from tests.support.snapshots import check_messages, refused
 
 PI = np.pi
 CLOSED = 1e-12
@@ -47,12 +49,12 @@ def opening(mechanism: srm.Mechanism, q: FloatArray) -> float:
         R = b.rotation.T @ a.rotation
         axis = np.array(loop.axis if loop.axis else (0.0, 0.0, 0.0))
         errors = {
-            "point": lambda gap=gap: [gap],
-            "frame": lambda gap=gap, R=R: [gap, (R - np.eye(3)).ravel()],
-            "revolute": lambda gap=gap, R=R, axis=axis: [gap, R @ axis - axis],
-            "point_on_line": lambda gap=gap, axis=axis: [gap - axis * (axis @ gap)],
-            "point_on_plane": lambda gap=gap, axis=axis: [np.atleast_1d(axis @ gap)],
-        }[loop.type]()
+            "point": [gap],
+            "frame": [gap, (R - np.eye(3)).ravel()],
+            "revolute": [gap, R @ axis - axis],
+            "point_on_line": [gap - axis * (axis @ gap)],
+            "point_on_plane": [np.atleast_1d(axis @ gap)],
+        }[loop.type]
         worst = max(worst, *(float(np.linalg.norm(error)) for error in errors))
     return worst
 
@@ -95,10 +97,9 @@ def test_a_loaded_mechanism_is_closed_and_its_rates_fit(name: str) -> None:
 @pytest.mark.parametrize("name", ["four_bar", "five_bar", "spatial_four_bar", "slider_crank"])
 def test_held_values_are_kept_to_the_last_bit(name: str) -> None:
     mechanism = load(name)
-    state = srm.assemble(mechanism, q={"crank": 1.1} if name != "five_bar" else {"crank_left": 1.9})
-    held = mechanism.joint_names[0]
-    index = mechanism.joint(held).idx_q
-    assert state.q[index] == (1.9 if name == "five_bar" else 1.1)
+    held, value = ("crank_left", 1.9) if name == "five_bar" else ("crank", 1.1)
+    state = srm.assemble(mechanism, q={held: value})
+    assert state.q[mechanism.joint(held).idx_q] == value
     check(mechanism, state)
 
 
@@ -282,15 +283,9 @@ def test_an_n_four_bar_with_horizontal_cranks_has_n_plus_one_freedoms(n: int) ->
 
 @pytest.mark.parametrize("crank", [HALF, 3 * HALF])
 def test_a_description_may_start_at_a_singular_configuration(crank: float, tmp_path: Path) -> None:
-    bundled = Path(load("slider_crank").source.path)  # type: ignore[union-attr]
-    text = bundled.read_text().replace("5.497787143782138", repr(crank))
-    text = text.replace("-10.995574287564276", repr(-2 * crank + 0.2))
-    (tmp_path / "urdf").mkdir()
-    (tmp_path / "models").mkdir()
-    urdf = load("slider_crank").source.urdf  # type: ignore[union-attr]
-    (tmp_path / "urdf" / "slider_crank.urdf").write_text(urdf)
-    (tmp_path / "models" / "start.toml").write_text(text)
-    mechanism = srm.load(tmp_path / "models" / "start.toml")
+    held = ("5.497787143782138", repr(crank))
+    guess = ("-10.995574287564276", repr(-2 * crank + 0.2))
+    mechanism = srm.load(rewritten(tmp_path, "slider_crank", held, guess))
     np.testing.assert_allclose(mechanism.q0, [crank, -2 * crank], rtol=0, atol=1e-10)
     assert mechanism.degrees_of_freedom == 1
     assert mechanism.structure.rank == 1
@@ -615,18 +610,12 @@ def test_rates_change_as_little_as_possible(name: str) -> None:
     np.testing.assert_allclose(free.T @ free, np.eye(free.shape[1]), atol=1e-13)
 
 
-def test_free_directions_keep_the_loops_closed() -> None:
+def test_free_directions_keep_the_loops_closed_and_are_orthonormal_in_units() -> None:
     mechanism = load("slider_crank_slider")
     state = srm.assemble(mechanism)
     for v in state.free_directions.T:
         np.testing.assert_allclose(srm.assemble(mechanism, state.q, v).v, v, atol=1e-12)
-
-
-def test_free_directions_are_orthonormal_in_units() -> None:
-    mechanism = load("slider_crank_slider")
-    by_unit = (
-        srm.assemble(mechanism).free_directions / mechanism.structure.units.coordinate[:, None]
-    )
+    by_unit = state.free_directions / mechanism.structure.units.coordinate[:, None]
     np.testing.assert_allclose(by_unit.T @ by_unit, np.eye(by_unit.shape[1]), atol=1e-12)
 
 
@@ -690,38 +679,37 @@ def test_joints_named_in_hold_are_held_and_others_are_guesses() -> None:
     assert (free.q != start).all()
 
 
-FAULTY: list[tuple[dict[str, Any], tuple[str, ...]]] = [
-    ({"q": {"crnk": 1.0}}, ("'crnk'", "crank, coupler, rocker")),
-    ({"v": {"crnk": 1.0}}, ("'crnk'", "crank, coupler, rocker")),
-    ({"guess": {"crnk": 1.0}}, ("'crnk'", "crank, coupler, rocker")),
-    ({"hold": ["crnk"]}, ("'crnk'", "crank, coupler, rocker")),
-    ({"q": {"crank": 1.0}, "guess": {"crank": 1.0}}, ("'crank'", "held", "guessed", "Keep one")),
-    ({"q": {"crank": float("nan")}}, ("'crank'", "nan", "one finite number")),
-    ({"q": {"crank": "one"}}, ("'crank'", "'one'", "one finite number")),
-    ({"q": {"crank": None}}, ("'crank'", "None", "one finite number")),
-    ({"q": {"crank": [1.0, 2.0]}}, ("'crank'", "one finite number (rad or m)")),
-    ({"q": {"crank": 1j}}, ("'crank'", "one finite number")),
-    ({"q": {"crank": [[1.0]]}}, ("'crank'", "one finite number")),
-    ({"v": {"crank": float("inf")}}, ("'crank'", "one finite number (rad/s or m/s)")),
-    ({"v": {"crank": [1.0, 2.0]}}, ("'crank'", "one finite number (rad/s or m/s)")),
-    ({"q": [1.0, 2.0]}, ("q must be 3 finite numbers", "mapping")),
-    ({"q": np.full(3, np.nan)}, ("q must be 3 finite numbers",)),
-    ({"q": np.zeros((3, 1))}, ("q must be 3 finite numbers",)),
-    ({"q": "abc"}, ("q must be 3 finite numbers",)),
-    ({"q": [[1.0], 2.0, 3.0]}, ("q must be 3 finite numbers",)),
-    ({"v": [1.0]}, ("v must be 3 finite numbers",)),
-    ({"v": [np.inf, 0.0, 0.0]}, ("v must be 3 finite numbers",)),
-    ({"v": 3.0}, ("v must be 3 finite numbers",)),
+FAULTY: list[dict[str, Any]] = [
+    {"q": {"crnk": 1.0}},
+    {"v": {"crnk": 1.0}},
+    {"guess": {"crnk": 1.0}},
+    {"hold": ["crnk"]},
+    {"q": {"crank": 1.0}, "guess": {"crank": 1.0}},
+    {"q": {"crank": float("nan")}},
+    {"q": {"crank": "one"}},
+    {"q": {"crank": None}},
+    {"q": {"crank": [1.0, 2.0]}},
+    {"q": {"crank": 1j}},
+    {"q": {"crank": [[1.0]]}},
+    {"v": {"crank": float("inf")}},
+    {"v": {"crank": [1.0, 2.0]}},
+    {"q": [1.0, 2.0]},
+    {"q": [float("nan"), 0.0, 0.0]},
+    {"q": [[0.0], [0.0], [0.0]]},
+    {"q": "abc"},
+    {"q": [[1.0], 2.0, 3.0]},
+    {"v": [1.0]},
+    {"v": [float("inf"), 0.0, 0.0]},
+    {"v": 3.0},
 ]
 
 
-@pytest.mark.parametrize(("arguments", "needles"), FAULTY)
-def test_faulty_arguments_are_refused(arguments: dict[str, Any], needles: tuple[str, ...]) -> None:
-    with pytest.raises(srm.InputError) as caught:
-        srm.assemble(load("four_bar"), **arguments)
-    assert not isinstance(caught.value, srm.AssemblyError)
-    for needle in needles:
-        assert needle in str(caught.value)
+def test_faulty_arguments_are_refused() -> None:
+    messages = {}
+    for arguments in FAULTY:
+        case = ", ".join(f"{key} = {value!r}" for key, value in arguments.items())
+        messages[case] = refused(partial(srm.assemble, load("four_bar"), **arguments))
+    check_messages("assembly_arguments", messages)
 
 
 def test_a_quaternion_of_length_zero_is_refused() -> None:
@@ -745,24 +733,21 @@ def test_planar_loops_in_tilted_planes_take_any_rate(
     closure: str, rate: float, tmp_path: Path
 ) -> None:
     """Rows that are zero up to rounding say nothing about the motion, however slow it is."""
-    source = load("four_bar").source
-    assert source is not None
-    urdf = source.urdf.replace('name="world"', 'name="frame"').replace(
-        'link="world"', 'link="frame"'
-    )
     tilt = (
         '<link name="world"/><joint name="tilt" type="fixed"><parent link="world"/>'
         '<child link="frame"/><origin rpy="0.4 0.5 0.6"/></joint>'
     )
-    urdf = urdf.replace('<link name="frame">', tilt + '<link name="frame">')
-    (tmp_path / "tilted.urdf").write_text(urdf)
-    text = source.description.replace("../urdf/four_bar.urdf", "tilted.urdf")
-    text = text.replace("crank = 4.0", f"crank = {rate!r}")
-    if closure == "revolute":
-        text = text.replace('type = "point"', 'type = "revolute"\naxis = [0.0, 1.0, 0.0]')
-    assert closure in text
-    (tmp_path / "tilted.toml").write_text(text)
-    tilted = srm.load(tmp_path / "tilted.toml")
+    urdf = (
+        ('name="world"', 'name="frame"'),
+        ('link="world"', 'link="frame"'),
+        ('<link name="frame">', tilt + '<link name="frame">'),
+    )
+    axis = "\naxis = [0.0, 1.0, 0.0]" if closure == "revolute" else ""
+    toml = (
+        ("crank = 4.0", f"crank = {rate!r}"),
+        ('type = "point"', f'type = "{closure}"{axis}'),
+    )
+    tilted = srm.load(rewritten(tmp_path, "four_bar", *toml, urdf=urdf))
     assert tilted.degrees_of_freedom == 1
     expected = srm.assemble(load("four_bar"), {"crank": 1.0}, {"crank": rate})
     np.testing.assert_allclose(tilted.v0, expected.v, rtol=1e-9)

@@ -216,31 +216,28 @@ def test_joints_with_commuting_coordinates_need_no_chart(joint: object) -> None:
     )
 
 
-def test_a_ball_inside_a_composite_joint_is_refused_by_name() -> None:
-    composite = pin.JointModelComposite()
-    composite.addJoint(pin.JointModelPX(), pin.SE3.Identity())
-    composite.addJoint(pin.JointModelSpherical(), pin.SE3.Identity())
-    model = pin.Model()
-    model.addJoint(0, composite, pin.SE3.Identity(), "left_hip")
-    with pytest.raises(srm.InputError, match=r"'left_hip'.*JointModelComposite.*not supported"):
-        group_joints(model)
+def composite(*joints: object) -> pin.JointModelComposite:
+    out = pin.JointModelComposite()
+    for joint in joints:
+        out.addJoint(joint, pin.SE3.Identity())
+    return out
 
 
-def test_an_unbounded_joint_inside_a_composite_joint_is_refused_by_name() -> None:
-    composite = pin.JointModelComposite()
-    composite.addJoint(pin.JointModelRUBX(), pin.SE3.Identity())
-    composite.addJoint(pin.JointModelRY(), pin.SE3.Identity())
-    model = pin.Model()
-    model.addJoint(0, composite, pin.SE3.Identity(), "wrist")
-    with pytest.raises(srm.InputError, match=r"'wrist'.*not supported"):
+@pytest.mark.parametrize(
+    "inside",
+    [(pin.JointModelPX(), pin.JointModelSpherical()), (pin.JointModelRUBX(), pin.JointModelRY())],
+    ids=["ball", "unbounded joint"],
+)
+def test_a_composite_joint_that_would_need_a_chart_is_refused_by_name(
+    inside: tuple[object, ...],
+) -> None:
+    model = single(composite(*inside))
+    with pytest.raises(srm.InputError, match=r"'joint_0'.*JointModelComposite.*not supported"):
         group_joints(model)
 
 
 def test_a_composite_of_one_degree_joints_needs_no_chart() -> None:
-    composite = pin.JointModelComposite()
-    composite.addJoint(pin.JointModelRX(), pin.SE3.Identity())
-    composite.addJoint(pin.JointModelPY(), pin.SE3.Identity())
-    assert group_joints(single(composite)) == ()
+    assert group_joints(single(composite(pin.JointModelRX(), pin.JointModelPY()))) == ()
 
 
 def test_a_mimic_joint_is_refused_by_name() -> None:
@@ -330,17 +327,18 @@ def test_a_planar_joint_moves_without_loss_at_small_turns(angle: float) -> None:
 def test_steps_are_limited_by_the_fastest_turning_group_joint() -> None:
     system = mixed_system()
     v = np.zeros(system.nv)
-    state = np.concatenate([pin.neutral(system.model), v])
-    assert system.step_limit(state) == np.inf
-    start = {joint.group: joint for joint in system._groups}
-    v[start["se3"].start : start["se3"].start + 3] = 100.0  # translation does not count
+
+    def limit() -> float:
+        return system.step_limit(np.concatenate([pin.neutral(system.model), v]))
+
+    assert limit() == np.inf
+    start = {joint.group: joint.start for joint in group_joints(system.model)}
+    v[start["se3"] : start["se3"] + 3] = 100.0  # translation does not count
     v[6] = 100.0  # nor does a revolute joint
-    assert system.step_limit(np.concatenate([state[: system.nq], v])) == np.inf
-    v[start["se3"].start + 3 : start["se3"].start + 6] = (0.0, 3.0, 4.0)
-    v[start["so3"].start : start["so3"].start + 3] = (6.0, 0.0, 8.0)
-    v[start["se2"].start + 2] = -2.0
-    limit = system.step_limit(np.concatenate([state[: system.nq], v]))
-    assert limit == pytest.approx(ROTATION_PER_STEP / 10.0, rel=1e-14)
-    v[start["se2"].start + 2] = -20.0
-    limit = system.step_limit(np.concatenate([state[: system.nq], v]))
-    assert limit == pytest.approx(ROTATION_PER_STEP / 20.0, rel=1e-14)
+    assert limit() == np.inf
+    v[start["se3"] + 3 : start["se3"] + 6] = (0.0, 3.0, 4.0)
+    v[start["so3"] : start["so3"] + 3] = (6.0, 0.0, 8.0)
+    v[start["se2"] + 2] = -2.0
+    assert limit() == pytest.approx(ROTATION_PER_STEP / 10.0, rel=1e-14)
+    v[start["se2"] + 2] = -20.0
+    assert limit() == pytest.approx(ROTATION_PER_STEP / 20.0, rel=1e-14)

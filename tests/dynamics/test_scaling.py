@@ -13,7 +13,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from tests.support import maximal, reduced
 from tests.support.bundled import load
-from tests.support.mechanisms import rescaled
+from tests.support.mechanisms import add_link, rescaled, start_terms, with_slider_mass
 from tests.support.references import observed, reference
 
 # Powers of four scale every quantity, square roots included, without rounding.
@@ -21,8 +21,15 @@ EXACT = [{"length": 4.0**5}, {"mass": 4.0**5}, {"time": 4.0}, {"length": 4.0**-4
 ROUNDED = [{"length": 1000.0}, {"length": 1e-3}, {"mass": 1e3}, {"time": 10.0}, {"time": 1e-2}]
 
 
-def relative_times(solution: srm.Solution, scale: dict[str, float]) -> np.ndarray:
-    return solution.t / scale.get("time", 1.0)
+def in_both_units(
+    name: str, scale: dict[str, float], t_end: float, **options: Any
+) -> tuple[srm.Solution, srm.Solution, np.ndarray]:
+    """A run, that of the rescaled mechanism, and the times of the latter in the original unit."""
+    mechanism, time = load(name), scale.get("time", 1.0)
+    plain = srm.simulate(mechanism, t_end, **options)
+    scaled = srm.simulate(rescaled(mechanism, **scale), t_end * time, **options)
+    assert scaled.success
+    return plain, scaled, scaled.t / time
 
 
 @pytest.mark.parametrize("scale", EXACT, ids=str)
@@ -31,51 +38,32 @@ def relative_times(solution: srm.Solution, scale: dict[str, float]) -> np.ndarra
 def test_rescaling_without_rounding_repeats_every_step(
     name: str, tableau: str, scale: dict[str, float]
 ) -> None:
-    mechanism = load(name)
-    plain = srm.simulate(mechanism, 5.0, rtol=1e-7, tableau=tableau)
-    time = scale.get("time", 1.0)
-    scaled = srm.simulate(rescaled(mechanism, **scale), 5.0 * time, rtol=1e-7, tableau=tableau)
-    assert np.array_equal(relative_times(scaled, scale), plain.t)
+    plain, scaled, t = in_both_units(name, scale, 5.0, rtol=1e-7, tableau=tableau)
+    assert np.array_equal(t, plain.t)
     assert scaled.stats.evaluations == plain.stats.evaluations
 
 
 @pytest.mark.parametrize("scale", ROUNDED, ids=str)
-@pytest.mark.parametrize("name", ["four_bar", "pendulum_chain", "slider_crank_regular"])
+@pytest.mark.parametrize(
+    "name", ["four_bar", "pendulum_chain", "slider_crank_regular", "squeezing_mechanism"]
+)
 def test_rescaling_with_rounding_takes_the_same_steps_on_regular_mechanisms(
     name: str, scale: dict[str, float]
 ) -> None:
-    mechanism = load(name)
-    plain = srm.simulate(mechanism, 5.0, rtol=1e-7)
-    time = scale.get("time", 1.0)
-    scaled = srm.simulate(rescaled(mechanism, **scale), 5.0 * time, rtol=1e-7)
-    assert len(scaled.t) == len(plain.t)
-    assert np.allclose(relative_times(scaled, scale), plain.t, rtol=1e-4)
+    """The squeezing mechanism has no gravity and starts at rest: forces give its unit of rates."""
+    t_end = 0.01 if name == "squeezing_mechanism" else 5.0
+    plain, _, t = in_both_units(name, scale, t_end, rtol=1e-7)
+    assert len(t) == len(plain.t)
+    assert np.allclose(t, plain.t, rtol=1e-4)
 
 
 @pytest.mark.parametrize("scale", ROUNDED, ids=str)
 def test_singular_passages_are_the_same_in_other_units(scale: dict[str, float]) -> None:
     """Rounding next to a singular configuration changes single steps, not what happens."""
-    mechanism = load("slider_crank_slider")
-    time = scale.get("time", 1.0)
-    scaled = srm.simulate(rescaled(mechanism, **scale), 20.0 * time, rtol=1e-7)
-    plain = srm.simulate(mechanism, 20.0, rtol=1e-7)
-    assert scaled.success
+    plain, scaled, _ = in_both_units("slider_crank_slider", scale, 20.0, rtol=1e-7)
     assert len(scaled.crossings) == len(plain.crossings)
     assert scaled.stats.evaluations == pytest.approx(plain.stats.evaluations, rel=0.15)
     assert scaled.joint("crank")[0][-1] == pytest.approx(plain.joint("crank")[0][-1], abs=1e-5)
-
-
-@pytest.mark.parametrize("scale", ROUNDED, ids=str)
-def test_a_mechanism_driven_by_forces_takes_the_same_steps_in_other_units(
-    scale: dict[str, float],
-) -> None:
-    """Without gravity and at rest the unit of rates comes from the forces."""
-    mechanism = load("squeezing_mechanism")
-    plain = srm.simulate(mechanism, 0.01, rtol=1e-7)
-    time = scale.get("time", 1.0)
-    scaled = srm.simulate(rescaled(mechanism, **scale), 0.01 * time, rtol=1e-7)
-    assert len(scaled.t) == len(plain.t)
-    assert np.allclose(relative_times(scaled, scale), plain.t, rtol=1e-4)
 
 
 UNITS = [{"length": 1000.0, "mass": 1e-6, "time": 1000.0}, {"length": 0.1, "mass": 1e3}]
@@ -85,42 +73,20 @@ def times_of(solution: srm.Solution) -> np.ndarray:
     return np.array([crossing.time for crossing in solution.crossings])
 
 
+@pytest.mark.parametrize("scale", UNITS, ids=str)
 @pytest.mark.parametrize("name", ["slider_crank", "spatial_dead_point", "n_four_bar_2"])
-def test_units_change_neither_passages_nor_errors(name: str) -> None:
-    mechanism = load(name)
-    plain = srm.simulate(mechanism, 3.0, rtol=1e-8)
+def test_units_change_neither_passages_nor_errors(name: str, scale: dict[str, float]) -> None:
+    plain, scaled, _ = in_both_units(name, scale, 3.0, rtol=1e-8)
+    time = scale.get("time", 1.0)
+    assert times_of(scaled) / time == pytest.approx(times_of(plain), abs=1e-9)
+    for a, b in zip(scaled.crossings, plain.crossings):
+        assert (a.loops, a.left_on) == (b.loops, b.left_on)
+    assert scaled.stats.evaluations == pytest.approx(plain.stats.evaluations, rel=0.05)
+    assert abs(scaled.stats.placements - plain.stats.placements) <= 4
     t, exact = reference(name, 3.0, 30)
     error = np.abs(observed(name, plain, t) - exact).max()
-    for scale in UNITS:
-        time = scale.get("time", 1.0)
-        scaled = srm.simulate(rescaled(mechanism, **scale), 3.0 * time, rtol=1e-8)
-        assert scaled.success
-        assert times_of(scaled) / time == pytest.approx(times_of(plain), abs=1e-9)
-        for a, b in zip(scaled.crossings, plain.crossings):
-            assert (a.loops, a.left_on) == (b.loops, b.left_on)
-        assert scaled.stats.evaluations == pytest.approx(plain.stats.evaluations, rel=0.05)
-        assert abs(scaled.stats.placements - plain.stats.placements) <= 4
-        values = _observed_in_units(name, scaled, t * time, time)
-        assert np.abs(values - exact).max() < 2.0 * error + 1e-10
-
-
-def _observed_in_units(name: str, solution: srm.Solution, t: np.ndarray, time: float) -> np.ndarray:
-    """Angle and rate of the crank (k, 2), the rate in the original unit."""
-    q, v = solution(t)
-    angle = q[:, 0] - (np.pi / 6 if name == "spatial_dead_point" else 0.0)
-    return np.column_stack([angle, v[:, 0] * time])
-
-
-def slider_of(mass: float) -> srm.Mechanism:
-    """slider_crank_slider with another mass (kg) of the slider."""
-    base = load("slider_crank_slider")
-    model = base.model.copy()
-    slider = model.getJointId("slider")
-    inertia = model.inertias[slider]
-    model.inertias[slider] = pin.Inertia(
-        mass, inertia.lever, inertia.inertia * (mass / inertia.mass)
-    )
-    return srm.Mechanism(model, base.loops, q0=base.q0, v0=base.v0)
+    values = observed(name, scaled, t * time) * [1.0, time]
+    assert np.abs(values - exact).max() < 2.0 * error + 1e-10
 
 
 def screwed(pitch: float) -> srm.Mechanism:
@@ -137,9 +103,8 @@ def screwed(pitch: float) -> srm.Mechanism:
             unit[joint.idx_v] = 1.0 / pitch
             joint = pin.JointModelHX(pitch)
             inertia = pin.Inertia(inertia.mass, np.zeros(3), np.zeros((3, 3)))
-        index = model.addJoint(base.model.parents[j], joint, base.model.jointPlacements[j], name)
-        model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
-        model.addBodyFrame(name, index, pin.SE3.Identity(), 0)
+        place = base.model.jointPlacements[j]
+        add_link(model, base.model.parents[j], joint, name, inertia, place)
     (pin_,) = base.loops
     # The rows in the rod's axes: those of the slider would turn with the screw.
     loop = srm.LoopClosure("point", pin_.b, pin_.a, name="pin")
@@ -172,7 +137,7 @@ def passages(field: Any, start: list[float], t: np.ndarray) -> int:
 @pytest.mark.parametrize("exponent", [-6, -3, 1, 6])
 def test_the_mass_of_the_slider_changes_no_branch(exponent: int) -> None:
     mass = 10.0**exponent
-    mechanism = slider_of(mass)
+    mechanism = with_slider_mass(mass)
     solution = srm.simulate(mechanism, 5.0, rtol=1e-8)
     assert solution.success
     t = np.linspace(0.0, 5.0, 101)[1:]
@@ -180,8 +145,7 @@ def test_the_mass_of_the_slider_changes_no_branch(exponent: int) -> None:
     assert crank_error(solution, REST, field, t) < 1e-8
     assert len(solution.crossings) == passages(field, REST, t)
     assert not any(crossing.switched for crossing in solution.crossings)
-    start = make_system(mechanism).evaluate(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
-    assert 0.5 < start.sigma < 2.0
+    assert 0.5 < start_terms(mechanism).sigma < 2.0
 
 
 @pytest.mark.parametrize("pitch", [1e-3, 0.1, 100.0])
@@ -240,8 +204,8 @@ def test_points_that_coincide_but_for_rounding_give_no_length(at: float) -> None
     model = pin.Model()
     for name, offset in (("a", 0.0), ("b", at)):
         place = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.3 + offset]))
-        index = model.addJoint(0, pin.JointModelRZ(), place, name)
-        model.appendBodyToJoint(index, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+        inertia = pin.Inertia(1.0, np.zeros(3), np.eye(3))
+        add_link(model, 0, pin.JointModelRZ(), name, inertia, place)
     units = srm.Mechanism(model, q0=[0.1, 0.2]).structure.units
     assert units.length == 1.0
     assert units.rate == pytest.approx(np.sqrt(9.81))

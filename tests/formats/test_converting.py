@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 import srm_mbs as srm
 from srm_mbs.cli.app import app
 from srm_mbs.dynamics.forces import ForceKinematics
-from tests.formats.test_loading import closure, mass_matrix
 from tests.formats.urdf.test_joint_types import urdf as extended_joints
 from tests.formats.urdf.test_urdf_loops import (
     CASES,
@@ -25,6 +24,7 @@ from tests.formats.urdf.test_urdf_loops import (
     slider_crank,
 )
 from tests.support import mjcf_files, sdf_files
+from tests.support.dynamics import closure, mass_matrix
 from tests.support.urdf_files import open_mechanism, tree
 
 YAML = "closed_loop: [[closing_ring_1, closing_ring_2]]\ntype: [6d]\njoint_name: [hip, track]\n"

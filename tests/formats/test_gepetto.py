@@ -10,8 +10,8 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from tests.formats.test_loading import mass_matrix
 from tests.formats.urdf.test_urdf_loops import PAIR, gaps, measured, random_positions
+from tests.support.dynamics import assert_same_dynamics
 from tests.support.snapshots import check_messages, refused
 from tests.support.urdf_files import BRANCHES, MASSES, open_mechanism, placement, relative, tree
 
@@ -72,12 +72,8 @@ def test_joints_take_the_types_of_the_yaml(tmp_path: Path) -> None:
         model.appendBodyToJoint(
             joint, pin.Inertia(MASSES[child], np.zeros(3), tensor), here * centre
         )
-    rng = np.random.default_rng(3)
-    for _ in range(3):
-        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-        np.testing.assert_allclose(
-            mass_matrix(mechanism.model, q), mass_matrix(model, q), atol=1e-13
-        )
+    model.gravity.linear = mechanism.model.gravity.linear
+    assert_same_dynamics(mechanism.model, model)
 
 
 def test_the_urdf_may_have_the_name_of_the_yaml_or_be_the_only_one(tmp_path: Path) -> None:

@@ -7,13 +7,13 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import networkx  # noqa: F401 - its import reads files, which do not count
 import pytest
 import yaml
 from defusedxml import ElementTree as SafeTree
 
 import srm_mbs as srm
 from srm_mbs.formats import csv_table
-from srm_mbs.formats.load import models_folder
 from tests.support import sdf_files
 from tests.support.mjcf_files import FOUR_BAR
 from tests.support.urdf_files import tree
@@ -60,54 +60,43 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[Any]:
     return found
 
 
-ONE_FILE = {
-    "robot.urdf": tree(),
-    "coupled.urdf": tree(joints={"knee": '<mimic joint="hip"/>'}),
-    "robot.sdf": sdf_files.four_bar(),
-    "robot.xml": FOUR_BAR,
+# Case: the files, of which the first is loaded, and the languages that are parsed.
+FILES: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
+    "a URDF": ({"robot.urdf": tree()}, ("XML",)),
+    "a URDF with a coupling": (
+        {"coupled.urdf": tree(joints={"knee": '<mimic joint="hip"/>'})},
+        ("XML",),
+    ),
+    "an SDF": ({"robot.sdf": sdf_files.four_bar()}, ("XML",)),
+    "an MJCF": ({"robot.xml": FOUR_BAR}, ("XML",)),
+    "a description and the files it names": (
+        {"robot.toml": DRIVEN, "robot.urdf": tree(), "motion.csv": TABLE},
+        ("TOML", "XML"),
+    ),
+    "a description of an SDF": (
+        {"robot.toml": 'format = 1\nsdf = "robot.sdf"\n', "robot.sdf": sdf_files.four_bar()},
+        ("TOML", "XML"),
+    ),
+    "a Gepetto file": ({"robot.yaml": GEPETTO, "robot.urdf": tree()}, ("YAML", "XML")),
 }
 
 
-@pytest.mark.parametrize("name", ONE_FILE)
-def test_a_model_file_is_read_and_parsed_once(
-    name: str, tmp_path: Path, counted: Counter[Any]
+@pytest.mark.parametrize("case", FILES)
+def test_every_file_is_read_and_parsed_once(
+    case: str, tmp_path: Path, counted: Counter[Any]
 ) -> None:
-    (tmp_path / name).write_text(ONE_FILE[name])
-    srm.load(tmp_path / name)
-    assert counted == {name: 1, "XML": 1, "mechanism": 1}
-
-
-def test_a_description_and_the_files_it_names_are_read_once(
-    tmp_path: Path, counted: Counter[Any]
-) -> None:
-    (tmp_path / "robot.urdf").write_text(tree())
-    (tmp_path / "robot.toml").write_text(DRIVEN)
-    (tmp_path / "motion.csv").write_text(TABLE)
-    srm.load(tmp_path / "robot.toml")
-    files = ("robot.toml", "robot.urdf", "motion.csv")
-    assert counted == dict.fromkeys((*files, "TOML", "XML", "mechanism"), 1)
+    files, languages = FILES[case]
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    srm.load(tmp_path / next(iter(files)))
+    assert counted == dict.fromkeys((*files, *languages, "mechanism"), 1)
 
 
 def test_a_bundled_description_is_parsed_once(counted: Counter[Any]) -> None:
     srm.load("four_bar")
-    assert (models_folder() / "four_bar.toml").is_file()
     assert counted == dict.fromkeys(
         ("four_bar.toml", "four_bar.urdf", "TOML", "XML", "mechanism"), 1
     )
-
-
-def test_a_description_of_an_sdf_file_is_parsed_once(tmp_path: Path, counted: Counter[Any]) -> None:
-    (tmp_path / "robot.sdf").write_text(sdf_files.four_bar())
-    (tmp_path / "robot.toml").write_text('format = 1\nsdf = "robot.sdf"\n')
-    srm.load(tmp_path / "robot.toml")
-    assert counted == dict.fromkeys(("robot.toml", "robot.sdf", "TOML", "XML", "mechanism"), 1)
-
-
-def test_a_gepetto_file_and_its_urdf_are_parsed_once(tmp_path: Path, counted: Counter[Any]) -> None:
-    (tmp_path / "robot.urdf").write_text(tree())
-    (tmp_path / "robot.yaml").write_text(GEPETTO)
-    srm.load(tmp_path / "robot.yaml")
-    assert counted == dict.fromkeys(("robot.yaml", "robot.urdf", "YAML", "XML", "mechanism"), 1)
 
 
 def test_a_conversion_parses_its_file_once(tmp_path: Path, counted: Counter[Any]) -> None:

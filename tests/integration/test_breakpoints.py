@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,16 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs.integration.breakpoints import smooth_intervals
-from srm_mbs.integration.kernel import backend as kernel
 from tests.support import reduced
+from tests.support.backends import needs_kernel, on_both
+from tests.support.convergence import fitted_order
 from tests.support.lockstep import compare
+from tests.support.slider_crank import START
+from tests.support.snapshots import check_refusals
 
 PERIOD = 0.37
 JUMPS = tuple(k * PERIOD for k in range(1, 9))
 T_END = 3.0
-BACKENDS = ("python", *(["kernel"] if kernel.core is not None else []))
 
 
 @pytest.fixture(scope="module")
@@ -39,33 +42,35 @@ def torque(t: float, q: Any, v: Any) -> np.ndarray:
     return np.array([(2.0 + np.sin(3.0 * t)) * (1.0 if int(t / PERIOD) % 2 else -1.0), 0.0])
 
 
-@pytest.fixture(scope="module")
-def exact() -> np.ndarray:
-    """State (2,) of the crank at T_END, by SciPy on the reduced equation, piece by piece."""
+def pushed(torque: Callable[[float], float], begin: float, end: float, y: Any) -> np.ndarray:
+    """Angle and rate of the crank at ``end``, by SciPy from ``y`` at ``begin`` under a torque of
+    time."""
     free = reduced.slider_crank()
 
-    def forced(t: float, y: Any, k: int) -> Any:
-        rates = free(t, y)
-        push = (2.0 + np.sin(3.0 * t)) * (1.0 if k % 2 else -1.0)
-        return [rates[0], rates[1] + push / (8.0 / 3.0 + 8.0 * np.sin(y[0]) ** 2)]
+    def field(t: float, y: Any) -> Any:
+        rate, acceleration = free(t, y)
+        return [rate, acceleration + torque(t) / (8.0 / 3.0 + 8.0 * np.sin(y[0]) ** 2)]
 
-    y = [7.0 * np.pi / 4.0, 0.0]
-    ends = (0.0, *JUMPS, T_END)
-    for k, (a, b) in enumerate(pairwise(ends)):
-        run = solve_ivp(forced, (a, b), y, "DOP853", args=(k,), rtol=1e-13, atol=1e-13)
-        y = run.y[:, -1]
+    run = solve_ivp(field, (begin, end), y, "DOP853", rtol=1e-13, atol=1e-13)
+    return np.array(run.y[:, -1])
+
+
+@pytest.fixture(scope="module")
+def exact() -> np.ndarray:
+    """State (2,) of the crank at T_END under the torque, from jump to jump."""
+    y: Any = START
+    for k, (begin, end) in enumerate(pairwise((0.0, *JUMPS, T_END))):
+        sign = 1.0 if k % 2 else -1.0
+        y = pushed(lambda t, sign=sign: sign * (2.0 + np.sin(3.0 * t)), begin, end, y)
     return np.array(y)
 
 
 def errors(run: Callable[[float], srm.Solution], steps: list[int], exact: np.ndarray) -> np.ndarray:
-    found = []
-    for n in steps:
-        end = run(T_END / n)
-        found.append(abs(end.q[-1, 0] - exact[0]) + abs(end.v[-1, 0] - exact[1]))
-    return np.array(found)
+    ends = [run(T_END / n) for n in steps]
+    return np.array([abs(e.q[-1, 0] - exact[0]) + abs(e.v[-1, 0] - exact[1]) for e in ends])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize(
     ("tableau", "steps", "order"), [("erk4", [100, 200, 400], 4.0), ("dop853", [24, 36, 48], 8.0)]
 )
@@ -89,12 +94,12 @@ def test_with_breakpoints_a_scheme_keeps_its_order(
         )
 
     found = errors(run, steps, exact)
-    assert np.polyfit(np.log(steps), -np.log(found), 1)[0] > order - 0.4
+    assert -fitted_order(steps, found) > order - 0.4
     without = errors(lambda h: run(h, ()), steps, exact)
     assert np.all(without > 1e3 * found)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_step_size_control_meets_jumps_without_rejecting(
     slider_crank: srm.Mechanism, exact: np.ndarray, backend: str
 ) -> None:
@@ -143,7 +148,7 @@ def test_a_side_of_a_breakpoint_is_what_the_controller_means(slider_crank: srm.M
     assert np.array_equal(ends[0], ends[2])
 
 
-@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+@needs_kernel
 @pytest.mark.parametrize(
     ("tableau", "step"), [("dop853", None), ("dopr54", None), ("erk4", 0.01), ("dop853", 0.05)]
 )
@@ -169,7 +174,7 @@ def test_every_attempt_between_breakpoints_is_repeated(
     assert found.error < 1e-12
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("step", [None, 0.01])
 @pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-7, 1e-4, -1e-3, 0.01])
 def test_a_breakpoint_next_to_a_singular_configuration_changes_nothing(
@@ -190,14 +195,12 @@ def test_a_breakpoint_next_to_a_singular_configuration_changes_nothing(
     assert np.abs(cut(t)[0] - smooth(t)[0]).max() < 2e-9
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_step_in_the_zone_between_breakpoints_is_read(
-    slider_crank: srm.Mechanism, backend: str
+    slider_crank: srm.Mechanism, smooth: srm.Solution, backend: str
 ) -> None:
     """It has no neighbours to be interpolated from."""
-    smooth = srm.simulate(slider_crank, 1.5, rtol=1e-12)
-    time = smooth.crossings[0].time
-    h = 0.01
+    time, h = smooth.crossings[0].time, 0.01
     cut = srm.simulate(
         slider_crank,
         1.5,
@@ -212,32 +215,27 @@ def test_a_step_in_the_zone_between_breakpoints_is_read(
     assert np.abs(cut(t)[0] - smooth(t)[0]).max() < 1e-6
 
 
-def test_a_torque_may_jump_on_a_singular_configuration(slider_crank: srm.Mechanism) -> None:
+@on_both
+def test_a_torque_may_jump_on_a_singular_configuration(
+    slider_crank: srm.Mechanism, smooth: srm.Solution, backend: str
+) -> None:
     """The multiplier jumps there with the torque; the reduced equation is regular."""
-    (passage,) = srm.simulate(slider_crank, 2.0, rtol=1e-12).crossings
-    at = passage.time
-    free = reduced.slider_crank()
-
-    def forced(t: float, y: Any) -> Any:
-        rates = free(t, y)
-        return [rates[0], rates[1] + 20.0 / (8.0 / 3.0 + 8.0 * np.sin(y[0]) ** 2)]
-
-    y = reduced.integrate(free, [7.0 * np.pi / 4.0, 0.0], at)
-    exact = reduced.integrate(forced, list(y), 2.0 - at)
-    for backend in BACKENDS:
-        solution = srm.simulate(
-            slider_crank,
-            2.0,
-            controller=lambda t, q, v: [20.0 if t > at else 0.0, 0.0],
-            breakpoints=[at],
-            rtol=1e-9,
-            backend=backend,
-        )
-        assert solution.success
-        assert abs(solution.q[-1, 0] - exact[0]) < 1e-8
+    at = smooth.crossings[0].time
+    y = reduced.integrate(reduced.slider_crank(), START, at)
+    exact = pushed(lambda t: 20.0, at, 2.0, y)
+    solution = srm.simulate(
+        slider_crank,
+        2.0,
+        controller=lambda t, q, v: [20.0 if t > at else 0.0, 0.0],
+        breakpoints=[at],
+        rtol=1e-9,
+        backend=backend,
+    )
+    assert solution.success
+    assert abs(solution.q[-1, 0] - exact[0]) < 1e-8
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("t_end", [1.0, 1.003])
 def test_a_controller_is_sampled_at_multiples_of_its_sample_time(
     slider_crank: srm.Mechanism, backend: str, t_end: float
@@ -258,22 +256,13 @@ def test_a_controller_is_sampled_at_multiples_of_its_sample_time(
 
 def sampled_exactly(gain: float, period: float, t_end: float) -> np.ndarray:
     """The crank under a torque -gain w that is held over each period, by SciPy."""
-    free = reduced.slider_crank()
-
-    def forced(t: float, y: Any, push: float) -> Any:
-        rates = free(t, y)
-        return [rates[0], rates[1] + push / (8.0 / 3.0 + 8.0 * np.sin(y[0]) ** 2)]
-
-    y = np.array([7.0 * np.pi / 4.0, 0.0])
+    y = np.array(START)
     for _ in range(round(t_end / period)):
-        run = solve_ivp(
-            forced, (0.0, period), y, "DOP853", args=(-gain * y[1],), rtol=1e-13, atol=1e-13
-        )
-        y = run.y[:, -1]
+        y = pushed(lambda t, held=-gain * y[1]: held, 0.0, period, y)
     return y
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
 def test_what_a_controller_returned_is_held_between_samples(
     slider_crank: srm.Mechanism, backend: str, tableau: str
@@ -318,7 +307,7 @@ def test_a_saved_run_knows_what_was_held(slider_crank: srm.Mechanism, tmp_path: 
     assert np.array_equal(loaded.reactions["pin"], solution.reactions["pin"])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_controller_may_return_the_same_array_every_time(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:
@@ -339,42 +328,41 @@ def test_a_controller_may_return_the_same_array_every_time(
     assert abs(same.energy_balance.relative) < 1e-6
 
 
+@on_both
 def test_a_controller_that_fails_at_a_sample_ends_the_run_there(
-    slider_crank: srm.Mechanism,
+    slider_crank: srm.Mechanism, backend: str
 ) -> None:
     def controller(t: float, q: Any, v: Any) -> Any:
         return [0.0] if t > 0.25 else [0.0, 0.0]
 
-    for backend in BACKENDS:
-        solution = srm.simulate(
-            slider_crank, 1.0, controller=controller, sample_time=0.1, backend=backend
+    solution = srm.simulate(
+        slider_crank, 1.0, controller=controller, sample_time=0.1, backend=backend
+    )
+    assert solution.status == "failed"
+    assert "returned an array of shape (1,)" in solution.message
+    assert solution.t[-1] == pytest.approx(0.3)
+
+
+@needs_kernel
+def test_both_backends_find_the_same_events_between_samples(slider_crank: srm.Mechanism) -> None:
+    found = []
+    for backend in ("python", "kernel"):
+        run = srm.simulate(
+            slider_crank,
+            2.0,
+            controller=lambda t, q, v: -2.0 * v,
+            sample_time=0.02,
+            events=[lambda t, q, v: q[0] - 5.0],
+            rtol=1e-10,
+            backend=backend,
         )
-        assert solution.status == "failed"
-        assert "returned an array of shape (1,)" in solution.message
-        assert solution.t[-1] == pytest.approx(0.3)
+        assert run.t_events is not None
+        found.append(run.t_events[0])
+    assert len(found[0]) >= 1
+    assert found[1] == pytest.approx(found[0], abs=1e-9)
 
 
-def test_events_are_found_between_samples(slider_crank: srm.Mechanism) -> None:
-    def level(t: float, q: Any, v: Any) -> float:
-        return float(q[0] - 5.0)
-
-    options: dict[str, Any] = {
-        "controller": lambda t, q, v: -2.0 * v,
-        "sample_time": 0.02,
-        "events": [level],
-        "rtol": 1e-10,
-    }
-    times = [
-        srm.simulate(slider_crank, 2.0, backend=backend, **options).t_events for backend in BACKENDS
-    ]
-    assert times[0] is not None
-    assert len(times[0][0]) >= 1
-    for other in times[1:]:
-        assert other is not None
-        assert np.allclose(other[0], times[0][0], atol=1e-9)
-
-
-@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+@needs_kernel
 def test_many_breakpoints_cost_little(slider_crank: srm.Mechanism) -> None:
     """20 000 of them: an evaluation and a look at the list each."""
     times = np.arange(1, 20_000) * 5e-5
@@ -383,34 +371,30 @@ def test_many_breakpoints_cost_little(slider_crank: srm.Mechanism) -> None:
     assert solution.stats.evaluations <= 13 * 20_010
 
 
-def test_pieces_join_times_that_no_step_fits_between() -> None:
-    pieces = smooth_intervals(np.array([0.3, 3 * 0.1, -1.0, 7.0]), np.array([0.6]), 0.0, 1.0)
-    assert pieces.ends.tolist() == [0.3, 0.6, 1.0]
-    assert pieces.given.tolist() == [False, True]
-    assert pieces.last[0] < 0.3 < 3 * 0.1 < pieces.first[1]
-    assert pieces.first[0] == -np.inf
-    assert pieces.last[-1] == np.inf
+def test_intervals_join_times_that_no_step_fits_between() -> None:
+    intervals = smooth_intervals(np.array([0.3, 3 * 0.1, -1.0, 7.0]), np.array([0.6]), 0.0, 1.0)
+    assert intervals.ends.tolist() == [0.3, 0.6, 1.0]
+    assert intervals.given.tolist() == [False, True]
+    assert intervals.last[0] < 0.3 < 3 * 0.1 < intervals.first[1]
+    assert intervals.first[0] == -np.inf
+    assert intervals.last[-1] == np.inf
     ends = smooth_intervals(np.array([0.0, 1.0]), np.zeros(0), 0.0, 1.0)
     assert ends.count == 1
     assert 0.0 < ends.first[0] < 1e-300
     assert 1.0 - 1e-14 < ends.last[0] < 1.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"breakpoints": [[0.1]]}, "breakpoints has shape"),
-        ({"breakpoints": ["x"]}, "does not consist of finite numbers"),
-        ({"breakpoints": [np.nan]}, "does not consist of finite numbers"),
-        ({"sample_time": 0.1}, "no controller"),
-        ({"sample_time": 0.0, "controller": torque}, "not a positive number"),
-        ({"sample_time": 1e-12, "controller": torque}, r"makes 1e\+12 samples"),
-        ({"sample_time": 1e-310, "controller": torque}, "makes inf samples"),
-        ({"breakpoints": [0.5], "singular_times": [0.5]}, "a step must end at 0.5 s"),
-    ],
-)
-def test_bad_options_are_refused(
-    slider_crank: srm.Mechanism, options: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(srm.InputError, match=message):
-        srm.simulate(slider_crank, 1.0, **options)
+REFUSED: dict[str, dict[str, Any]] = {
+    "breakpoints as a matrix": {"breakpoints": [[0.1]]},
+    "breakpoints as words": {"breakpoints": ["x"]},
+    "a breakpoint that is no number": {"breakpoints": [np.nan]},
+    "nothing to sample": {"sample_time": 0.1},
+    "sample time of zero": {"sample_time": 0.0, "controller": torque},
+    "very many samples": {"sample_time": 1e-12, "controller": torque},
+    "infinitely many samples": {"sample_time": 1e-310, "controller": torque},
+}
+
+
+def test_bad_options_are_refused(slider_crank: srm.Mechanism) -> None:
+    run = partial(srm.simulate, slider_crank, 1.0)
+    check_refusals("breakpoints", {case: partial(run, **given) for case, given in REFUSED.items()})

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.kernel import backend as kernel
+from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
 
@@ -95,21 +95,18 @@ def test_extra_stages_are_evaluated_only_when_dense_output_is_read() -> None:
     assert solution._system.evaluations == spent + 3
 
 
-def test_dense_output_inside_the_zone_uses_the_prediction_of_the_run() -> None:
-    solution = srm.simulate(load("slider_crank"), 1.3, rtol=1e-12, max_step=5e-4)
-    assert solution.stats.zone_steps > 0
-    centre = solution.crossings[0].time
-    q, _ = solution(np.linspace(centre - 1e-3, centre + 1e-3, 201))
-    assert np.abs(q[:, 1] + 2.0 * q[:, 0]).max() < 1e-8
-
-
-def test_angles_of_continuous_joints_are_unwrapped() -> None:
-    """A free rotor with a (cos, sin) joint turns at constant rate, many turns per step."""
+def rotor(rate: float, *forces: srm.ForceElement) -> srm.Mechanism:
+    """A rotor of 1 kg m^2 with a (cos, sin) joint, without gravity."""
     model = pin.Model()
     model.gravity.linear = np.zeros(3)
     joint = model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "spin")
-    model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
-    mechanism = srm.Mechanism(model, v0=[3.0])
+    model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    return srm.Mechanism(model, v0=[rate], forces=forces)
+
+
+def test_angles_of_continuous_joints_are_unwrapped() -> None:
+    """A free rotor turns at constant rate, many turns per step."""
+    mechanism = rotor(3.0)
     solution = srm.simulate(mechanism, 40.0)
     position, rate = solution.joint("spin")
     assert position == pytest.approx(3.0 * solution.t, abs=1e-6)
@@ -122,18 +119,11 @@ def test_angles_of_continuous_joints_are_unwrapped() -> None:
 def test_turns_are_counted_within_steps_in_which_the_rate_changes_by_many_turns() -> None:
     """omega = A cos t: the mean of the rates at the ends of a step is off by several turns."""
     A = 20000.0
-    model = pin.Model()
-    model.gravity.linear = np.zeros(3)
-    joint = model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "spin")
-    model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
-    motor = srm.JointTorque("spin", A, law=srm.Sine(-1.0, omega=1.0))
-    mechanism = srm.Mechanism(model, v0=[A], forces=[motor])
+    mechanism = rotor(A, srm.JointTorque("spin", A, law=srm.Sine(-1.0, omega=1.0)))
     t = np.linspace(0.0, 10.0, 997)
-    for solution in (
-        srm.simulate(mechanism, 10.0, rtol=1e-5),
-        srm.simulate(mechanism, 10.0, rtol=1e-5, breakpoints=[3.3, 7.1]),
-        srm.simulate(mechanism, 10.0, rtol=1e-5, events=[srm.Event(lambda t, q, v: t - 4.7)]),
-    ):
+    event = srm.Event(lambda t, q, v: t - 4.7)
+    for options in ({}, {"breakpoints": [3.3, 7.1]}, {"events": [event]}):
+        solution = srm.simulate(mechanism, 10.0, rtol=1e-5, **options)
         assert solution.at(t).joint("spin")[0] == pytest.approx(A * np.sin(t), abs=1e-6)
 
 
@@ -151,7 +141,7 @@ def beside_a_slider_crank(joint: Any, rates: list[float]) -> srm.Mechanism:
 
 @pytest.mark.parametrize("speed", [5.0, 60.0, 300.0])
 @pytest.mark.parametrize("kind", ["cosine and sine", "ball"])
-def test_what_turns_fast_is_told_also_beside_singular_configurations(
+def test_joints_that_turn_fast_are_followed_beside_singular_configurations(
     kind: str, speed: float
 ) -> None:
     """Around passages the states of several steps are interpolated, over which joints may turn by
@@ -173,13 +163,11 @@ def test_what_turns_fast_is_told_also_beside_singular_configurations(
             assert np.abs(data.oMi[3].rotation - turn).max() < 1e-9
 
 
-@pytest.mark.parametrize("backend", ["python", "kernel"])
-def test_a_rotor_that_reverses_fast_is_told_also_beside_singular_configurations(
+@on_both
+def test_a_rotor_that_reverses_fast_is_followed_beside_singular_configurations(
     backend: str,
 ) -> None:
     """omega = A cos t; the crank goes round slowly, without gravity, past two passages."""
-    if backend == "kernel" and kernel.core is None:
-        pytest.skip(f"no kernel: {kernel.missing}")
     A = 300.0
     base = beside_a_slider_crank(pin.JointModelRUBY(), [A])
     model = base.model.copy()

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import replace
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,14 @@ from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.model.anchors import WORLD, Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure, perpendicular_basis
+from tests.support.backends import needs_kernel
+from tests.support.mechanisms import random_state
+from tests.support.snapshots import check_refusals
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
 TYPES = tuple(name for name, kind in CLOSURE_TYPES.items() if "a" in kind.needs)
-"""Those between anchors; tests/test_couplings.py has those between joints."""
+"""Those between anchors; test_couplings.py has those between joints."""
 GRAVITY = np.array([3.0, -5.0, -9.81])
 
 # Anchors of a closure: both branches of the tree, one branch and the ground, one chain.
@@ -86,11 +89,6 @@ def tree(seed: int) -> pin.Model:
     return model
 
 
-def random_state(model: pin.Model, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-    return q, rng.uniform(-1.0, 1.0, model.nv)
-
-
 def random_anchor(link: str, rng: np.random.Generator) -> Anchor:
     return Anchor(link, xyz=tuple(rng.uniform(-1, 1, 3)), rpy=tuple(rng.uniform(-1.5, 1.5, 3)))
 
@@ -104,15 +102,70 @@ def random_loop(kind: str, place: str, rng: np.random.Generator) -> LoopClosure:
     return LoopClosure(kind, *anchors, **axes, length=length, name=f"{kind} {place}")
 
 
+@dataclass(frozen=True)
+class Scene:
+    """A tree, closures on it, and a state in which they are open."""
+
+    model: pin.Model
+    loops: tuple[LoopClosure, ...]
+    q: FloatArray
+    v: FloatArray
+    rng: np.random.Generator
+
+    @property
+    def loop(self) -> LoopClosure:
+        """The only closure."""
+        (loop,) = self.loops
+        return loop
+
+    @cached_property
+    def kinematics(self) -> LoopKinematics:
+        return LoopKinematics(self.model, self.loops)
+
+    def rows(self, q: FloatArray | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """g, G and Gdot v of the closures at (q, v)."""
+        return evaluate(self.model, self.kinematics, self.q if q is None else q, self.v)
+
+    def relative(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation R and position p of anchor a in anchor b."""
+        Ra, pa = anchor_placement(self.model, q, self.loop.a)
+        Rb, pb = anchor_placement(self.model, q, self.loop.b)
+        return Rb.T @ Ra, Rb.T @ (pa - pb)
+
+    def moved(self, delta: FloatArray) -> FloatArray:
+        """The configuration at q + delta (nv,)."""
+        return pin.integrate(self.model, self.q, delta)
+
+    def closed_at(self, relative: pin.SE3) -> Scene:
+        """The closure with anchor b moved so that a has the placement ``relative`` in b."""
+        link = self.loop.b.link
+        wanted = pin.SE3(*anchor_placement(self.model, self.q, self.loop.a)) * relative.inverse()
+        body = pin.SE3(*anchor_placement(self.model, self.q, Anchor(link)))
+        return replace(self, loops=(replace(self.loop, b=anchor_at(link, body.actInv(wanted))),))
+
+
+def scene(seed: int, *closures: tuple[str, str]) -> Scene:
+    """Closures of given kinds at given places, with anchors, axes and a state from ``seed``."""
+    rng = np.random.default_rng([seed, 2])
+    model = tree(seed % len(SEEDS))
+    loops = tuple(random_loop(kind, place, rng) for kind, place in closures)
+    return Scene(model, loops, *random_state(model, rng), rng)
+
+
+EVERYWHERE = tuple((kind, place) for kind in TYPES for place in PLACES)
+"""Closures of all kinds at all places."""
+
+
+def anchor_at(link: str, placement: pin.SE3) -> Anchor:
+    rpy = Rotation.from_matrix(placement.rotation).as_euler("xyz")
+    return Anchor(link, xyz=tuple(placement.translation), rpy=tuple(rpy))
+
+
 def evaluate(
-    model: pin.Model,
-    rows: LoopKinematics,
-    q: FloatArray,
-    v: FloatArray,
-    data: pin.Data | None = None,
+    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """g, G and Gdot v at (q, v)."""
-    data = model.createData() if data is None else data
+    data = model.createData()
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, v)
     rows.update(data, q)
@@ -132,15 +185,6 @@ def anchor_placement(model: pin.Model, q: FloatArray, anchor: Anchor) -> tuple[F
     return rotation @ own, origin + rotation @ np.array(anchor.xyz)
 
 
-def relative_placement(
-    model: pin.Model, q: FloatArray, loop: LoopClosure
-) -> tuple[FloatArray, FloatArray]:
-    """Rotation R and position p of anchor a in anchor b."""
-    Ra, pa = anchor_placement(model, q, loop.a)
-    Rb, pb = anchor_placement(model, q, loop.b)
-    return Rb.T @ Ra, Rb.T @ (pa - pb)
-
-
 def extrapolated(difference: Callable[[float], FloatArray], step: float) -> FloatArray:
     """Richardson extrapolation of a central difference, error O(step^6)."""
     coarse, middle, fine = difference(step), difference(step / 2), difference(step / 4)
@@ -157,20 +201,15 @@ every_seed = pytest.mark.parametrize("seed", SEEDS)
 @every_place
 @every_seed
 def test_jacobian_is_the_derivative_of_the_rows(kind: str, place: str, seed: int) -> None:
-    rng = np.random.default_rng([seed, 1])
-    model = tree(seed)
-    loop = random_loop(kind, place, rng)
-    q, v = random_state(model, rng)
-    rows = LoopKinematics(model, (loop,))
-    _, G, _ = evaluate(model, rows, q, v)
-    data = model.createData()
+    here = scene(seed, (kind, place))
+    _, G, _ = here.rows()
+    for column, e in enumerate(np.eye(here.model.nv)):
 
-    def moved(delta: FloatArray) -> FloatArray:
-        return evaluate(model, rows, pin.integrate(model, q, delta), v, data)[0]
+        def difference(h: float, e: FloatArray = e) -> FloatArray:
+            forward, back = (here.rows(here.moved(step * e))[0] for step in (h, -h))
+            return (forward - back) / (2 * h)
 
-    for column, e in enumerate(np.eye(model.nv)):
-        expected = extrapolated(lambda h, e=e: (moved(h * e) - moved(-h * e)) / (2 * h), 4e-3)
-        assert_close(G[:, column], expected, atol=2e-11)
+        assert_close(G[:, column], extrapolated(difference, 4e-3), atol=2e-11)
     assert np.abs(G).max(axis=1).min() > 1e-2  # the test sees every row move
 
 
@@ -180,15 +219,11 @@ def test_jacobian_is_the_derivative_of_the_rows(kind: str, place: str, seed: int
 def test_bias_is_the_derivative_of_the_rates_at_constant_body_velocity(
     kind: str, place: str, seed: int
 ) -> None:
-    rng = np.random.default_rng([seed, 2])
-    model = tree(seed)
-    loop = random_loop(kind, place, rng)
-    q, v = random_state(model, rng)
-    rows = LoopKinematics(model, (loop,))
-    _, _, bias = evaluate(model, rows, q, v)
+    here = scene(seed, (kind, place))
+    _, _, bias = here.rows()
 
     def rate(tau: float) -> FloatArray:
-        return evaluate(model, rows, pin.integrate(model, q, tau * v), v)[1] @ v
+        return here.rows(here.moved(tau * here.v))[1] @ here.v
 
     expected = extrapolated(lambda h: (rate(h) - rate(-h)) / (2 * h), 4e-3)
     assert_close(bias, expected, atol=5e-11 * max(1.0, np.abs(expected).max()))
@@ -199,46 +234,36 @@ def test_bias_is_the_derivative_of_the_rates_at_constant_body_velocity(
 @every_seed
 def test_bias_is_the_second_derivative_of_the_gap_itself(kind: str, seed: int) -> None:
     """Independent of G: second differences of rows computed from placements."""
-    rng = np.random.default_rng([seed, 3])
-    model = tree(seed)
-    loop = random_loop(kind, "two branches", rng)
-    q, v = random_state(model, rng)
-    bias = evaluate(model, LoopKinematics(model, (loop,)), q, v)[2]
+    here = scene(seed, (kind, "two branches"))
 
     def g(tau: float) -> FloatArray:
-        moved = pin.integrate(model, q, tau * v)
-        return rows_from_placements(loop, *relative_placement(model, moved, loop))
+        return rows_from_placements(here, here.moved(tau * here.v))
 
     expected = extrapolated(lambda h: (g(h) - 2 * g(0.0) + g(-h)) / h**2, 4e-2)
-    assert_close(bias, expected, atol=2e-8 * max(1.0, np.abs(expected).max()))
+    assert_close(here.rows()[2], expected, atol=2e-8 * max(1.0, np.abs(expected).max()))
 
 
-def rows_from_placements(loop: LoopClosure, R: FloatArray, p: FloatArray) -> FloatArray:
+def rows_from_placements(at: Scene, q: FloatArray) -> FloatArray:
     """The rows of every type written out, for a's rotation R and position p in b."""
-    if loop.type == "point":
-        return p
-    turns = [R[2, 1], R[0, 2], R[1, 0]]
-    if loop.type == "frame":
-        return np.array([*p, *turns])
-    if loop.type == "universal":
-        return np.array([*p, np.array(loop.axis_b) @ R @ np.array(loop.axis_a)])
-    if loop.type == "distance":
-        return np.array([np.linalg.norm(p) - loop.length])
-    axis = np.array(loop.axis)
+    loop = at.loop
+    R, p = at.relative(q)
+    axis, axis_a, axis_b = (np.array(u or (1, 0, 0)) for u in (loop.axis, loop.axis_a, loop.axis_b))
     n1, n2 = perpendicular_basis(axis)
-    if loop.type == "revolute":
-        return np.array([*p, n1 @ R @ axis, n2 @ R @ axis])
-    if loop.type == "prismatic":
-        return np.array([n1 @ p, n2 @ p, *turns])
-    if loop.type == "cylindrical":
-        return np.array([n1 @ p, n2 @ p, n1 @ R @ axis, n2 @ R @ axis])
-    if loop.type == "planar":
-        return np.array([axis @ p, n1 @ R @ axis, n2 @ R @ axis])
-    if loop.type == "point_on_line":
-        return np.array([n1 @ p, n2 @ p])
-    if loop.type == "point_on_plane":
-        return np.array([axis @ p])
-    raise AssertionError(f"this test does not know the rows of {loop.type!r}: write them down here")
+    across, aligned = [n1 @ p, n2 @ p], [n1 @ R @ axis, n2 @ R @ axis]
+    turns = [R[2, 1], R[0, 2], R[1, 0]]
+    rows: dict[Any, list[Any]] = {
+        "point": [p],
+        "frame": [p, turns],
+        "revolute": [p, aligned],
+        "prismatic": [across, turns],
+        "cylindrical": [across, aligned],
+        "universal": [p, axis_b @ R @ axis_a],
+        "planar": [axis @ p, aligned],
+        "distance": [np.linalg.norm(p) - (loop.length or 0.0)],
+        "point_on_line": [across],
+        "point_on_plane": [axis @ p],
+    }
+    return np.hstack(rows[loop.type])
 
 
 @every_row
@@ -247,28 +272,22 @@ def rows_from_placements(loop: LoopClosure, R: FloatArray, p: FloatArray) -> Flo
 def test_rows_are_the_gaps_between_the_placements_of_the_anchors(
     kind: str, place: str, seed: int
 ) -> None:
-    rng = np.random.default_rng([seed, 4])
-    model = tree(seed)
-    loop = random_loop(kind, place, rng)
-    q, v = random_state(model, rng)
-    g = evaluate(model, LoopKinematics(model, (loop,)), q, v)[0]
-    expected = rows_from_placements(loop, *relative_placement(model, q, loop))
-    assert_close(g, expected, atol=3e-14)
-    assert len(g) == loop.rows.count == len(loop.row_names) == len(set(loop.row_names))
+    here = scene(seed, (kind, place))
+    g, _, _ = here.rows()
+    assert_close(g, rows_from_placements(here, here.q), atol=3e-14)
+    names = here.loop.row_names
+    assert len(g) == here.loop.rows.count == len(names) == len(set(names))
 
 
 @every_row
 @every_seed
 def test_gravity_does_not_enter_the_bias(kind: str, seed: int) -> None:
-    rng = np.random.default_rng([seed, 5])
-    model = tree(seed).copy()
-    loops = tuple(random_loop(kind, place, rng) for place in PLACES)
-    q, v = random_state(model, rng)
-    rows = LoopKinematics(model, loops)
+    here = scene(seed, *((kind, place) for place in PLACES))
     found = []
     for gravity in (np.zeros(3), GRAVITY, -1e3 * GRAVITY):
+        model = here.model.copy()
         model.gravity.linear = gravity
-        found.append(evaluate(model, rows, q, v))
+        found.append(replace(here, model=model).rows())
     for g, G, bias in found[1:]:
         np.testing.assert_array_equal(g, found[0][0])
         np.testing.assert_array_equal(G, found[0][1])
@@ -277,264 +296,177 @@ def test_gravity_does_not_enter_the_bias(kind: str, seed: int) -> None:
 
 
 @every_seed
-def test_bias_vanishes_at_rest_under_gravity(seed: int) -> None:
-    rng = np.random.default_rng([seed, 6])
-    model = tree(seed)
-    loops = tuple(random_loop(kind, place, rng) for kind in TYPES for place in PLACES)
-    q, v = random_state(model, rng)
-    rows = LoopKinematics(model, loops)
-    assert_close(evaluate(model, rows, q, 0 * v)[2], 0.0, atol=1e-13)
-
-
-@every_seed
 def test_bias_is_quadratic_in_the_rates(seed: int) -> None:
-    rng = np.random.default_rng([seed, 7])
-    model = tree(seed)
-    loops = tuple(random_loop(kind, place, rng) for kind in TYPES for place in PLACES)
-    q, v = random_state(model, rng)
-    rows = LoopKinematics(model, loops)
-    once = evaluate(model, rows, q, v)[2]
-    assert_close(evaluate(model, rows, q, -3 * v)[2], 9 * once, atol=1e-12)
+    """So it vanishes at rest, also under gravity."""
+    here = scene(seed, *EVERYWHERE)
+    at_rest, once, back = (replace(here, v=k * here.v).rows()[2] for k in (0, 1, -3))
+    assert_close(at_rest, 0.0, atol=1e-13)
+    assert_close(back, 9 * once, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("place", "links"),
+    [
+        ("descendant and ancestor", ("leg_2", "leg_3", "leg_4")),
+        ("ancestor and descendant", ("arm_2", "arm_3", "arm_4")),
+        ("body and ground", ("arm_1", "arm_2", "arm_3", "arm_4")),
+    ],
+)
 @every_row
 @every_seed
-def test_every_row_moves_only_the_joints_between_its_anchors(kind: str, seed: int) -> None:
-    rng = np.random.default_rng([seed, 8])
-    model = tree(seed)
-    q, v = random_state(model, rng)
-    between = {
-        "descendant and ancestor": ("leg_2", "leg_3", "leg_4"),
-        "ancestor and descendant": ("arm_2", "arm_3", "arm_4"),
-        "body and ground": ("arm_1", "arm_2", "arm_3", "arm_4"),
-    }
-    for place, links in between.items():
-        loop = random_loop(kind, place, rng)
-        _, G, _ = evaluate(model, LoopKinematics(model, (loop,)), q, v)
-        moving = np.zeros(model.nv, dtype=bool)
-        for link in links:
-            joint = model.joints[model.getJointId(f"{link}_joint")]
-            moving[joint.idx_v : joint.idx_v + joint.nv] = True
-        assert not G[:, ~moving].any(), place
-        assert G[:, moving].any(), place
+def test_every_row_moves_only_the_joints_between_its_anchors(
+    kind: str, place: str, links: tuple[str, ...], seed: int
+) -> None:
+    here = scene(seed, (kind, place))
+    _, G, _ = here.rows()
+    moving = np.zeros(here.model.nv, dtype=bool)
+    for link in links:
+        joint = here.model.joints[here.model.getJointId(f"{link}_joint")]
+        moving[joint.idx_v : joint.idx_v + joint.nv] = True
+    assert not G[:, ~moving].any()
+    assert G[:, moving].any()
 
 
 @every_seed
 def test_scales_divide_the_rows_and_only_kept_rows_are_evaluated(seed: int) -> None:
-    rng = np.random.default_rng([seed, 9])
-    model = tree(seed)
-    loops = tuple(
-        random_loop(kind, place, rng) for kind, place in zip(TYPES * 2, [*PLACES, *PLACES])
-    )
-    q, v = random_state(model, rng)
-    g, G, bias = evaluate(model, LoopKinematics(model, loops), q, v)
-    scale = rng.uniform(0.1, 10.0, len(g))
-    for trial in range(6):
-        keep = rng.random(len(g)) < (1.0, 0.5, 0.5, 0.5, 0.2, 0.0)[trial]
-        part = evaluate(model, LoopKinematics(model, loops, scale, keep), q, v)
-        for own, whole in zip(part, (g, G, bias)):
-            by = scale if whole.ndim == 1 else scale[:, None]
-            assert_close(own, (whole / by)[keep], rtol=1e-13, atol=1e-14)
+    here = scene(seed, *zip(TYPES * 2, [*PLACES, *PLACES]))
+    whole = here.rows()
+    scale = here.rng.uniform(0.1, 10.0, len(whole[0]))
+    for share in (1.0, 0.5, 0.5, 0.5, 0.2, 0.0):
+        keep = here.rng.random(len(scale)) < share
+        rows = LoopKinematics(here.model, here.loops, scale, keep)
+        for part, all_ in zip(evaluate(here.model, rows, here.q, here.v), whole):
+            by = scale if all_.ndim == 1 else scale[:, None]
+            assert_close(part, (all_ / by)[keep], rtol=1e-13, atol=1e-14)
 
 
 def test_update_without_bias_leaves_the_rows_the_same() -> None:
-    rng = np.random.default_rng(10)
-    model = tree(0)
-    loops = tuple(random_loop(kind, place, rng) for kind in TYPES for place in PLACES)
-    q, v = random_state(model, rng)
-    g, G, _ = evaluate(model, LoopKinematics(model, loops), q, v)
-    rows = LoopKinematics(model, loops)
-    data = model.createData()
-    pin.crba(model, data, q, pin.Convention.WORLD)
-    rows.update(data, q, with_bias=False)
+    here = scene(3, *EVERYWHERE)
+    g, G, _ = here.rows()
+    rows = LoopKinematics(here.model, here.loops)
+    data = here.model.createData()
+    pin.crba(here.model, data, here.q, pin.Convention.WORLD)
+    rows.update(data, here.q, with_bias=False)
     np.testing.assert_array_equal(rows.g, g)
     np.testing.assert_array_equal(rows.G, G)
 
 
 def free_motion(loop: LoopClosure, rng: np.random.Generator) -> pin.SE3:
     """A relative placement of a in b that the closure allows."""
-    axis = np.zeros(3) if loop.axis is None else np.array(loop.axis)
-    any_rotation = Rotation.random(random_state=rng).as_matrix()
-    about_axis = Rotation.from_rotvec(rng.uniform(-3, 3) * axis).as_matrix()
-    if loop.type == "prismatic":
-        return pin.SE3(np.eye(3), rng.uniform(-2, 2) * axis)
-    if loop.type == "cylindrical":
-        return pin.SE3(about_axis, rng.uniform(-2, 2) * axis)
-    if loop.type == "planar":
-        offset = rng.uniform(-2, 2, 3)
-        return pin.SE3(about_axis, offset - axis * (axis @ offset))
-    if loop.type == "universal":
-        # The axes made perpendicular in one way, then turns about each of them.
-        u, n = np.array(loop.axis_a), np.array(loop.axis_b)
-        across = perpendicular_basis(n)[0]
-        start = Rotation.align_vectors(across[None], u[None])[0]
-        about_a, about_b = (Rotation.from_rotvec(rng.uniform(-3, 3) * w) for w in (u, n))
-        return pin.SE3((about_b * start * about_a).as_matrix(), np.zeros(3))
-    if loop.type == "distance":
-        direction = rng.standard_normal(3)
-        return pin.SE3(any_rotation, loop.length * direction / np.linalg.norm(direction))
-    if loop.type == "point":
-        return pin.SE3(any_rotation, np.zeros(3))
-    if loop.type == "frame":
-        return pin.SE3.Identity()
-    if loop.type == "revolute":
-        return pin.SE3(about_axis, np.zeros(3))
-    if loop.type == "point_on_line":
-        return pin.SE3(any_rotation, rng.uniform(-2, 2) * axis)
-    if loop.type == "point_on_plane":
-        offset = rng.uniform(-2, 2, 3)
-        return pin.SE3(any_rotation, offset - axis * (axis @ offset))
-    raise AssertionError(f"this test does not know the free motion of {loop.type!r}")
-
-
-def closed_by_anchor(
-    model: pin.Model, q: FloatArray, loop: LoopClosure, relative: pin.SE3
-) -> LoopClosure:
-    """``loop`` with anchor b moved so that a has the placement ``relative`` in b."""
-    Ra, pa = anchor_placement(model, q, loop.a)
-    wanted = pin.SE3(Ra, pa) * relative.inverse()
-    Rl, pl = anchor_placement(model, q, Anchor(loop.b.link))
-    inside = pin.SE3(Rl, pl).actInv(wanted)
-    anchor = Anchor(
-        loop.b.link,
-        xyz=tuple(inside.translation),
-        rpy=tuple(Rotation.from_matrix(inside.rotation).as_euler("xyz")),
+    axis, u, n = (np.array(u or (1, 0, 0)) for u in (loop.axis, loop.axis_a, loop.axis_b))
+    fixed, any_rotation = Rotation.identity(), Rotation.random(random_state=rng)
+    about_axis, about_u, about_n = (
+        Rotation.from_rotvec(rng.uniform(-3, 3) * w) for w in (axis, u, n)
     )
-    return replace(loop, b=anchor)
+    # The axes of the cross made perpendicular in one way, then turns about each of them.
+    crossed = about_n * Rotation.align_vectors(perpendicular_basis(n)[0], u)[0] * about_u
+    offset, along = rng.uniform(-2, 2, 3), rng.uniform(-2, 2) * axis
+    in_plane = offset - axis * (axis @ offset)
+    at_length = (loop.length or 0.0) * offset / np.linalg.norm(offset)
+    here = np.zeros(3)
+    motions: dict[Any, tuple[Rotation, FloatArray]] = {
+        "point": (any_rotation, here),
+        "frame": (fixed, here),
+        "revolute": (about_axis, here),
+        "prismatic": (fixed, along),
+        "cylindrical": (about_axis, along),
+        "universal": (crossed, here),
+        "planar": (about_axis, in_plane),
+        "distance": (any_rotation, at_length),
+        "point_on_line": (any_rotation, along),
+        "point_on_plane": (any_rotation, in_plane),
+    }
+    rotation, translation = motions[loop.type]
+    return pin.SE3(rotation.as_matrix(), translation)
 
 
 @every_row
 @every_place
 @every_seed
 def test_rows_vanish_wherever_the_closure_is_satisfied(kind: str, place: str, seed: int) -> None:
-    rng = np.random.default_rng([seed, 11])
-    model = tree(seed)
-    q, v = random_state(model, rng)
-    loop = random_loop(kind, place, rng)
-    closed = closed_by_anchor(model, q, loop, free_motion(loop, rng))
-    g = evaluate(model, LoopKinematics(model, (closed,)), q, v)[0]
-    assert_close(g, 0.0, atol=1e-13)
+    here = scene(seed, (kind, place))
+    assert_close(here.closed_at(free_motion(here.loop, here.rng)).rows()[0], 0.0, atol=1e-13)
 
 
 @every_row
 @every_seed
 def test_rows_are_nonzero_where_the_closure_is_violated(kind: str, seed: int) -> None:
     """Each of the motions that a closure forbids shows in its rows, to first order."""
-    rng = np.random.default_rng([seed, 12])
-    model = tree(seed)
-    q, v = random_state(model, rng)
-    loop = random_loop(kind, "two branches", rng)
-    free = free_motion(loop, rng)
-    axis = np.zeros(3) if loop.axis is None else np.array(loop.axis)
-    n1, n2 = perpendicular_basis(axis) if axis.any() else (np.zeros(3), np.zeros(3))
-    eye = list(np.eye(3))
-    crossed = np.zeros(3)
-    if loop.type == "universal":
-        crossed = np.cross(free.rotation @ np.array(loop.axis_a), np.array(loop.axis_b))
+    here = scene(seed, (kind, "two branches"))
+    loop = here.loop
+    free = free_motion(loop, here.rng)
+    axis, axis_a, axis_b = (np.array(u or (1, 0, 0)) for u in (loop.axis, loop.axis_a, loop.axis_b))
+    across, eye = list(perpendicular_basis(axis)), list(np.eye(3))
     shifts, turns = {
         "point": (eye, []),
         "frame": (eye, eye),
-        "revolute": (eye, [n1, n2]),
-        "prismatic": ([n1, n2], eye),
-        "cylindrical": ([n1, n2], [n1, n2]),
-        "universal": (eye, [crossed]),
-        "planar": ([axis], [n1, n2]),
+        "revolute": (eye, across),
+        "prismatic": (across, eye),
+        "cylindrical": (across, across),
+        "universal": (eye, [np.cross(free.rotation @ axis_a, axis_b)]),
+        "planar": ([axis], across),
         "distance": ([free.translation / (loop.length or 1.0)], []),
-        "point_on_line": ([n1, n2], []),
+        "point_on_line": (across, []),
         "point_on_plane": ([axis], []),
     }[kind]
     size = 1e-4
-    found = []
-    for shift in shifts:
-        moved = pin.SE3(free.rotation, free.translation + size * np.array(shift))
-        closed = closed_by_anchor(model, q, loop, moved)
-        found.append(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0])
+    violations = [pin.SE3(free.rotation, free.translation + size * shift) for shift in shifts]
     for turn in turns:
         turned = Rotation.from_rotvec(size * turn).as_matrix() @ free.rotation
-        closed = closed_by_anchor(model, q, loop, pin.SE3(turned, free.translation))
-        found.append(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0])
+        violations.append(pin.SE3(turned, free.translation))
+    found = np.array([here.closed_at(violation).rows()[0] for violation in violations])
     # As many independent rows as forbidden motions, none of them weaker than the others.
-    singular = np.linalg.svd(np.array(found) / size, compute_uv=False)
-    assert_close(singular, 1.0, atol=1e-3)
-    assert np.array(found).shape == (loop.rows.count, loop.rows.count)
+    assert_close(np.linalg.svd(found / size, compute_uv=False), 1.0, atol=1e-3)
+    assert found.shape == (loop.rows.count, loop.rows.count)
 
 
 def test_rates_of_a_closed_frame_are_the_relative_velocity_in_its_axes() -> None:
-    rng = np.random.default_rng(13)
-    model = tree(1)
-    q, v = random_state(model, rng)
-    loop = random_loop("frame", "two branches", rng)
-    loop = closed_by_anchor(model, q, loop, pin.SE3.Identity())
-    G = evaluate(model, LoopKinematics(model, (loop,)), q, v)[1]
-    data = model.createData()
-    pin.computeJointJacobians(model, data, q)
-    pin.framesForwardKinematics(model, data, q)
+    here = scene(1, ("frame", "two branches")).closed_at(pin.SE3.Identity())
+    data = here.model.createData()
+    pin.forwardKinematics(here.model, data, here.q, here.v)
     twists = []
-    for anchor in (loop.a, loop.b):
-        joint, placement = anchor.resolve(model)
-        at = data.oMi[joint] * placement
-        twists.append(
-            at.toActionMatrixInverse()
-            @ pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD)
-            @ v
-        )
-    assert_close(G @ v, twists[0] - twists[1], atol=1e-13)
+    for joint, placement in here.loop.resolve(here.model):
+        twists.append(placement.actInv(data.v[joint]).vector)
+    assert_close(here.rows()[1] @ here.v, twists[0] - twists[1], atol=1e-13)
 
 
 @every_row
 def test_an_anchor_on_a_frame_equals_the_same_anchor_on_its_link(kind: str) -> None:
-    rng = np.random.default_rng(14)
-    model = tree(2).copy()
-    inside = random_placement(rng)
+    here = scene(2, (kind, "two branches"))
+    model, a = here.model.copy(), here.loop.a
+    inside = random_placement(here.rng)
     link = model.frames[model.getFrameId("leg_3")]
     model.addFrame(
         pin.Frame("tip", link.parentJoint, link.placement * inside, pin.FrameType.OP_FRAME)
     )
-    loop = random_loop(kind, "two branches", rng)
-    offset = anchor_offset(loop.a)
-    whole = inside * offset
-    on_link = replace(
-        loop,
-        a=Anchor(
-            "leg_3",
-            xyz=tuple(whole.translation),
-            rpy=tuple(Rotation.from_matrix(whole.rotation).as_euler("xyz")),
-        ),
+    offset = pin.SE3(Rotation.from_euler("xyz", a.rpy).as_matrix(), np.array(a.xyz))
+    on_link, on_frame = (
+        replace(here, model=model, loops=(replace(here.loop, a=anchor),)).rows()
+        for anchor in (
+            anchor_at("leg_3", inside * offset),
+            Anchor(frame="tip", xyz=a.xyz, rpy=a.rpy),
+        )
     )
-    on_frame = replace(loop, a=Anchor(frame="tip", xyz=loop.a.xyz, rpy=loop.a.rpy))
-    q, v = random_state(model, rng)
-    for x, y in zip(
-        evaluate(model, LoopKinematics(model, (on_link,)), q, v),
-        evaluate(model, LoopKinematics(model, (on_frame,)), q, v),
-    ):
+    for x, y in zip(on_link, on_frame):
         assert_close(x, y, atol=1e-13)
-
-
-def anchor_offset(anchor: Anchor) -> pin.SE3:
-    return pin.SE3(Rotation.from_euler("xyz", anchor.rpy).as_matrix(), np.array(anchor.xyz))
 
 
 @every_row
 @every_place
 def test_wrenches_of_the_rows_do_the_work_that_the_multipliers_do(kind: str, place: str) -> None:
     """Power of the row wrenches on the anchors' bodies is -lam . (G v), also in open loops."""
-    rng = np.random.default_rng(15)
-    model = tree(0)
-    loop = random_loop(kind, place, rng)
-    q, v = random_state(model, rng)
-    G = evaluate(model, LoopKinematics(model, (loop,)), q, v)[1]
-    data = model.createData()
-    pin.forwardKinematics(model, data, q, v)
-    wrenches = row_wrenches(loop, model, data)
-    at_b = anchor_placement(model, q, loop.b)[1]
+    here = scene(0, (kind, place))
+    data = here.model.createData()
+    pin.forwardKinematics(here.model, data, here.q, here.v)
+    wrenches = row_wrenches(here.loop, here.model, data)
+    at_b = anchor_placement(here.model, here.q, here.loop.b)[1]
     powers = []
-    for anchor in (loop.a, loop.b):
-        joint, _ = anchor.resolve(model)
+    for joint, _ in here.loop.resolve(here.model):
         twist = data.oMi[joint].act(data.v[joint])
         velocity = twist.linear + np.cross(twist.angular, at_b)
         powers.append(wrenches @ np.concatenate([velocity, twist.angular]))
     # On b the wrench, on a its opposite at the same point: together -G^T lam.
-    assert_close(powers[1] - powers[0], -(G @ v), atol=1e-13)
+    assert_close(powers[1] - powers[0], -(here.rows()[1] @ here.v), atol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -559,46 +491,35 @@ def test_perpendicular_basis_of_a_coordinate_axis_is_the_other_coordinate_axes(
 
 @every_row
 def test_rows_of_a_type_are_unit_and_alignments_perpendicular(kind: str) -> None:
-    rng = np.random.default_rng(16)
-    rows = random_loop(kind, "two branches", rng).rows
-    count = len(rows.directions) + len(rows.distances) + len(rows.alignments)
-    assert rows.count == count
-    assert [block.stop - block.start for block in rows.blocks] == [
-        count - len(rows.alignments), len(rows.alignments), 0
-    ]  # fmt: skip
-    assert_close(np.linalg.norm(rows.directions, axis=1), 1.0, atol=1e-15)
+    rows = scene(0, (kind, "two branches")).loop.rows
+    lengths, alignments, joints = (block.stop - block.start for block in rows.blocks)
+    assert lengths == len(rows.directions) + len(rows.distances)
+    assert (alignments, joints) == (len(rows.alignments), 0)
+    assert rows.count == lengths + alignments
     assert_close(rows.directions @ rows.directions.T, np.eye(len(rows.directions)), atol=1e-15)
     for u, n in rows.alignments:
         if kind != "universal":  # whose axes are perpendicular where it is assembled
             assert u @ n == pytest.approx(0.0, abs=1e-15)
-        assert np.linalg.norm(u) == pytest.approx(1.0)
-        assert np.linalg.norm(n) == pytest.approx(1.0)
+    assert_close(np.linalg.norm(rows.alignments, axis=2), 1.0, atol=1e-15)
     assert_close(np.linalg.norm(rows.matched, axis=1), 1.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic", "cylindrical", "planar"])
 def test_a_reversed_axis_satisfies_the_rows_but_not_the_matched_axes(kind: str) -> None:
-    rng = np.random.default_rng(17)
-    model = tree(0)
-    q, v = random_state(model, rng)
-    loop = random_loop(kind, "two branches", rng)
-    across = perpendicular_basis(np.array(loop.axis))[0] if kind != "prismatic" else np.eye(3)[0]
-    reversed_ = pin.SE3(Rotation.from_rotvec(np.pi * across).as_matrix(), np.zeros(3))
-    closed = closed_by_anchor(model, q, loop, reversed_)
-    assert_close(evaluate(model, LoopKinematics(model, (closed,)), q, v)[0], 0.0, atol=1e-13)
-    R, _ = relative_placement(model, q, closed)
-    assert np.abs(closed.rows.matched @ R.T - closed.rows.matched).max() > 0.5
+    here = scene(0, (kind, "two branches"))
+    axis = np.eye(3)[1] if kind == "prismatic" else np.array(here.loop.axis)
+    turn = Rotation.from_rotvec(np.pi * perpendicular_basis(axis)[0])
+    here = here.closed_at(pin.SE3(turn.as_matrix(), np.zeros(3)))
+    assert_close(here.rows()[0], 0.0, atol=1e-13)
+    R, _ = here.relative(here.q)
+    assert np.abs(here.loop.rows.matched @ R.T - here.loop.rows.matched).max() > 0.5
 
 
 @pytest.mark.parametrize("place", ["two branches", "body and ground", "ground and body"])
 def test_points_that_coincide_have_no_distance(place: str) -> None:
-    rng = np.random.default_rng(18)
-    model = tree(0)
-    q, v = random_state(model, rng)
-    loop = random_loop("distance", place, rng)
-    closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
+    here = scene(0, ("distance", place)).closed_at(pin.SE3.Identity())
     with pytest.raises(EvaluationError, match=rf"points of the loop 'distance {place}' coincide"):
-        evaluate(model, LoopKinematics(model, (closed,)), q, v)
+        here.rows()
 
 
 def test_every_type_says_what_it_needs_and_takes() -> None:
@@ -630,76 +551,71 @@ SOUND: dict[str, dict[str, Any]] = {
 """For each key, values that a closure can have."""
 
 
-@pytest.mark.parametrize("kind", CLOSURE_TYPES)
-def test_a_missing_or_superfluous_key_is_refused_with_the_remedy(kind: str) -> None:
-    needs = CLOSURE_TYPES[kind].needs
-    good: dict[str, Any] = {}
-    for key in needs:
-        good |= SOUND[key]
-    assert LoopClosure(kind, **good).name.startswith(f"{kind}_")
-    for key in needs:
-        less = {name: value for name, value in good.items() if name != key}
-        with pytest.raises(srm.InputError, match=rf"a {kind} closure needs .*Give \"{key} = "):
-            LoopClosure(kind, **less)
-    for key, values in SOUND.items():
-        if key in needs or key in CLOSURE_TYPES[kind].takes:
-            continue
-        with pytest.raises(srm.InputError, match=rf"a {kind} closure takes no {key}.*Remove"):
-            LoopClosure(kind, **good | {key: values[key]})
-    for key in needs:
-        if key.startswith("axis"):
-            with pytest.raises(srm.InputError, match=rf"the {key} is zero\. Give a direction"):
-                LoopClosure(kind, **good | {key: (0.0, 0.0, 0.0)})
+def refusals() -> dict[str, Callable[[], object]]:
+    """Closures that lack a key, have one too many, or have a value that cannot be."""
+    calls: dict[str, Callable[[], object]] = {}
+    calls["an unknown type"] = partial(LoopClosure, "hinge", Anchor("leg_3"), Anchor("arm_3"))
+    for kind, type_ in CLOSURE_TYPES.items():
+        good: dict[str, Any] = {}
+        for key in type_.needs:
+            good |= SOUND[key]
+        assert LoopClosure(kind, **good).name.startswith(f"{kind}_")
+        for key, values in SOUND.items():
+            if key in type_.needs:
+                less = {name: value for name, value in good.items() if name != key}
+                calls[f"{kind} without {key}"] = partial(LoopClosure, kind, **less)
+                if key.startswith("axis"):
+                    zero = good | {key: (0.0, 0.0, 0.0)}
+                    calls[f"{kind} with a zero {key}"] = partial(LoopClosure, kind, **zero)
+            elif key not in type_.takes:
+                more = good | {key: values[key]}
+                calls[f"{kind} with {key}"] = partial(LoopClosure, kind, **more)
+    calls["an axis of two numbers"] = partial(
+        LoopClosure, "point_on_plane", Anchor("leg_3"), Anchor("arm_3"), (1.0, 0.0)
+    )
+    for length in (0.0, -1.0, np.nan):
+        calls[f"distance of length {length:g}"] = partial(
+            LoopClosure, "distance", Anchor("leg_3"), Anchor("arm_3"), length=length
+        )
+    return calls
 
 
-def test_a_length_must_be_positive_and_zero_is_a_point() -> None:
-    a, b = Anchor("leg_3"), Anchor("arm_3")
-    with pytest.raises(srm.InputError, match=r'of 0 has no direction\. Use type = "point"'):
-        LoopClosure("distance", a, b, length=0.0)
-    with pytest.raises(srm.InputError, match="-1 m is negative"):
-        LoopClosure("distance", a, b, length=-1.0)
-    with pytest.raises(srm.InputError, match="length must be 1 finite numbers"):
-        LoopClosure("distance", a, b, length=np.nan)
+def test_closures_are_refused_by_key_with_a_remedy() -> None:
+    check_refusals("closures", refusals())
 
 
 def test_a_length_that_is_not_given_is_the_distance_in_the_initial_configuration() -> None:
-    rng = np.random.default_rng(19)
-    model = tree(0)
-    loop = random_loop("distance", "two branches", rng)
-    bare = replace(loop, length=None)
+    here = scene(0, ("distance", "two branches"))
+    bare = replace(here.loop, length=None)
     with pytest.raises(srm.InputError, match=r"known only when it is part.*mechanism\.loops"):
         _ = bare.rows
-    q, _ = random_state(model, rng)
-    mechanism = srm.Mechanism(model, (bare,), q0=q)
+    mechanism = srm.Mechanism(here.model, (bare,), q0=here.q)
     (resolved,) = mechanism.loops
-    expected = np.linalg.norm(relative_placement(model, q, loop)[1])
+    expected = np.linalg.norm(here.relative(here.q)[1])
     assert resolved.length == pytest.approx(expected, rel=1e-14)
-    other, v = random_state(model, rng)
-    assert mechanism.with_state(other, v).loops == (resolved,)  # the guess, not a later start
-    closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
+    other = random_state(here.model, here.rng)
+    assert mechanism.with_state(*other).loops == (resolved,)  # the guess, not a later start
+    closed = here.closed_at(pin.SE3.Identity()).loop
     with pytest.raises(srm.InputError, match=r'coincide in the guess.*Use type = "point"'):
-        srm.Mechanism(model, (replace(closed, length=None),), q0=q)
+        srm.Mechanism(here.model, (replace(closed, length=None),), q0=here.q)
 
 
-@pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
+@needs_kernel
 @every_row
 def test_the_kernel_evaluates_every_type_like_the_reference(kind: str) -> None:
     """g, G and Gdot v enter E g and the acceleration, at open configurations."""
-    rng = np.random.default_rng(20)
-    model = tree(1)
-    loops = tuple(random_loop(kind, place, rng) for place in PLACES)
+    here = scene(1, *((kind, place) for place in PLACES))
+    model, loops, rng = here.model, here.loops, here.rng
     for chosen in (*((loop,) for loop in loops), loops[:2]):
         names = tuple(name for loop in chosen for name in loop.row_names)
-        units = Units(1.3, np.ones(model.nv), 1.0)
-        scale = rng.uniform(0.5, 2.0, len(names))
         structure = Structure(  # the analysis is not what is tested here
             row_names=names,
-            row_scale=scale,
+            row_scale=rng.uniform(0.5, 2.0, len(names)),
             kept=np.ones(len(names), dtype=bool),
             rank=len(names),
             loop_rank=len(names),
             sigma_ref=0.7,
-            units=units,
+            units=Units(1.3, np.ones(model.nv), 1.0),
             samples=1,
             notes=(),
         )
@@ -721,17 +637,12 @@ def test_the_kernel_evaluates_every_type_like_the_reference(kind: str) -> None:
                 assert found["sigma"] == pytest.approx(terms.sigma, rel=1e-10)
 
 
-@pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
+@needs_kernel
 def test_the_kernel_refuses_points_that_coincide_as_well() -> None:
-    rng = np.random.default_rng(21)
-    model = tree(0)
-    q, v = random_state(model, rng)
-    loop = random_loop("distance", "two branches", rng)
-    closed = closed_by_anchor(model, q, loop, pin.SE3.Identity())
-    system = ClosedSystem(srm.Mechanism(model, (closed,)))
-    kernel_system = make_kernel_system(system)
+    here = scene(0, ("distance", "two branches")).closed_at(pin.SE3.Identity())
+    kernel_system = make_kernel_system(ClosedSystem(srm.Mechanism(here.model, here.loops)))
     with pytest.raises(ArithmeticError):
-        kernel_system.terms(0.0, np.concatenate([q, v]), -1.0)
+        kernel_system.terms(0.0, np.concatenate([here.q, here.v]), -1.0)
 
 
 def test_the_page_of_closures_lists_every_type_with_its_rows_and_keys() -> None:
@@ -741,10 +652,9 @@ def test_the_page_of_closures_lists_every_type_with_its_rows_and_keys() -> None:
         for name, rows, keys in re.findall(r"^\| `(\w+)` \| (\d) \|([^|]*)\|", page, re.MULTILINE)
     }
     expected = {}
-    rng = np.random.default_rng(22)
     for name, kind in CLOSURE_TYPES.items():
         keys = {*kind.needs, *kind.takes} - {"a", "b"}
-        count = random_loop(name, "two branches", rng).rows.count if name in TYPES else 1
+        count = scene(0, (name, "two branches")).loop.rows.count if name in TYPES else 1
         expected[name] = (count, keys)
     assert found == expected
     blocks = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)

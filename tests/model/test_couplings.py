@@ -19,17 +19,11 @@ from srm_mbs.dynamics.scaling import row_angles, row_dimensions, row_units
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.visualization.animation.shapes import visuals_of
+from tests.support.backends import needs_kernel, on_both
+from tests.support.mechanisms import random_state
+from tests.support.snapshots import check_messages, refused
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
-
-BACKENDS = [
-    "python",
-    pytest.param(
-        "kernel",
-        marks=pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}"),
-    ),
-]
-on_both = pytest.mark.parametrize("backend", BACKENDS)
 
 WHEEL = (
     '<link name="{name}"><inertial><origin xyz="{com}"/><mass value="{mass}"/>'
@@ -201,8 +195,7 @@ def test_rows_have_constant_entries_at_the_coordinates_of_their_joints(seed: int
     for keep in ([True, True], [False, True], [True, False], [False, False]):
         rows = LoopKinematics(model, loops, scale, np.array(keep))
         data = model.createData()
-        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-        v = rng.uniform(-1.0, 1.0, model.nv)
+        q, v = random_state(model, rng)
 
         def at(q: Any, v: Any = v, rows: Any = rows, data: Any = data) -> Any:
             pin.crba(model, data, q, pin.Convention.WORLD)
@@ -240,66 +233,46 @@ def test_a_continuous_joint_counts_its_turns_only_where_it_is_coupled(tmp_path: 
         assert model.velocityLimit[joint.idx_v] == velocity
 
 
-def test_joints_without_turns_are_refused_in_a_model_in_hand() -> None:
-    model, names = joints_of_many_kinds(0)
-    unbounded = next(
-        model.names[k] for k in range(1, model.njoints) if model.joints[k].shortname().count("RUB")
-    )
-    ball = next(
-        model.names[k]
-        for k in range(1, model.njoints)
-        if "Spherical" in model.joints[k].shortname()
-    )
-    for name, words in (
-        (unbounded, r"stored as \(cos, sin\).*Build it as a revolute joint without limits"),
-        (ball, "has 3 degrees of freedom. Couple joints with one"),
-        ("nobody", "no moving joint 'nobody'. Known: joint_0"),
-    ):
-        loop = srm.LoopClosure("coupling", joints=(names[0], name), ratio=1.0, name="gear")
-        with pytest.raises(srm.InputError, match=f"loop 'gear': .*{words}"):
-            srm.Mechanism(model, (loop,))
-
-
-WRONG: dict[str, tuple[str, str]] = {
-    "no joints": ("ratio = 1.0", "needs joints"),
-    "one joint for a ratio": ('joints = ["a_joint"]\nratio = 1.0', "relates two joints, not 1"),
-    "neither": ('joints = ["a_joint", "b_joint"]', "needs a ratio or coefficients"),
-    "both": (
-        'joints = ["a_joint", "b_joint"]\nratio = 1.0\ncoefficients = [1.0, 2.0]',
-        "either a ratio or coefficients",
+BOTH = 'joints = ["a_joint", "b_joint"]\n'
+WRONG = {
+    "no joints": "ratio = 1.0",
+    "one joint for a ratio": 'joints = ["a_joint"]\nratio = 1.0',
+    "neither": BOTH,
+    "both": f"{BOTH}ratio = 1.0\ncoefficients = [1.0, 2.0]",
+    "too few": f"{BOTH}coefficients = [1.0]",
+    "a zero": f"{BOTH}ratio = 0.0",
+    "twice": 'joints = ["a_joint", "a_joint"]\nratio = 1.0',
+    "none": "joints = []\ncoefficients = []",
+    "unknown": 'joints = ["a_joint", "c"]\nratio = 1.0',
+    "locked": f"{BOTH}ratio = 1.0",
+    "anchors": f'{BOTH}ratio = 1.0\na = {{ link = "a" }}',
+    "not finite": f"{BOTH}ratio = nan",
+    "held positions that contradict it": (
+        f"{BOTH}ratio = 2.0\n[initial]\nq = {{ a_joint = 1.0, b_joint = 1.0 }}"
     ),
-    "too few": ('joints = ["a_joint", "b_joint"]\ncoefficients = [1.0]', "2 finite numbers"),
-    "a zero": ('joints = ["a_joint", "b_joint"]\nratio = 0.0', "is zero. Remove that joint"),
-    "twice": ('joints = ["a_joint", "a_joint"]\nratio = 1.0', "is named twice"),
-    "none": ("joints = []\ncoefficients = []", "not a list of names"),
-    "unknown": ('joints = ["a_joint", "c"]\nratio = 1.0', "no moving joint 'c'. Known: a_joint, b"),
-    "locked": ('joints = ["a_joint", "b_joint"]\nratio = 1.0\nX', "joint 'b_joint' is locked"),
-    "anchors": (
-        'joints = ["a_joint", "b_joint"]\nratio = 1.0\na = { link = "a" }',
-        "a coupling closure takes no a. Remove",
+    "held rates that contradict it": (
+        f"{BOTH}ratio = 2.0\n[initial]\nv = {{ a_joint = 1.0, b_joint = 1.0 }}"
     ),
-    "not finite": ('joints = ["a_joint", "b_joint"]\nratio = nan', "finite number"),
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_coupling_is_refused_by_name(case: str, tmp_path: Path) -> None:
-    keys, words = WRONG[case]
-    lock = 'lock = ["b_joint"]\n' if keys.endswith("X") else ""
-    text = f'{lock}[[loop]]\nname = "gear"\ntype = "coupling"\n{keys.removesuffix("X")}\n'
-    with pytest.raises(srm.InputError, match=rf"wheels\.toml: loop(\[0\]| 'gear').*{words}"):
-        load(tmp_path, GEARS, text)
-
-
-def test_held_values_that_contradict_a_coupling_are_named(tmp_path: Path) -> None:
-    start = "[initial]\nq = { a_joint = 1.0, b_joint = 1.0 }\n"
-    with pytest.raises(
-        srm.AssemblyError, match=r"'a_joint', 'b_joint'; remaining gaps: gear: 1 rad"
-    ):
-        load(tmp_path, GEARS, f"{GEAR}ratio = 2.0\n{start}")
-    rates = "[initial]\nv = { a_joint = 1.0, b_joint = 1.0 }\n"
-    with pytest.raises(srm.AssemblyError, match="a_joint"):
-        load(tmp_path, GEARS, f"{GEAR}ratio = 2.0\n{rates}")
+def test_a_wrong_coupling_is_refused_by_name(tmp_path: Path) -> None:
+    messages = {}
+    for case, keys in WRONG.items():
+        lock = 'lock = ["b_joint"]\n' if case == "locked" else ""
+        text = f'{lock}[[loop]]\nname = "gear"\ntype = "coupling"\n{keys}\n'
+        messages[case] = refused(partial(load, tmp_path, GEARS, text), tmp_path)
+    model, names = joints_of_many_kinds(0)
+    kinds = {joint.shortname(): name for joint, name in zip(model.joints, model.names)}
+    others = {
+        "a joint without turns": kinds["JointModelRUBY"],
+        "a ball": kinds["JointModelSpherical"],
+        "no joint": "nobody",
+    }
+    for case, name in others.items():
+        loop = srm.LoopClosure("coupling", joints=(names[0], name), ratio=1.0, name="gear")
+        messages[f"in a model: {case}"] = refused(partial(srm.Mechanism, model, [loop]))
+    check_messages("couplings", messages)
 
 
 def test_a_saved_run_with_couplings_is_the_same(tmp_path: Path) -> None:
@@ -339,7 +312,7 @@ def test_a_mechanism_with_couplings_is_drawn_and_described(tmp_path: Path) -> No
     assert row[3] == "+1 a_joint +2.5 b_joint = 0.25"
 
 
-@pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+@needs_kernel
 @pytest.mark.parametrize("algebra", ["dense", "sparse"])
 def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None:
     """Beside a closure between anchors, whose rows come before and after."""
@@ -361,8 +334,7 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
     )
     rng = np.random.default_rng(3)
     for _ in range(5):
-        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
-        x = np.concatenate([q, rng.uniform(-1.0, 1.0, model.nv)])
+        x = np.concatenate(random_state(model, rng))
         terms = system.evaluate(0.0, x)
         found = kernel_system.terms(0.0, x, -1.0)
         for what in ("rate", "correction", "multiplier", "sigma", "constraint_residual"):

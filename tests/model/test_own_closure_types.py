@@ -11,6 +11,8 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.analysis.summary import loop_rows
 from srm_mbs.model.closures import ClosureType, ClosureValues, RowSet
+from tests.support.backends import needs_kernel
+from tests.support.mechanisms import add_link
 
 
 def _rows(values: ClosureValues) -> RowSet:
@@ -23,10 +25,8 @@ MASS, WORLD = srm.Anchor("mass"), srm.Anchor("world")
 
 def pendulum() -> srm.Mechanism:
     model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelTranslation(), pin.SE3.Identity(), "slide")
     inertia = pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3)))
-    model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
-    model.addBodyFrame("mass", joint, pin.SE3.Identity(), 0)
+    add_link(model, 0, pin.JointModelTranslation(), "mass", inertia)
     closure = srm.LoopClosure(CIRCLE, MASS, WORLD, axis=(0.0, 2.0, 0.0), length=0.5)
     return srm.Mechanism(model, loops=[closure], q0=[0.5, 0.0, 0.0])
 
@@ -47,9 +47,8 @@ def test_a_key_that_a_closure_type_of_ones_own_needs_is_asked_for() -> None:
         srm.LoopClosure(CIRCLE, MASS, WORLD, axis=(0.0, 1.0, 0.0), length=1.0, ratio=2.0)
 
 
+@needs_kernel
 def test_both_backends_run_a_closure_type_of_ones_own() -> None:
-    if srm.backend() == "python":
-        pytest.skip("the compiled kernel is not there, or not wanted")
     ends = [srm.simulate(pendulum(), 1.0, backend=name).q[-1] for name in ("kernel", "python")]
     assert ends[0] == pytest.approx(ends[1], abs=1e-10)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
-from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
+from tests.support.snapshots import check_refusals
 
 
 def placement(rng: np.random.Generator) -> pin.SE3:
@@ -67,7 +68,7 @@ def of_pinocchio(model: pin.Model, given: Any, q: Any) -> tuple[Any, np.ndarray]
 def test_rows_and_jacobians_are_those_of_pinocchio(kind: str, joints: tuple[int, int]) -> None:
     model = tree()
     given = constraint(kind, model, joints, 1)
-    (loop,) = closures_from_pinocchio(model, given)
+    (loop,) = srm.closures_from_pinocchio(model, given)
     rng = np.random.default_rng(2)
     for _ in range(3):
         q = pin.integrate(model, pin.neutral(model), rng.normal(size=model.nv))
@@ -137,23 +138,26 @@ def test_closures_without_a_model_are_named() -> None:
     assert found.without == ("pin",)
 
 
-def test_what_cannot_be_converted_is_refused() -> None:
+def test_constraints_without_a_closure_are_refused() -> None:
     model = tree()
-    limits = pin.JointLimitConstraintModel(model, [2])
-    with pytest.raises(srm.InputError, match=r"constraint_models\[0\].*JointLimitConstraintModel"):
-        srm.closures_from_pinocchio(model, [limits])
     shifted = constraint("point", model, (1, 2), 0)
     shifted.desired_constraint_offset = np.array([0.0, 0.0, 0.1])
-    with pytest.raises(srm.InputError, match="a desired offset"):
-        srm.closures_from_pinocchio(model, shifted)
+    desired = constraint("rigid6", model, (1, 2), 0)
+    desired.desired_contact_placement = placement(np.random.default_rng(0))
     bare = pin.Model()
     joint = bare.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "bare")
-    with pytest.raises(srm.InputError, match=r"joint 'bare' has no frame.*addBodyFrame"):
-        srm.closures_from_pinocchio(
+    given: dict[str, tuple[pin.Model, Any]] = {
+        "joint limits": (model, [pin.JointLimitConstraintModel(model, [2])]),
+        "a desired offset": (model, shifted),
+        "a desired placement": (model, desired),
+        "a joint without frame": (
             bare, pin.PointAnchorConstraintModel(bare, joint, pin.SE3.Identity())
-        )
-    with pytest.raises(srm.InputError, match="no closure for a float"):
-        srm.closures_from_pinocchio(model, [3.0])
+        ),
+        "a joint of a larger model": (pin.Model(), constraint("point", model, (1, 2), 0)),
+        "a number": (model, [3.0]),
+    }  # fmt: skip
+    calls = {case: partial(srm.closures_from_pinocchio, *pair) for case, pair in given.items()}
+    check_refusals("pinocchio_constraints", calls)
 
 
 def test_equal_names_are_told_apart() -> None:

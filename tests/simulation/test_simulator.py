@@ -14,6 +14,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.integration.kernel import backend as kernel
 from tests.support.mechanisms import floating_ring
+from tests.support.snapshots import check_messages, refused
 
 BACKENDS = ("python", *(["kernel"] if kernel.core is not None else []))
 needs_kernel = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
@@ -120,15 +121,13 @@ def test_a_clone_knows_the_force_that_acted_before(
     assert np.array_equal(clone.v, simulator.v)
 
 
-def test_copies_are_clones_and_pickles_are_refused(slider_crank: srm.Mechanism) -> None:
+def test_copies_are_clones(slider_crank: srm.Mechanism) -> None:
     simulator = srm.Simulator(slider_crank)
     simulator.step(0.1)
     for other in (copy.copy(simulator), copy.deepcopy(simulator)):
         other.step(0.1)
         assert simulator.t == 0.1
         assert other.t == 0.2
-    with pytest.raises(srm.InputError, match="another process"):
-        pickle.dumps(simulator)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -147,9 +146,6 @@ def test_steps_within_rounding_move_the_time_and_spoil_nothing(
         each.step(0.5)
     assert simulator.t == pytest.approx(1.5, abs=1e-15)
     assert np.abs(simulator.q - plain.q).max() < 1e-9
-    simulator.reset(t=1e15)
-    with pytest.raises(srm.InputError, match="below the rounding"):
-        simulator.step(0.01)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -162,6 +158,16 @@ def test_times_are_of_double_precision_whatever_the_type_of_a_step(
     for _ in range(10):
         simulator.step(dt)
     assert simulator.t == pytest.approx(1000.0 + 10 * float(dt), abs=1e-11)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_states_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
+    simulator = srm.Simulator(slider_crank, backend=backend)
+    q, v = simulator.step(0.1)
+    before = q.copy(), v.copy()
+    for array in (q, v, simulator.q, simulator.v):
+        array[:] = np.nan
+    np.testing.assert_array_equal((simulator.q, simulator.v), before)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -194,18 +200,11 @@ def test_a_reset_repeats_the_run_to_the_last_bit(slider_crank: srm.Mechanism, ba
     assert np.abs(simulator.q - run.q[-1]).max() < 1e-6
 
 
-def test_states_off_the_closures_are_refused_or_projected(slider_crank: srm.Mechanism) -> None:
+def test_states_off_the_closures_can_be_projected(slider_crank: srm.Mechanism) -> None:
     simulator = srm.Simulator(slider_crank)
     simulator.step(0.3)
     q, v = simulator.q, simulator.v
     off = np.array([0.0, 0.01])
-    with pytest.raises(srm.InputError, match="violates the closures"):
-        simulator.set_state(q + off)
-    with pytest.raises(srm.InputError, match="violates the closures"):
-        simulator.set_state(v=v + off)
-    with pytest.raises(srm.InputError, match="does not consist of"):
-        simulator.reset(q[:1])
-    assert np.array_equal(simulator.q, q)
     simulator.set_state(q + off, v + 20.0 * off[::-1], project=True)
     assert simulator.t == 0.3
     moved, rate = simulator.q, simulator.v
@@ -232,33 +231,32 @@ def test_a_failed_step_raises_and_leaves_the_last_good_state(
     simulator.step(0.2)
 
 
-@pytest.mark.parametrize(
-    ("dt", "tau", "message"),
-    [
-        (0.0, None, "dt = 0.0"),
-        (np.nan, None, "dt = nan"),
-        ("soon", None, "dt = 'soon'"),
-        (None, None, "dt = None"),
-        (0.1, [1.0], "tau ="),
-        (0.1, [np.nan, 0.0], "tau ="),
-        (0.1, "x", "tau ="),
-    ],
-)
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_bad_steps_are_refused(
-    slider_crank: srm.Mechanism, dt: float, tau: Any, message: str, backend: str
-) -> None:
+def test_bad_steps_and_times_are_refused(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator = srm.Simulator(slider_crank, backend=backend)
     simulator.step(0.1)
-    with pytest.raises(srm.InputError, match=message):
-        simulator.step(dt, tau)
-    assert simulator.t == 0.1
-    simulator.reset()
-    with pytest.raises(srm.InputError, match=message):
-        simulator.step(dt, tau)
+    messages = {}
+    for start in ("on the way", "at the start"):
+        t = simulator.t
+        for dt in (0.0, np.nan, "soon", None):
+            messages[f"dt = {dt} {start}"] = refused(lambda: simulator.step(dt))  # noqa: B023
+        for tau in ([1.0], [np.nan, 0.0], "x"):
+            refusal = refused(lambda: simulator.step(0.1, tau))  # noqa: B023
+            messages[f"tau = {tau} {start}"] = refusal
+        assert simulator.t == t
+        simulator.reset()
     for t in (np.nan, "now"):
-        with pytest.raises(srm.InputError, match="t = "):
-            simulator.reset(t=t)
+        messages[f"t = {t}"] = refused(lambda: simulator.reset(t=t))  # noqa: B023
+    simulator.reset(t=1e15)
+    messages["dt below rounding"] = refused(lambda: simulator.step(0.01))
+    messages["pickle"] = refused(lambda: pickle.dumps(simulator))
+    q, v = slider_crank.q0, slider_crank.v0
+    off = np.array([0.0, 0.01])
+    messages["q off the closures"] = refused(lambda: simulator.set_state(q + off))
+    messages["v off the closures"] = refused(lambda: simulator.set_state(v=v + off))
+    messages["q too short"] = refused(lambda: simulator.reset(q[:1]))
+    assert np.array_equal(simulator.q, q)
+    check_messages("simulator", messages)
 
 
 def test_other_methods_run_on_the_reference(slider_crank: srm.Mechanism) -> None:

@@ -11,14 +11,33 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS_PER_PATH, SECONDS_TO_START = 2.0, 60.0
+BATCH = 125
+"""Largest number of paths in one process."""
 
 
 def load_isolated(paths: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Outcome (``load_batch.outcome``) by path; ``died`` for those that take the process along.
+    """Outcome (``load_batch.outcome``) by path; ``died`` for those that take the process along."""
+    results: dict[str, dict[str, Any]] = {}
+    for start in range(0, len(paths), BATCH):
+        results |= _load_batch(paths[start : start + BATCH])
+    return results
 
-    A batch whose process dies, hangs or writes anything to standard error is halved until single
-    paths are left.
-    """
+
+def fault_of(got: dict[str, Any]) -> str | None:
+    """What is wrong with an outcome whatever the input: a crash, or a message that is not ours."""
+    if got["is"] == "loaded":
+        return None
+    message = str(got["message"])
+    if got["is"] != "refused":
+        return message
+    if "Traceback" in message or "pydantic" in message.lower():
+        return f"not in our words: {message}"
+    return None if got["file"] else f"the message names no file: {message}"
+
+
+def _load_batch(paths: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The outcomes of one process; a batch whose process dies, hangs or writes anything to standard
+    error is halved until single paths are left."""
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.stress.load_batch"],
         cwd=ROOT,
@@ -44,7 +63,7 @@ def load_isolated(paths: Sequence[str]) -> dict[str, dict[str, Any]]:
         end = "it hangs" if hung else f"exit status {process.returncode}"
         return {paths[0]: {"is": "died", "message": f"{end}; standard error: {err[-2000:]!r}"}}
     half = len(paths) // 2
-    halves = {**load_isolated(paths[:half]), **load_isolated(paths[half:])}
+    halves = {**_load_batch(paths[:half]), **_load_batch(paths[half:])}
     if not any(result["is"] == "died" for result in halves.values()):
         halves[paths[-1]] = {"is": "died", "message": f"only the whole batch does: {err[-2000:]!r}"}
     return halves

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
 
 TREE, LOOPS, START, DEFAULTS, NAMES = "tree", "loops", "start", "defaults", "names"
 """Parts of a fingerprint (``load_batch.fingerprint``)."""
@@ -28,21 +34,18 @@ class Expectation:
     noted: bool = False
 
 
-def must_be_refused() -> Expectation:
-    return Expectation(loads=False, refused=True)
+REFUSED = Expectation(loads=False, refused=True)
+REFUSED_OR_NOTED = Expectation(loads=True, refused=True, noted=True)
 
 
-def must_load_unchanged(*but: str) -> Expectation:
+def unchanged(*but: str) -> Expectation:
+    """The same mechanism but for these parts."""
     return Expectation(loads=True, refused=False, changes=frozenset(but))
 
 
 def legal(*changes: str) -> Expectation:
     """Another legal mechanism, or one that cannot be built or assembled."""
     return Expectation(loads=True, refused=True, changes=frozenset(changes))
-
-
-def refused_or_noted() -> Expectation:
-    return Expectation(loads=True, refused=True, noted=True)
 
 
 @dataclass(frozen=True)
@@ -67,13 +70,32 @@ class Mutation:
         The mutated input.
     expectation
         What may become of it.
-    twin
-        Input that says the same in so many words (a default written out): the outcome, refused or
-        loaded, must be that of ``kernel_system``.
+    written_out
+        The same input with a default written out: the outcome, refused or loaded, must be the same.
     """
 
     model: str
     change: str
     files: Files
     expectation: Expectation
-    kernel_system: Files | None = None
+    written_out: Files | None = None
+
+
+GARBAGE = ("", "x", "1 2", "1,5", "nan", "inf", "1e999", "0x10", "1_0", "--1", "1 2 3 4")
+"""Texts in place of one number."""
+
+
+def misspelt(word: str, rng: np.random.Generator) -> str:
+    """``word`` with a letter lost, doubled, or in capitals."""
+    at = int(rng.integers(len(word)))
+    return [
+        word[:at] + word[at + 1 :] or "x",
+        word[:at] + word[at] + word[at:],
+        word.capitalize() if word != word.capitalize() else word.upper(),
+        word + "_2",
+    ][int(rng.integers(4))]
+
+
+def one_of(items: Sequence[T], rng: np.random.Generator) -> T:
+    """A random item."""
+    return items[int(rng.integers(len(items)))]

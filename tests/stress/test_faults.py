@@ -16,12 +16,14 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
+from tests.stress.patience import Patience
 from tests.support.mechanisms import along_x, rod
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(60)]
 
 MOST_STEPS = 10_000
-"""Ten times what the runs below need; one that takes more is crawling."""
+"""Ten times what the runs below need; one that takes more crawls and is interrupted, so that its
+status is not ``failed``."""
 
 Controller = Callable[[float, FloatArray, FloatArray], Any]
 PLANE = np.array([0.0, -1.0, 0.0])
@@ -41,18 +43,6 @@ def check_partial(solution: srm.Solution, *needles: str) -> None:
     assert gap(solution) <= 1e-9
     q, _ = solution(0.5 * solution.t[-1])
     assert np.isfinite(q).all()
-
-
-class Patience:
-    """Interrupts a run that crawls, so that its status is not ``failed``."""
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-    def __call__(self, t: float, h: float, state: FloatArray) -> None:
-        self.steps += 1
-        if self.steps >= MOST_STEPS:
-            raise KeyboardInterrupt
 
 
 def gap(solution: srm.Solution) -> float:
@@ -157,13 +147,12 @@ def test_a_torque_of_noise_ends_the_run_instead_of_crawling(
         four_bar,
         2.0,
         controller=lambda t, q, v: size * rng.standard_normal(3),
-        progress=Patience(),
+        progress=Patience(MOST_STEPS),
     )
     check_partial(solution)
 
 
 # --- motions that are impossible ------------------------------------------------------------------
-# Drives do not exist yet: a torque and a closure take their place.
 
 
 def test_a_torque_cannot_push_a_double_rocker_beyond_its_reach() -> None:
@@ -277,7 +266,9 @@ def test_tolerances_at_their_floor_end_in_finite_time(name: str, tableau: str) -
     t_end = 0.02 if tableau == "tvd32" else 2.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", srm.SrmWarning)  # rtol is raised to round-off
-        solution = srm.simulate(mechanism, t_end, tableau=tableau, rtol=1e-300, progress=Patience())
+        solution = srm.simulate(
+            mechanism, t_end, tableau=tableau, rtol=1e-300, progress=Patience(MOST_STEPS)
+        )
     assert gap(solution) <= 1e-9
     if not solution.success:
         check_partial(solution)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.formats.urdf.test_urdf_loops import BAR, HINGE, SLIDER
-from tests.stress.isolation import load_isolated
+from tests.stress.isolation import fault_of, load_isolated
 
 pytestmark = pytest.mark.stress
 
@@ -37,17 +38,15 @@ def tree(closing: str = "") -> str:
         HINGE.format(name="c", parent="ground", child="dial", xyz="0 1 0", more="MIMIC"),
         HINGE.format(name="d", parent="ground", child="disk", xyz="0 2 0", more=""),
     ]
-    return "".join(
-        [
-            '<robot name="loops">',
-            '<link name="ground"/>',
-            bars,
-            SLIDER,
-            *joints,
-            closing,
-            "</robot>",
-        ]
-    )
+    parts = [
+        '<robot name="loops"><link name="ground"/>',
+        bars,
+        SLIDER,
+        *joints,
+        closing,
+        "</robot>",
+    ]
+    return "".join(parts)
 
 
 DRAKE = """<drake:{0} {1} xmlns:drake="http://drake.mit.edu">
@@ -100,56 +99,46 @@ def below(root: Element, original: Element) -> list[tuple[Element, Element]]:
     return found
 
 
+Change = Callable[[Element, Element], object]
+"""Changes an element, given with its parent."""
+
+
+def changes(parent: Element, node: Element) -> Iterator[tuple[str, bool, Change]]:
+    """What is done to ``node``, and whether it must be refused."""
+    yield "deleted", False, lambda parent, node: parent.remove(node)
+    # Two springs without a name are two springs.
+    twice = not node.tag.endswith("}linear_spring_damper")
+    yield "twice", twice, lambda parent, node: parent.append(copy.deepcopy(node))
+    # Elements of <gazebo> other than joints are ignored with a note.
+    acts = parent.tag != "gazebo"
+    yield "misspelt", acts, lambda _, node: setattr(node, "tag", node.tag + "_x")
+    acts = node.tag != "gazebo"
+    yield "with more", acts, lambda _, node: ElementTree.SubElement(node, "more")
+    for key in node.attrib:
+        yield f"without {key}", False, lambda _, node, key=key: node.attrib.pop(key)
+
+        def rename(_: Element, node: Element, key: str = key) -> None:
+            node.set(key + "x", node.attrib.pop(key))
+
+        yield f"{key} misspelt", True, rename
+        for text in GARBAGE if key != "name" or "body" in node.tag else ():
+            yield f"{key}={text!r}", True, lambda _, node, new=(key, text): node.set(*new)
+    for text in GARBAGE if (node.text or "").strip() else ():
+        yield f"text {text!r}", True, lambda _, node, text=text: setattr(node, "text", text)
+
+
 def mutations(element: str) -> list[tuple[str, bool, str]]:
     """(what was done, whether it must be refused, text) of every mutation of one element."""
     text = robot(element)
     original = ElementTree.fromstring(robot(""))
-    count = len(below(ElementTree.fromstring(text), original))
-    out: list[tuple[str, bool, str]] = []
-
-    def change(index: int, what: str, refused: bool, do: Any) -> None:
-        root = ElementTree.fromstring(text)
-        parent, node = below(root, original)[index]
-        do(parent, node)
-        tag = node.tag.rsplit("}", 1)[-1]
-        out.append((f"<{tag}> {what}", refused, ElementTree.tostring(root, encoding="unicode")))
-
-    for i in range(count):
-        parent, node = below(ElementTree.fromstring(text), original)[i]
-        change(i, "deleted", False, lambda parent, node: parent.remove(node))
-        # Two springs without a name are two springs.
-        change(
-            i,
-            "twice",
-            not node.tag.endswith("}linear_spring_damper"),
-            lambda parent, node: parent.append(copy.deepcopy(node)),
-        )
-        # What stands in <gazebo> besides joints is ignored with a note.
-        told = node.tag != "gazebo"
-        change(
-            i,
-            "misspelt",
-            parent.tag != "gazebo",
-            lambda _, node: setattr(node, "tag", node.tag + "_x"),
-        )
-        change(i, "with more", told, lambda _, node: ElementTree.SubElement(node, "more"))
-        for key in node.attrib:
-            change(i, f"without {key}", False, lambda _, node, key=key: node.attrib.pop(key))
-            change(
-                i, f"{key} misspelt", True,
-                lambda _, node, key=key: node.set(key + "x", node.attrib.pop(key)),
-            )  # fmt: skip
-            for garbage in GARBAGE if key != "name" or "body" in node.tag else ():
-                change(
-                    i, f"{key}={garbage!r}", True,
-                    lambda _, node, key=key, garbage=garbage: node.set(key, garbage),
-                )  # fmt: skip
-        if (node.text or "").strip():
-            for garbage in GARBAGE:
-                change(
-                    i, f"with the text {garbage!r}", True,
-                    lambda _, node, garbage=garbage: setattr(node, "text", garbage),
-                )  # fmt: skip
+    out = []
+    for i, (above, here) in enumerate(below(ElementTree.fromstring(text), original)):
+        for what, refused, change in changes(above, here):
+            root = ElementTree.fromstring(text)
+            parent, node = below(root, original)[i]
+            tag = node.tag.rsplit("}", 1)[-1]
+            change(parent, node)
+            out.append((f"<{tag}> {what}", refused, ElementTree.tostring(root, encoding="unicode")))
     return out
 
 
@@ -182,12 +171,9 @@ def yaml_mutations() -> list[tuple[str, bool, str]]:
 
 def wrong(original: dict[str, Any], got: dict[str, Any], refused: bool) -> str | None:
     """What is wrong with an outcome."""
-    if got["is"] == "refused":
-        message = got["message"]
-        ours = "Traceback" not in message and "pydantic" not in message.lower() and got["file"]
-        return None if ours else f"not in our words: {message}"
-    if got["is"] != "loaded":
-        return str(got["message"])
+    fault = fault_of(got)
+    if fault is not None or got["is"] == "refused":
+        return fault
     if refused:
         return "loaded"
     same = all(got[part] == original[part] for part in ("tree", "loops", "names"))

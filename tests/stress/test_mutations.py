@@ -14,7 +14,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.formats.load import models_folder
-from tests.stress.isolation import ROOT, load_isolated
+from tests.stress.isolation import ROOT, fault_of, load_isolated
 from tests.stress.mutation import DEFAULTS, LOOPS, NAMES, START, TREE, Files, Mutation
 from tests.stress.toml_mutations import TomlMutator
 from tests.stress.urdf_mutations import UrdfMutator
@@ -22,7 +22,6 @@ from tests.stress.urdf_mutations import UrdfMutator
 pytestmark = pytest.mark.stress
 
 COUNT = 1000
-BATCH = 125
 ON_THE_COMMAND_LINE = 50
 PARTS = (TREE, LOOPS, START, DEFAULTS, NAMES)
 
@@ -67,12 +66,9 @@ def write(folder: Path, files: Files) -> str:
 
 def same(ours: Any, theirs: Any, tolerance: float = 1e-10) -> bool:
     """Equal, numbers up to rounding."""
-    if isinstance(ours, list):
-        return (
-            isinstance(theirs, list)
-            and len(ours) == len(theirs)
-            and all(same(a, b, tolerance) for a, b in zip(ours, theirs))
-        )
+    if isinstance(ours, list) and isinstance(theirs, list):
+        alike = (same(a, b, tolerance) for a, b in zip(ours, theirs))
+        return len(ours) == len(theirs) and all(alike)
     if isinstance(ours, float) and isinstance(theirs, float):
         return bool(np.isclose(ours, theirs, rtol=tolerance, atol=tolerance))
     return bool(ours == theirs)
@@ -86,24 +82,19 @@ def complaint(
     mutation: Mutation,
     got: dict[str, Any],
     original: dict[str, Any],
-    kernel_system: dict[str, Any] | None,
+    written_out: dict[str, Any] | None,
 ) -> str | None:
     """What is wrong with an outcome; None if it is as expected."""
     expected = mutation.expectation
-    if got["is"] not in ("loaded", "refused"):
-        return str(got["message"])
-    if got["is"] == "refused":
-        if not expected.refused:
-            return f"refused: {got['message']}"
-        if "Traceback" in got["message"] or "pydantic" in got["message"].lower():
-            return f"not in our words: {got['message']}"
-        return None if got["file"] else f"the message names no file: {got['message']}"
+    fault = fault_of(got)
+    if fault is not None or got["is"] == "refused":
+        return fault or (None if expected.refused else f"refused: {got['message']}")
     if not expected.loads:
         return f"loaded; differs in {differences(got, original) or 'nothing'}"
-    if kernel_system is not None:
-        if kernel_system["is"] != "loaded":
-            return f"loaded, but with the default written out it is {kernel_system}"
-        if differs := differences(got, kernel_system):
+    if written_out is not None:
+        if written_out["is"] != "loaded":
+            return f"loaded, but with the default written out it is {written_out}"
+        if differs := differences(got, written_out):
             return f"differs in {differs} from the same with the default written out"
     if expected.noted and got["remarks"] > original["remarks"]:
         return None
@@ -134,28 +125,20 @@ def outcomes(
     """Every mutation with its outcome and what is wrong with it."""
     folder = tmp_path_factory.mktemp("unmutated")
     originals = {name: write(folder / name, files) for name, files in bundled_files().items()}
-    twins = {
-        path: write(folder / str(i), mutation.kernel_system)
+    written_out = {
+        path: write(folder / str(i), mutation.written_out)
         for i, (mutation, path) in enumerate(written)
-        if mutation.kernel_system is not None
+        if mutation.written_out is not None
     }
-    everything = [*originals.values(), *(path for _, path in written), *twins.values()]
-    results: dict[str, dict[str, Any]] = {}
-    for start in range(0, len(everything), BATCH):
-        results.update(load_isolated(everything[start : start + BATCH]))
-    return [
-        (
-            mutation,
-            results[path],
-            complaint(
-                mutation,
-                results[path],
-                results[originals[mutation.model]],
-                results.get(twins.get(path, "")),
-            ),
-        )
-        for mutation, path in written
-    ]
+    results = load_isolated(
+        [*originals.values(), *(path for _, path in written), *written_out.values()]
+    )
+    out = []
+    for mutation, path in written:
+        original, same_again = results[originals[mutation.model]], written_out.get(path, "")
+        why = complaint(mutation, results[path], original, results.get(same_again))
+        out.append((mutation, results[path], why))
+    return out
 
 
 @pytest.mark.timeout(600)

@@ -9,9 +9,9 @@ from hypothesis import event, given, settings
 from scipy.integrate import trapezoid
 
 import srm_mbs as srm
-from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, closure_errors
 from srm_mbs.dynamics.scaling import row_units
+from tests.stress.patience import Patience
 from tests.stress.random_mechanisms import Spec, build, specs
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(900)]
@@ -26,18 +26,6 @@ MANY_TURNS = 100.0
 grows with their number."""
 
 deterministic = settings(derandomize=True, database=None, deadline=None, print_blob=True)
-
-
-class Patience:
-    """Interrupts a run after ``MOST_STEPS`` steps, as Ctrl-C does."""
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-    def __call__(self, t: float, h: float, state: FloatArray) -> None:
-        self.steps += 1
-        if self.steps >= MOST_STEPS:
-            raise KeyboardInterrupt
 
 
 def rank_at_start(mechanism: srm.Mechanism) -> int:
@@ -69,7 +57,7 @@ def check(spec: Spec) -> None:
     mechanism = assembled(spec)
     model, units = mechanism.model, mechanism.structure.units
     assert mechanism.degrees_of_freedom == model.nv - rank_at_start(mechanism) >= 1
-    solution = srm.simulate(mechanism, T_END, rtol=RTOL, progress=Patience())
+    solution = srm.simulate(mechanism, T_END, rtol=RTOL, progress=Patience(MOST_STEPS))
     event(f"{solution.status}, {len(solution.crossings)} passages")
     assert solution.status in ("finished", "interrupted"), solution.message
 

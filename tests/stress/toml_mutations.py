@@ -13,16 +13,17 @@ from tests.stress.mutation import (
     DEFAULTS,
     LOOPS,
     NAMES,
+    REFUSED,
     START,
     TREE,
     Expectation,
     Files,
     Mutation,
     legal,
-    must_be_refused,
-    must_load_unchanged,
+    misspelt,
+    one_of,
+    unchanged,
 )
-from tests.stress.urdf_mutations import misspelt
 
 Path = tuple[str | int, ...]
 ANYTHING = (TREE, LOOPS, START, NAMES, DEFAULTS)
@@ -96,44 +97,43 @@ class TomlMutator:
     def draw(self, rng: np.random.Generator) -> Mutation | None:
         """A random mutation; None if the drawn operation does not apply at the drawn key."""
         document = copy.deepcopy(self.document)
-        everything = paths(document)
-        path = everything[int(rng.integers(len(everything)))]
-        operation = [self.delete, self.duplicate, self.rename, self.retype][int(rng.integers(4))]
+        path = one_of(paths(document), rng)
+        operation = one_of([self.delete, self.duplicate, self.rename, self.retype], rng)
         outcome = operation(document, path, rng)
         if outcome is None:
             return None
-        change, expectation, text, kernel_system = outcome
+        change, expectation, text, written_out = outcome
         files = Files(text or document_text(document), self.files.urdf)
         return Mutation(
             self.model,
             f"toml: {'.'.join(map(str, path))} {change}",
             files,
             expectation,
-            None if kernel_system is None else Files(document_text(kernel_system), self.files.urdf),
+            None if written_out is None else Files(document_text(written_out), self.files.urdf),
         )
 
     Outcome = tuple[str, Expectation, str | None, dict[str, Any] | None] | None
 
     def delete(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:
         key = path[-1]
-        kernel_system = None
+        written_out = None
         if key in DEFAULT:
-            kernel_system = copy.deepcopy(document)
-            holder(kernel_system, path)[key] = DEFAULT[str(key)]
+            written_out = copy.deepcopy(document)
+            holder(written_out, path)[key] = DEFAULT[str(key)]
         del holder(document, path)[key]
-        return "deleted", self._without(path), None, kernel_system
+        return "deleted", self._without(path), None, written_out
 
     def _without(self, path: Path) -> Expectation:
         key = path[-1]
         if path[0] == "initial":
             return legal(START)
         if path[0] == "simulation":
-            return must_load_unchanged(DEFAULTS)
+            return unchanged(DEFAULTS)
         if key == "name":
-            return must_load_unchanged(NAMES)
+            return unchanged(NAMES)
         if key in DEFAULT or isinstance(key, int) or (path[0] == "force" and key == "damping"):
             return legal(*ANYTHING)
-        return must_be_refused()
+        return REFUSED
 
     def duplicate(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:
         """A [[loop]] or [[force]] twice has one name twice; any other key twice is no TOML."""
@@ -141,7 +141,7 @@ class TomlMutator:
         if isinstance(key, int):
             held.insert(key, copy.deepcopy(held[key]))
             if rng.random() < 0.5:
-                return "duplicated", must_be_refused(), None, None
+                return "duplicated", REFUSED, None, None
             held[key]["name"] = "another"
             changes = (TREE, START) if path[0] == "force" else (LOOPS, NAMES)
             return "duplicated under another name", legal(*changes), None, None
@@ -150,7 +150,7 @@ class TomlMutator:
         held["MARK"] = held[key]
         text = document_text(document).replace('"MARK"', json.dumps(key))
         text = text.replace("[MARK]", f"[{key}]")
-        return "twice", must_be_refused(), text, None
+        return "twice", REFUSED, text, None
 
     def rename(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:
         held, key = holder(document, path), path[-1]
@@ -172,12 +172,12 @@ class TomlMutator:
         if path[0] == "initial" and len(path) > 1 and new in ("q", "v", "guess", "crank"):
             return legal(START)
         if path[0] == "simulation" and len(path) > 1 and new in ("t_end", "rtol", "atol"):
-            return must_load_unchanged(DEFAULTS)
+            return unchanged(DEFAULTS)
         if (path[-1], new) == ("link", "frame"):
             return legal()
         if {path[-1], new} == {"xyz", "rpy"}:
             return legal(TREE if path[0] == "force" else LOOPS, START)
-        return must_be_refused()
+        return REFUSED
 
     def retype(self, document: Any, path: Path, rng: np.random.Generator) -> Outcome:
         held, key = holder(document, path), path[-1]
@@ -188,13 +188,10 @@ class TomlMutator:
                 return None
             held[key] = other
             return f"made {other!r}", self._sensibly_changed(path), None, None
-        choices = WRONG[type(old)]
-        new = choices[int(rng.integers(len(choices)))]
+        new = one_of(WRONG[type(old)], rng)
         held[key] = new
-        expectation = must_be_refused()
-        if key == "name" and isinstance(new, str):
-            expectation = must_load_unchanged(NAMES)
-        return f"made {new!r}", expectation, None, None
+        named = key == "name" and isinstance(new, str)
+        return f"made {new!r}", unchanged(NAMES) if named else REFUSED, None, None
 
     def _sensible(self, path: Path, old: Any, rng: np.random.Generator) -> Any:
         if path == ("format",):
@@ -217,7 +214,7 @@ class TomlMutator:
         if path[0] == "initial":
             return legal(START)
         if path[0] == "simulation":
-            return must_load_unchanged(DEFAULTS)
+            return unchanged(DEFAULTS)
         if path[0] == "loop":
             return legal(LOOPS, START)
         return legal(TREE, LOOPS, START, NAMES)

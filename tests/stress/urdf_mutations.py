@@ -10,17 +10,20 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from tests.stress.mutation import (
+    GARBAGE,
     LOOPS,
     NAMES,
+    REFUSED,
+    REFUSED_OR_NOTED,
     START,
     TREE,
     Expectation,
     Files,
     Mutation,
     legal,
-    must_be_refused,
-    must_load_unchanged,
-    refused_or_noted,
+    misspelt,
+    one_of,
+    unchanged,
 )
 
 DRAWN = ("visual", "collision", "material")
@@ -33,14 +36,13 @@ KNOWN_ATTRIBUTES = (
     *("name", "type", "xyz", "rpy", "value", "link", "ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
     *("lower", "upper", "effort", "velocity", "damping", "friction", "rising", "k_position"),
 )
-GARBAGE = ("", "x", "1 2", "1,5", "nan", "inf", "1e999", "0x10", "1_0", "--1", "1 2 3 4")
 NAMING = ("name", "link", "type")
 OPTIONAL = {"origin": {"xyz": "0 0 0", "rpy": "0 0 0"}, "axis": {"xyz": "1 0 0"}}
 """Optional elements of joints and inertials: what URDF says when they are missing."""
 MASSLESS = {"ixx": "0", "iyy": "0", "izz": "0", "ixy": "0", "ixz": "0", "iyz": "0"}
 MOVING = (TREE, LOOPS, START)
 Outcome = tuple[str, Expectation, str | None, str | None] | None
-"""Change, expectation, the mutated text if it is no XML, the twin's text if there is one."""
+"""Change, expectation, the mutated text if it is no XML, the text with a default written out."""
 
 
 @dataclass(frozen=True)
@@ -75,17 +77,6 @@ def places(root: Element) -> list[Place]:
     return found
 
 
-def misspelt(word: str, rng: np.random.Generator) -> str:
-    """``word`` with a letter lost, doubled, or in capitals."""
-    at = int(rng.integers(len(word)))
-    return [
-        word[:at] + word[at + 1 :] or "x",
-        word[:at] + word[at] + word[at:],
-        word.capitalize() if word != word.capitalize() else word.upper(),
-        word + "_2",
-    ][int(rng.integers(4))]
-
-
 def shifted(numbers: str) -> str:
     """Other numbers, as many."""
     return " ".join(f"{1.1 * float(x) + 0.01:.6g}" for x in numbers.split())
@@ -101,33 +92,33 @@ class UrdfMutator:
     def draw(self, rng: np.random.Generator) -> Mutation | None:
         """A random mutation; None if the drawn operation does not apply to the drawn element."""
         root = ElementTree.fromstring(self.files.urdf)
-        everything = places(root)
         drawn = bool(rng.random() < 0.12)
-        candidates = [place for place in everything if place.drawn == drawn]
-        tags = sorted({place.tag for place in candidates})
-        tag = tags[int(rng.integers(len(tags)))]
-        candidates = [place for place in candidates if place.tag == tag]
-        place = candidates[int(rng.integers(len(candidates)))]
-        operation = [
-            self.delete_element,
-            self.duplicate_element,
-            self.rename_element,
-            self.delete_attribute,
-            self.duplicate_attribute,
-            self.rename_attribute,
-            self.retype_attribute,
-        ][int(rng.integers(7))]
+        candidates = [place for place in places(root) if place.drawn == drawn]
+        tag = one_of(sorted({place.tag for place in candidates}), rng)
+        place = one_of([place for place in candidates if place.tag == tag], rng)
+        operation = one_of(
+            [
+                self.delete_element,
+                self.duplicate_element,
+                self.rename_element,
+                self.delete_attribute,
+                self.duplicate_attribute,
+                self.rename_attribute,
+                self.retype_attribute,
+            ],
+            rng,
+        )
         outcome = operation(root, place, rng)
         if outcome is None:
             return None
-        change, expectation, text, kernel_system = outcome
+        change, expectation, text, written_out = outcome
         text = text or ElementTree.tostring(root, encoding="unicode")
         return Mutation(
             self.model,
             f"urdf: {change}",
             Files(self.files.toml, text),
             expectation,
-            None if kernel_system is None else Files(self.files.toml, kernel_system),
+            None if written_out is None else Files(self.files.toml, written_out),
         )
 
     def delete_element(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
@@ -135,9 +126,9 @@ class UrdfMutator:
         if parent is None:
             return None
         change = f"{place.path} deleted"
-        kernel_system = None
+        written_out = None
         if place.drawn:
-            expectation = must_load_unchanged()
+            expectation = unchanged()
         elif tag in OPTIONAL or tag == "inertial":
             expectation = legal(*MOVING)
             if tag == "inertial":
@@ -146,17 +137,17 @@ class UrdfMutator:
                 ElementTree.SubElement(node, "inertia", MASSLESS)
             else:
                 node.attrib = dict(OPTIONAL[tag])
-            kernel_system = ElementTree.tostring(root, encoding="unicode")
+            written_out = ElementTree.tostring(root, encoding="unicode")
         else:
-            expectation = must_be_refused()
+            expectation = REFUSED
         parent.remove(node)
-        return change, expectation, None, kernel_system
+        return change, expectation, None, written_out
 
     def duplicate_element(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
         if place.parent is None:
             return None
         place.parent.insert(list(place.parent).index(place.node), copy.deepcopy(place.node))
-        expectation = must_load_unchanged() if place.drawn else must_be_refused()
+        expectation = unchanged() if place.drawn else REFUSED
         return f"{place.path} duplicated", expectation, None, None
 
     def rename_element(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
@@ -170,7 +161,7 @@ class UrdfMutator:
         if place.drawn and place.parent is not None and place.parent.tag not in ("robot", "link"):
             expectation = legal()  # not read; but loops and inertia there are refused
         else:
-            expectation = refused_or_noted() if known else must_be_refused()
+            expectation = REFUSED_OR_NOTED if known else REFUSED
         return change, expectation, None, None
 
     def delete_attribute(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
@@ -179,19 +170,19 @@ class UrdfMutator:
             return None
         key = str(rng.choice(sorted(node.attrib)))
         change = f"{place.path} without {key}"
-        kernel_system = None
+        written_out = None
         if place.drawn or (tag == "limit" and key in ("lower", "upper")):
-            expectation = must_load_unchanged()
+            expectation = unchanged()
         elif tag == "dynamics":
             expectation = legal(*MOVING)
         elif tag == "origin":
             expectation = legal(*MOVING)
             node.set(key, OPTIONAL["origin"][key])
-            kernel_system = ElementTree.tostring(root, encoding="unicode")
+            written_out = ElementTree.tostring(root, encoding="unicode")
         else:
-            expectation = must_be_refused()
+            expectation = REFUSED
         del node.attrib[key]
-        return change, expectation, None, kernel_system
+        return change, expectation, None, written_out
 
     def duplicate_attribute(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
         """An attribute twice is no XML; only the text can say it."""
@@ -201,7 +192,7 @@ class UrdfMutator:
         place.node.set("zzz", "MARK")
         text = ElementTree.tostring(root, encoding="unicode")
         text = text.replace('zzz="MARK"', f'{key}="{place.node.get(key)}"')
-        return f"{place.path} with {key} twice", must_be_refused(), text, None
+        return f"{place.path} with {key} twice", REFUSED, text, None
 
     def rename_attribute(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
         node, tag = place.node, place.tag
@@ -215,10 +206,10 @@ class UrdfMutator:
         node.set(new, node.attrib.pop(key))
         change = f"{place.path}: {key} renamed {new}"
         if place.drawn:
-            return change, must_load_unchanged(), None, None
+            return change, unchanged(), None, None
         if tag == "origin" and {key, new} == {"xyz", "rpy"}:
             return change, legal(*MOVING), None, None
-        return change, must_be_refused(), None, None
+        return change, REFUSED, None, None
 
     def retype_attribute(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:
         node, tag = place.node, place.tag
@@ -226,20 +217,20 @@ class UrdfMutator:
             return None
         key = str(rng.choice(sorted(node.attrib)))
         old = node.get(key, "")
-        expectation = must_be_refused()
+        expectation = REFUSED
         sensible = bool(rng.random() < 0.4)
         if key in NAMING:
             new, expectation = self._other_name(root, place, key, sensible, rng)
         elif sensible:
             new = "7" if place.drawn else shifted(old)
-            expectation = must_load_unchanged() if tag == "limit" else legal(*MOVING)
+            expectation = unchanged() if tag == "limit" else legal(*MOVING)
         else:
             new = str(rng.choice(GARBAGE))
         if new == old:
             return None
         node.set(key, new)
         if place.drawn:
-            expectation = must_load_unchanged()
+            expectation = unchanged()
         return f"{place.path}: {key}={old!r} made {new!r}", expectation, None, None
 
     def _other_name(
@@ -251,16 +242,16 @@ class UrdfMutator:
             if sensible:
                 new = str(rng.choice([kind for kind in known if kind != old]))
                 return new, legal(*MOVING, NAMES)
-            return str(rng.choice(["", "x", "hinge", old.upper(), f" {old}"])), must_be_refused()
+            return str(rng.choice(["", "x", "hinge", old.upper(), f" {old}"])), REFUSED
         if not sensible:
             unnamed = rng.random() < 0.3
             new = "" if unnamed else "no_such_name"
             if unnamed or tag in ("parent", "child", "link") or old in self.described:
-                return new, must_be_refused()
-            return new, must_load_unchanged(NAMES)
+                return new, REFUSED
+            return new, unchanged(NAMES)
         if tag == "robot":
-            return "another name", must_load_unchanged(NAMES)
+            return "another name", unchanged(NAMES)
         kind = "joint" if tag == "joint" else "link"
         names = [node.get("name", "") for node in root.findall(kind)]
         new = str(rng.choice([name for name in names if name != old] or [old]))
-        return new, legal(*MOVING, NAMES) if tag in ("parent", "child") else must_be_refused()
+        return new, legal(*MOVING, NAMES) if tag in ("parent", "child") else REFUSED

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
+from srm_mbs.visualization.animation.meshcat_scene import node_names
 
 SMALL, LARGE = (300, 200), (900, 600)
 """Windows (pixels): Chromium draws without a graphics card, a large one several times as long."""
@@ -44,6 +46,17 @@ def opened(browser: Any, address: str, size: tuple[int, int] = SMALL) -> Iterato
     assert complaints == []
 
 
+@contextlib.contextmanager
+def exported(
+    browser: Any, folder: Path, motion: Any, size: tuple[int, int] = SMALL, **options: Any
+) -> Iterator[Any]:
+    """The page of a run or prescribed motion, exported with ``options`` to ``folder``."""
+    path = folder / "page.html"
+    motion.export_html(path, **options)
+    with opened(browser, path.as_uri(), size) as page:
+        yield page
+
+
 BODIES = """t => {
   if (t !== null) { viewer.animator.pause(); viewer.animator.seek(t); }
   viewer.scene.updateMatrixWorld(true);
@@ -60,6 +73,15 @@ def bodies_in(page: Any, t: float | None = None) -> dict[str, Any]:
     """Placement (4, 4) of each body in a page or frame, at the animation's time ``t``."""
     found = page.evaluate(BODIES, t)
     return {name: np.array(matrix).reshape(4, 4).T for name, matrix in found.items()}
+
+
+def assert_in_place(page: Any, motion: Any, t: float, within: float = 1e-6) -> set[str]:
+    """The bodies in a page at t are where forward kinematics puts them; returns their names."""
+    found, (q, _) = bodies_in(page, t), motion(t)
+    for name, placement in zip(node_names(motion.mechanism), placements(motion.mechanism, q)):
+        if name in found:
+            assert np.abs(found[name] - placement.homogeneous).max() < within, (name, t)
+    return set(found)
 
 
 def placements(mechanism: srm.Mechanism, q: Any) -> list[pin.SE3]:

@@ -8,6 +8,7 @@ slopes on these problems, hence its finer steps.
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -25,6 +26,11 @@ STEPS = {
     "dop853": (0.2, 0.1, 0.05),
 }
 SAMPLES = np.linspace(0.2, 1.0, 5)
+
+
+def fitted_order(steps: Any, errors: Any) -> float:
+    """Slope of log(error) against log(step)."""
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
 
 
 @cache
@@ -51,4 +57,4 @@ def observed_order(
         assert solution.stats.placements == 0, "orders are measured away from singularities"
         dq = [pin.difference(mechanism.model, a, b) for a, b in zip(solution.q, reference.q)]
         errors.append(max(np.abs(dq).max(), np.abs(solution.v - reference.v).max()))
-    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+    return fitted_order(steps, errors)

@@ -10,10 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 import srm_mbs as srm
-from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
@@ -21,12 +19,13 @@ from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
 from srm_mbs.integration.kernel.marshalling import control_struct
-from srm_mbs.integration.kernel.run import ARRIVAL, CompiledRun
+from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
+from tests.support.mechanisms import mass_matrix
 
 
 def control_state(control: Any) -> Any:
@@ -56,13 +55,6 @@ def control_state(control: Any) -> Any:
             assert isinstance(control, FixedStep)
             return control_struct(**state, index=control._index)
         control = control._inner
-
-
-def mass_matrix(mechanism: srm.Mechanism, state: FloatArray) -> FloatArray:
-    """M (nv, nv) at a state."""
-    model = mechanism.model
-    M = np.triu(pin.crba(model, model.createData(), state[: model.nq]))
-    return M + np.triu(M, 1).T  # type: ignore[no-any-return]
 
 
 @dataclass
@@ -105,6 +97,11 @@ class Comparison:
     replaced: int = 0
     entered: int = 0
     arrivals: int = 0
+
+    def enlarge(self, **found: Any) -> None:
+        """Keep the largest of each difference."""
+        for name, value in found.items():
+            setattr(self, name, max(getattr(self, name), float(value)))
 
 
 def compare(
@@ -166,12 +163,12 @@ def compare(
             assert run.at_breakpoint
             run.enter()
             change = run.memory().rate - memory.rate
-            out.rates = max(out.rates, float(np.max(np.abs(change) / (np.abs(memory.rate) + one))))
+            out.enlarge(rates=np.max(np.abs(change) / (np.abs(memory.rate) + one)))
         limit = min(max_step, system.step_limit(x))
         # Before the reference proposes: its proposal writes the slope into the memory.
-        stop, compiled_decision = run.attempt_from(t, x, memory, control_state(control))
+        reason, compiled_decision = run.attempt_from(t, x, memory, control_state(control))
         proposal = control.propose(t, limit, memory)
-        assert proposal.singular_arrival == (stop == ARRIVAL)
+        assert proposal.singular_arrival == (reason is ReturnReason.ARRIVAL)
         if proposal.singular_arrival:
             memory = passing.singular_arrival(t, x, memory)
             out.arrivals += 1
@@ -182,7 +179,7 @@ def compare(
             result = None
         decision = control.decide(proposal, result)
         out.attempts += 1
-        out.h = max(out.h, abs(run.h - proposal.h) / proposal.h)
+        out.enlarge(h=abs(run.h - proposal.h) / proposal.h)
         if decision is not compiled_decision:
             out.decisions.append((t, decision, compiled_decision))
         if result is not None:
@@ -193,32 +190,25 @@ def compare(
             # Next to a singular configuration the algebra magnifies rounding by 1 / sigma^2.
             lowest = min(1.0, float(result.sigmas.min()))
             scale = np.maximum(size, proposal.h * rates) / lowest**2
-            moved = float(np.max(np.abs(change) / scale))
+            moved = np.max(np.abs(change) / scale)
             if result.quiet or not system.has_constraints:
-                out.state = max(out.state, moved)
-                M = mass_matrix(mechanism, x)
-                out.condition = max(out.condition, float(np.linalg.cond(M)))
-                for part in np.split(np.arange(2 * system.nv), 2):
-                    d, s = change[part], scale[part]
-                    out.energy = max(out.energy, float(np.sqrt((d @ M @ d) / (s * s @ np.diag(M)))))
+                M = mass_matrix(mechanism.model, x[: mechanism.model.nq])
+                out.enlarge(state=moved, condition=np.linalg.cond(M))
+                for d, s in zip(np.split(change, 2), np.split(scale, 2)):
+                    out.enlarge(energy=np.sqrt((d @ M @ d) / (s * s @ np.diag(M))))
             else:
-                out.near = max(out.near, moved)
-            out.rates = max(
-                out.rates,
-                float(np.max(np.abs(compiled_result.rates - result.rates).max(0) / (rates + one)))
-                * lowest**2,
-            )
+                out.enlarge(near=moved)
+            change = np.abs(compiled_result.rates - result.rates).max(axis=0)
+            out.enlarge(rates=np.max(change / (rates + one)) * lowest**2)
             if np.isfinite(result.sigmas).all():
-                change = np.abs(compiled_result.sigmas - result.sigmas)
-                out.sigma = max(out.sigma, float(change.max()) * lowest)
+                out.enlarge(sigma=np.abs(compiled_result.sigmas - result.sigmas).max() * lowest)
             if result.correction.size:
                 change = np.abs(compiled_result.correction - result.correction)
-                out.correction = max(out.correction, float(np.max(change / scale)))
+                out.enlarge(correction=np.max(change / scale))
             # An error estimate is a difference of rates: its rounding is theirs.
             rounding = norm(proposal.h * rates, norm.weights(memory.state_scale))
             change = abs(compiled_result.error_ratio - result.error_ratio)
-            bound = (rounding + result.error_ratio) / lowest**2
-            out.error = max(out.error, float(change / bound))
+            out.enlarge(error=change / ((rounding + result.error_ratio) / lowest**2))
             out.zones += result.zone is not None
             assert (result.zone is None) == (compiled_result.zone is None)
             assert result.rank == compiled_result.rank

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
-from tests.support.mechanisms import rod
+from tests.support.mechanisms import add_link, rod
 
 JOINTS = ("planar", "chain")
 """One planar joint for each bar (nq != nv), or two prismatic joints and a revolute one."""
@@ -49,17 +49,16 @@ def _mechanism(
         here, moving = np.array(bar.origin), np.array(bar.origin_rate)
         c, s = np.cos(bar.angle), np.sin(bar.angle)
         if joints == "planar":
-            index = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), bar.name)
+            parent, joint = 0, pin.JointModelPlanar()
             q += [*here, c, s]
             v += [*(np.array([[c, s], [-s, c]]) @ moving), bar.rate]  # in the bar's axes
         else:
             x = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), f"{bar.name}_x")
-            y = model.addJoint(x, pin.JointModelPY(), pin.SE3.Identity(), f"{bar.name}_y")
-            index = model.addJoint(y, pin.JointModelRZ(), pin.SE3.Identity(), bar.name)
+            parent = model.addJoint(x, pin.JointModelPY(), pin.SE3.Identity(), f"{bar.name}_y")
+            joint = pin.JointModelRZ()
             q += [*here, bar.angle]
             v += [*moving, bar.rate]
-        model.appendBodyToJoint(index, rod(bar.mass, bar.length), pin.SE3.Identity())
-        model.addBodyFrame(bar.name, index, pin.SE3.Identity(), 0)
+        add_link(model, parent, joint, bar.name, rod(bar.mass, bar.length))
     return srm.Mechanism(model, tuple(loops), q0=np.array(q), v0=np.array(v))
 
 

@@ -9,6 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.system import Terms
 from srm_mbs.formats.load import models_folder
 
 CLOSED_MODELS = tuple(
@@ -29,8 +32,48 @@ def rod(mass: float = 1.0, length: float = 1.0, thickness: float = 0.24) -> pin.
     return pin.Inertia(mass, np.array([length / 2.0, 0.0, 0.0]), inertia)
 
 
+def add_link(
+    model: pin.Model,
+    parent: int,
+    joint: object,
+    name: str,
+    inertia: pin.Inertia | None = None,
+    at: pin.SE3 | None = None,
+) -> int:
+    """Add a joint and a link on it, both called ``name``; by default a :func:`rod` at the parent.
+
+    Returns the index of the joint.
+    """
+    here = pin.SE3.Identity()
+    index: int = model.addJoint(parent, joint, at or here, name)
+    model.appendBodyToJoint(index, inertia or rod(), here)
+    model.addBodyFrame(name, index, here, 0)
+    return index
+
+
+def random_state(
+    model: pin.Model, seed: int | np.random.Generator, turn: float = 1.0
+) -> tuple[FloatArray, FloatArray]:
+    """q (nq,) up to ``turn`` (rad, m) away from neutral in each direction, and v (nv,) up to 1."""
+    rng = np.random.default_rng(seed)
+    q = pin.integrate(model, pin.neutral(model), turn * rng.uniform(-1.0, 1.0, model.nv))
+    return q, rng.uniform(-1.0, 1.0, model.nv)
+
+
+def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
+    """M (nv, nv) at q (nq,)."""
+    upper = np.triu(pin.crba(model, model.createData(), q))
+    return upper + np.triu(upper, 1).T  # type: ignore[no-any-return]
+
+
 def along_x(distance: float) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array([distance, 0.0, 0.0]))
+
+
+def start_terms(mechanism: srm.Mechanism) -> Terms:
+    """The terms of the reference at the start."""
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    return make_system(mechanism).evaluate(0.0, state)
 
 
 def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
@@ -42,9 +85,7 @@ def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     parent = 0
     for i, name in enumerate("abcd"):
         joint = pin.JointModelSpherical() if i else (root or pin.JointModelFreeFlyer())
-        parent = model.addJoint(parent, joint, along_x(1.0 if i else 0.0), name)
-        model.appendBodyToJoint(parent, rod(), pin.SE3.Identity())
-        model.addBodyFrame(name, parent, pin.SE3.Identity(), 0)
+        parent = add_link(model, parent, joint, name, at=along_x(1.0 if i else 0.0))
     q = pin.neutral(model)
     turn = np.array([0.1, 0.15, 1.0])
     quaternion = pin.Quaternion(pin.exp3(1.4 * turn / np.linalg.norm(turn))).coeffs()
@@ -59,6 +100,18 @@ def floating_ring(root: object | None = None, seed: int = 0) -> srm.Mechanism:
     return mechanism.with_state(state.q, state.v)
 
 
+def with_slider_mass(mass: float) -> srm.Mechanism:
+    """The bundled slider_crank_slider with another mass (kg) of the slider."""
+    base = srm.load("slider_crank_slider")
+    model = base.model.copy()
+    slider = model.getJointId("slider")
+    inertia = model.inertias[slider]
+    model.inertias[slider] = pin.Inertia(
+        mass, inertia.lever, inertia.inertia * (mass / inertia.mass)
+    )
+    return srm.Mechanism(model, base.loops, q0=base.q0, v0=base.v0)
+
+
 def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mechanism:
     """The bundled spatial_dead_point with a Pinocchio ball joint: nq != nv.
 
@@ -70,12 +123,9 @@ def ball_dead_point(angle: float = -np.pi / 6.0, rate: float = 4.0) -> srm.Mecha
     model = pin.Model()
     model.name = "ball_dead_point"
     model.gravity.linear = 9.81 * np.array([-0.5, -np.sqrt(0.75), 0.0])
-    first = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "crank")
-    model.appendBodyToJoint(first, rod(1.0, crank, 0.0), pin.SE3.Identity())
-    model.addBodyFrame("crank", first, pin.SE3.Identity(), 0)
-    second = model.addJoint(first, pin.JointModelSpherical(), along_x(crank), "rod")
-    model.appendBodyToJoint(second, rod(1.0, 2.5, 0.02), pin.SE3.Identity())
-    model.addBodyFrame("rod", second, pin.SE3.Identity(), 0)
+    first = add_link(model, 0, pin.JointModelRZ(), "crank", rod(1.0, crank, 0.0))
+    ball, inertia = pin.JointModelSpherical(), rod(1.0, 2.5, 0.02)
+    add_link(model, first, ball, "rod", inertia, along_x(crank))
     loop = srm.LoopClosure(
         "point_on_line",
         srm.Anchor("rod", xyz=(2.5, 0.0, 0.0)),
@@ -110,12 +160,8 @@ def floating_slider_crank(
     base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "beam")
     model.appendBodyToJoint(base, rod(2.0, 3.0), along_x(-0.5))
     model.addBodyFrame("beam", base, pin.SE3.Identity(), 0)
-    crank = model.addJoint(base, pin.JointModelRZ(), pin.SE3.Identity(), "crank")
-    model.appendBodyToJoint(crank, rod(), pin.SE3.Identity())
-    model.addBodyFrame("crank", crank, pin.SE3.Identity(), 0)
-    tip = model.addJoint(crank, pin.JointModelRZ(), along_x(1.0), "rod")
-    model.appendBodyToJoint(tip, rod(1.5), pin.SE3.Identity())
-    model.addBodyFrame("rod", tip, pin.SE3.Identity(), 0)
+    crank = add_link(model, base, pin.JointModelRZ(), "crank")
+    add_link(model, crank, pin.JointModelRZ(), "rod", rod(1.5), along_x(1.0))
     loop = srm.LoopClosure(
         "point_on_line",
         srm.Anchor("rod", xyz=(1.0, 0.0, 0.0)),
@@ -142,9 +188,7 @@ def slider_crank_of_points(apart: float) -> srm.Mechanism:
     tip = 2.0 * np.array([np.cos(first), 0.0, -np.sin(first)])
     q: list[float] = []
     for name, turn, origin in (("crank", first, np.zeros(3)), ("rod", second, tip)):
-        joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), name)
-        model.appendBodyToJoint(joint, rod(1.0, 2.0), pin.SE3.Identity())
-        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+        add_link(model, 0, pin.JointModelFreeFlyer(), name, rod(1.0, 2.0))
         q += [*origin, 0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)]
     ends = (("crank", 0.0, "world", 0.0), ("rod", 0.0, "crank", 2.0), ("rod", 2.0, "world", 0.0))
     loops = []
@@ -210,7 +254,7 @@ def rescaled(
     q0 = np.array(mechanism.q0)
     for joint in list(model.joints)[1:]:
         lengths = translation[joint.idx_v : joint.idx_v + joint.nv]
-        # A quaternion stands behind the position that comes first.
+        # A quaternion comes after the position.
         q0[joint.idx_q : joint.idx_q + lengths.size][lengths] *= length
     return srm.Mechanism(
         model,

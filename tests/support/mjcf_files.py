@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pinocchio as pin
 
+import srm_mbs as srm
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.mjcf.reader import translate
 from srm_mbs.formats.translation import Options, Translation
@@ -112,6 +115,13 @@ TWO = "".join(BODY.format(*names) for names in (("one", "j"), ("two", "k")))
 def file(world: str = TWO, more: str = "") -> str:
     """A file with two hinged bodies by default, and further sections."""
     return f"<mujoco>{more}<worldbody>{world}</worldbody></mujoco>"
+
+
+def loaded(folder: Path, text: str) -> srm.Mechanism:
+    """The mechanism of a file with this text."""
+    path = folder / "robot.xml"
+    path.write_text(text)
+    return srm.load(path)
 
 
 def model_of(text: str) -> pin.Model:

@@ -9,8 +9,10 @@ import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
 
+import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
+from tests.support.mechanisms import mass_matrix
 
 G = 9.81
 Field = Callable[[float, Any], Any]
@@ -25,6 +27,19 @@ def cross(a: Any, b: Any) -> np.ndarray:
 def integrate(field: Field, start: list[float], t_end: float) -> np.ndarray:
     """State at ``t_end`` by DOP853 at 1e-13."""
     return trajectory(field, start, np.array([t_end]))[0]
+
+
+def error_at_end(
+    solution: srm.Solution, field: Field, start: list[float], joint: str | None = None
+) -> float:
+    """Largest error of angle and rate of a joint, by default the first, at the end of a run.
+
+    ``start``: its angle and rate, in the coordinates of ``field``, at the time 0.
+    """
+    assert solution.success, solution.message
+    expected = integrate(field, start, float(solution.t[-1]))
+    position, rate = solution.joint(joint or solution.mechanism.joint_names[0])
+    return float(np.abs([position[-1], rate[-1]] - expected).max())
 
 
 def trajectory(field: Field, start: list[float], times: np.ndarray) -> np.ndarray:
@@ -220,6 +235,5 @@ class OneDegree:
         bend = np.zeros(self.model.nv)
         bend[self.others] = np.linalg.lstsq(G[:, self.others], -bias, rcond=1e-9)[0]
         nle = pin.nonLinearEffects(self.model, self.data, q, v)
-        M = pin.crba(self.model, self.data, q)
-        M = np.triu(M) + np.triu(M, 1).T
+        M = mass_matrix(self.model, q)
         return [rate, float(-along @ (M @ bend + nle) / (along @ M @ along))]

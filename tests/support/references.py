@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from tests.support import reduced
+from tests.support.bundled import load
 
 
 def _open_chain(mechanism: srm.Mechanism) -> reduced.Field:
@@ -25,7 +26,7 @@ def _open_chain(mechanism: srm.Mechanism) -> reduced.Field:
 
 
 def observed(name: str, solution: srm.Solution, t: np.ndarray) -> np.ndarray:
-    """What :func:`reference` gives, from a run: angle and rate of the crank, or the whole state."""
+    """The quantities of :func:`reference` in a run: angle and rate of the crank, or the state."""
     q, v = solution(t)
     if name in ("four_bar", "spatial_four_bar", "pendulum_chain"):
         return np.hstack([q, v])
@@ -44,7 +45,7 @@ def reference(name: str, t_end: float, samples: int) -> tuple[np.ndarray, np.nda
     if name in ("slider_crank", "slider_crank_whirl"):
         field = reduced.slider_crank()
     elif name == "parallelogram":
-        field = lambda t, y: [y[1], -reduced.G * 9.0 / 8.0 * np.cos(y[0])]  # noqa: E731
+        field = reduced.parallelogram()
     elif name == "spatial_dead_point":
         field, start = reduced.spatial_dead_point(), start - np.array([np.pi / 6, 0.0])
     elif name.startswith("n_four_bar"):
@@ -56,3 +57,18 @@ def reference(name: str, t_end: float, samples: int) -> tuple[np.ndarray, np.nda
     run = solve_ivp(field, (0.0, t_end), start, "DOP853", t, rtol=3e-14, atol=1e-14)
     assert run.success
     return t, run.y.T
+
+
+def error_across(name: str, around: float, **options: Any) -> tuple[float, srm.Solution]:
+    """Largest error of q ``around`` (s) after the first singular passage of a bundled mechanism, of
+    a run with ``options`` from as long before it; and that run."""
+    mechanism = load(name)
+    t = srm.simulate(mechanism, 1.5, rtol=1e-8).crossings[0].time
+    before = srm.simulate(mechanism, t - around, rtol=1e-12)
+    start = mechanism.with_state(before.q[-1], before.v[-1])
+    times = {"t0": t - around, "t_eval": [t + around]}
+    exact = srm.simulate(start, t + around, rtol=1e-12, **times)
+    run = srm.simulate(start, t + around, **options, **times)
+    assert run.success, run.message
+    assert len(run.crossings) == 1
+    return float(np.abs(run.q[-1] - exact.q[-1]).max()), run

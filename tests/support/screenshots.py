@@ -19,7 +19,7 @@ SIZE = (330, 220)
 BLUR = 2.0
 """Pixels: wider than what drivers of graphics cards and their antialiasing differ by."""
 FOREGROUND = 0.1
-"""What a pixel of a body differs by from the background of its row."""
+"""Least difference of a pixel of a body from the background of its row."""
 SLACK = 2
 """Pixels that an outline may lie beside the other."""
 ALIKE = 0.16

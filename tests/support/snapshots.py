@@ -51,6 +51,11 @@ def refused(call: Callable[[], object], folder: Path | None = None) -> str:
     return message.encode("unicode_escape").decode()
 
 
+def check_refusals(family: str, calls: Mapping[str, Callable[[], object]]) -> None:
+    """Compare the messages of calls that are refused, by the name of the case."""
+    check_messages(family, {case: refused(call) for case, call in calls.items()})
+
+
 def check_messages(family: str, messages: Mapping[str, str]) -> None:
     """Compare the messages of a family, by the name of the case, with its file."""
     path = MESSAGES / f"{family}.txt"

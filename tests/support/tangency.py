@@ -15,7 +15,7 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
-from tests.support.mechanisms import along_x, rod
+from tests.support.mechanisms import add_link, along_x, rod
 
 G = 9.81
 INPUT, COUPLER, BAR = 0.5, 1.5, 2.0
@@ -65,9 +65,7 @@ def mechanism(reach: float) -> srm.Mechanism:
         ("rod", 3, along_x(BAR), BAR),
     )
     for name, parent, placement, length in bars:
-        joint = model.addJoint(parent, pin.JointModelRZ(), placement, name)
-        model.appendBodyToJoint(joint, rod(1.0, length), pin.SE3.Identity())
-        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+        add_link(model, parent, pin.JointModelRZ(), name, rod(1.0, length), placement)
     loops = (
         srm.LoopClosure(
             "point",

@@ -57,8 +57,7 @@ def placement(xyz: object, rpy: object) -> pin.SE3:
 
 def open_mechanism(path: Path, cut: tuple[str, ...] = ()) -> srm.Mechanism:
     """The mechanism of a file before anything is closed."""
-    reading = read(path, Overrides(cut=cut))
-    return unassembled(reading.description, reading.tree, reading.source, reading.notes)[0]
+    return unassembled(read(path, Overrides(cut=cut)))[0]
 
 
 def relative(q: FloatArray, on_shin: object = ON_SHIN, on_rim: object = ON_RIM) -> pin.SE3:

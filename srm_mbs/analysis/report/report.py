@@ -24,7 +24,7 @@ from srm_mbs.analysis.report.sections import (
 from srm_mbs.errors import InputError, __version__
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.overlays import OverlayOptions
-from srm_mbs.visualization.animation.page import render, write_page
+from srm_mbs.visualization.animation.page import render, write_file
 from srm_mbs.visualization.animation.playback import page_of
 
 FOLDER = Path(__file__).parent
@@ -86,7 +86,7 @@ def write_report(
     if certificate is None:
         certificate = certify(solution, rtol=rtol, again=again, progress=progress)
     page = report_page(solution, certificate, animation=animation, pictures=pictures)
-    write_page(page, Path(path))
+    write_file(Path(path), page.encode())
 
 
 def report_page(

@@ -25,6 +25,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.projection import symmetric
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
 from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW, structure_of
@@ -45,8 +46,10 @@ class ClosureGeometry:
 
     Attributes
     ----------
-    coordinate_unit : (nv,), length, row_unit : (rows,)
-        Units of the coordinates, the scene diagonal (m), units of the rows.
+    units
+        Units at ``start``.
+    coordinate_unit : (nv,), row_unit : (rows,)
+        Units of the coordinates and of the rows.
     unit : (n,)
         Units of the unknowns: the coordinates, n = nv.
     drives
@@ -61,16 +64,14 @@ class ClosureGeometry:
         self.model.gravity.linear = np.zeros(3)
         self.data = workspace(self.model)
         self.rows = LoopKinematics(self.model, mechanism.loops)
-        units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
-        self.unit = self.coordinate_unit = units.coordinate
-        self.length = units.length
-        self.row_unit = row_units(mechanism, units)
+        self.units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
+        self.unit = self.coordinate_unit = self.units.coordinate
+        self.row_unit = row_units(mechanism, self.units)
         self.drives: tuple[str, ...] = ()
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
-        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self.rows.update(self.data, q, with_bias=False)
+        self.rows.evaluate(self.model, self.data, q)
         return self.rows.g / self.row_unit, self.rows.G / self.row_unit[:, None] * self.unit
 
     @cached_property
@@ -89,7 +90,7 @@ class ClosureGeometry:
             # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
             J = world_jacobian(self.data)
             turn = np.linalg.norm(J[3:], axis=0) * self.unit
-            shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.length + turn
+            shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.units.length + turn
             uncancelled += np.array([shift @ shift, turn @ turn]) / 8
         at = 0
         for loop in self.mechanism.loops:
@@ -129,8 +130,7 @@ class ClosureGeometry:
             np.linalg.norm(rows, axis=1)
             for rows in (self.normalised(start), self._without_shares(start))
         )
-        out: FloatArray = np.where(left > DEPENDENT * before, left / np.maximum(before, left), 1.0)
-        return out
+        return np.where(left > DEPENDENT * before, left / np.maximum(before, left), 1.0)
 
     def separated(self, q: FloatArray) -> FloatArray:
         """As :meth:`normalised`, with the difference in place of one of two nearly parallel rows of
@@ -141,16 +141,13 @@ class ClosureGeometry:
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
-        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        pin.nonLinearEffects(self.model, self.data, q, u * self.unit)
-        self.rows.update(self.data, q)
+        self.rows.evaluate(self.model, self.data, q, u * self.unit)
         return self.rows.bias / self.row_unit / self.row_size
 
     def mass(self) -> FloatArray:
         """Mass matrix (nv, nv) for rates in units, where the closures were evaluated last."""
-        upper, unit = np.triu(self.data.M), self.coordinate_unit
-        out: FloatArray = (upper + np.triu(upper, 1).T) * unit * unit[:, None]
-        return out
+        unit = self.coordinate_unit
+        return symmetric(self.data.M) * unit * unit[:, None]
 
     def at(self, q: FloatArray, t: float) -> FloatArray:
         """The unknowns, as the other methods take them, at q (nq,) and t (s): q itself."""
@@ -158,8 +155,7 @@ class ClosureGeometry:
 
     def rates(self, v: FloatArray) -> FloatArray:
         """Rates (n,) in units of a motion with the velocity v (nv,)."""
-        out: FloatArray = v / self.unit
-        return out
+        return v / self.unit
 
     def move(self, q: FloatArray, delta: Any, free: IndexArray | None = None) -> FloatArray:
         """q (+) delta, delta in units: (nv,), or (k,) over the ``free`` coordinates (indices)."""
@@ -193,32 +189,25 @@ class DriveRows:
     """
 
     def __init__(self, mechanism: MechanismData, geometry: ClosureGeometry, q: FloatArray) -> None:
-        drives = in_order_of_rows(mechanism.drives)
         self._model, self._data, self._q = geometry.model, geometry.data, q
-        self._kinematics = DrivenKinematics(geometry.model, (), drives)
-        joints = [geometry.model.getJointId(d.joint) if d.joint else 0 for d in drives]
-        in_v = [geometry.model.joints[joint].idx_v for joint in joints]
-        self._row_unit = np.array(
-            [geometry.unit[k] if joint else geometry.length for joint, k in zip(joints, in_v)]
-        )
         self._unit = geometry.unit
+        self._kinematics = DrivenKinematics(geometry.model, (), mechanism.drives)
+        units = constraint_units(mechanism, geometry.units)
+        self._row_unit = units[len(geometry.row_unit) :]
         # Rates and accelerations do not depend on where a law starts, but for its target.
-        starts = positions(geometry.model, drives, q)
-        moving = np.array([d.curve(starts[d.name])(0.0) for d in drives]).reshape(-1, 3)
+        starts = positions(geometry.model, mechanism.drives, q)
+        moving = np.array(
+            [d.curve(starts[d.name])(0.0) for d in in_order_of_rows(mechanism.drives)]
+        ).reshape(-1, 3)
         self.rates = moving[:, 1] / self._row_unit
-        self._bends = moving[:, 2] / self._row_unit
-        pin.crba(self._model, self._data, q, pin.Convention.WORLD)
-        self._kinematics.update(self._data, q, with_bias=False)
+        self._accelerations = moving[:, 2] / self._row_unit
+        self._kinematics.evaluate(self._model, self._data, q)
         self.rows = self._kinematics.G / self._row_unit[:, None] * self._unit
 
     def bias(self, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (k,) for the rates u (nv,) in units."""
-        v = u * self._unit
-        pin.crba(self._model, self._data, self._q, pin.Convention.WORLD)
-        pin.nonLinearEffects(self._model, self._data, self._q, v)
-        self._kinematics.update(self._data, self._q)
-        out: FloatArray = self._kinematics.bias / self._row_unit - self._bends
-        return out
+        self._kinematics.evaluate(self._model, self._data, self._q, u * self._unit)
+        return self._kinematics.bias / self._row_unit - self._accelerations
 
 
 class DrivenGeometry(ClosureGeometry):
@@ -251,11 +240,11 @@ class DrivenGeometry(ClosureGeometry):
         closures = len(self.row_unit)
         self.drives = tuple(drive.name for drive in drives)
         self.row_unit = constraint_units(mechanism, units)
-        self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives, curves)
+        self._rows = DrivenKinematics(self.model, mechanism.loops, drives).follow(curves)
         fastest = units.rate
         for drive, unit in zip(drives, self.row_unit[closures:].tolist()):
-            _, rate, bend = curves[drive.name](0.0 if t is None else t)
-            fastest = max(fastest, abs(rate) / unit, float(np.sqrt(abs(bend) / unit)))
+            _, rate, acceleration = curves[drive.name](0.0 if t is None else t)
+            fastest = max(fastest, abs(rate) / unit, float(np.sqrt(abs(acceleration) / unit)))
         self.unit = np.append(self.coordinate_unit, 1.0 / fastest)
 
     @cached_property
@@ -264,28 +253,22 @@ class DrivenGeometry(ClosureGeometry):
         of_closures = ClosureGeometry(self.mechanism, self.start).row_size
         return np.concatenate([of_closures, np.ones(len(self.drives))])
 
-    def _update(self, place: FloatArray, with_bias: bool) -> FloatArray:
-        """Evaluate the rows at (q, t); returns their Gdot v, without the s'' of the laws."""
-        self._rows.update(self.data, place[:-1], with_bias)
-        bias = self._rows.bias.copy()
-        self._rows.move_to(float(place[-1]))
-        return bias
-
     def closure(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(g - s) over row units (rows,), and [G, -s'] over row units times units (rows, n)."""
-        pin.crba(self.model, self.data, place[:-1], pin.Convention.WORLD)
-        self._update(place, with_bias=False)
-        jacobian = np.column_stack([self._rows.G, -self._rows.target_rate])
-        return self._rows.g / self.row_unit, jacobian / self.row_unit[:, None] * self.unit
+        rows = self._rows
+        rows.evaluate(self.model, self.data, place[:-1])
+        rows.move_to(float(place[-1]))
+        jacobian = np.column_stack([rows.G, -rows.target_rate])
+        return rows.g / self.row_unit, jacobian / self.row_unit[:, None] * self.unit
 
     def bias(self, place: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (dt)^2, rows over their usual size, for the rates u = (v, dt) in units."""
-        q, rates = place[:-1], u * self.unit
-        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        pin.nonLinearEffects(self.model, self.data, q, rates[:-1])
-        own = self._update(place, with_bias=True)
-        out: FloatArray = own + (self._rows.bias - own) * rates[-1] ** 2
-        return out / self.row_unit / self.row_size
+        rows, rates = self._rows, u * self.unit
+        rows.evaluate(self.model, self.data, place[:-1], rates[:-1])
+        of_motion = rows.bias.copy()
+        rows.move_to(float(place[-1]))
+        whole: FloatArray = of_motion + (rows.bias - of_motion) * rates[-1] ** 2
+        return whole / self.row_unit / self.row_size
 
     def move(self, place: FloatArray, delta: Any, free: IndexArray | None = None) -> FloatArray:
         """(q, t) (+) delta, delta in units: (n,), or (k,) over the ``free`` of them (indices)."""
@@ -297,8 +280,7 @@ class DrivenGeometry(ClosureGeometry):
     def difference(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """Motion (n,) from a to b, in units."""
         moved = pin.difference(self.model, a[:-1], b[:-1])
-        out: FloatArray = np.append(moved, b[-1] - a[-1]) / self.unit
-        return out
+        return np.append(moved, b[-1] - a[-1]) / self.unit
 
     def at(self, q: FloatArray, t: float) -> FloatArray:
         """The place (q, t)."""
@@ -306,8 +288,7 @@ class DrivenGeometry(ClosureGeometry):
 
     def rates(self, v: FloatArray) -> FloatArray:
         """(v, 1) in units (n,), for the velocity v (nv,)."""
-        out: FloatArray = np.append(v, 1.0) / self.unit
-        return out
+        return np.append(v, 1.0) / self.unit
 
 
 def geometry_of(mechanism: MechanismData, q: FloatArray, t: float | None = None) -> ClosureGeometry:

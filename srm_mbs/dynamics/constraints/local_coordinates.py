@@ -65,8 +65,7 @@ class ChartPoint:
         if size <= cut:
             return chart.basis
         back = np.linalg.lstsq(moves, G @ chart.basis, rcond=cut / size)[0]
-        out: FloatArray = chart.basis - chart.complement @ back
-        return out
+        return chart.basis - chart.complement @ back
 
     @cached_property
     def rate_matrix(self) -> FloatArray:

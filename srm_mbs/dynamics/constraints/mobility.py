@@ -1,7 +1,7 @@
-"""Degrees of freedom: Gruebler counts against the true rank, redundant rows, stuck and idle joints.
+"""Degrees of freedom by Gruebler's count and by the rank; redundant rows, stuck and idle joints.
 
-The analysis uses the initial configuration and some more of a walk on the closure manifold, as far
-as the closures have their structural rank there: single configurations may be singular.
+The analysis uses the initial configuration and others of random walks on the closure manifold, as
+far as the closures have their structural rank there: single configurations may be singular.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.constraints.structure import ManifoldSampler, row_names, structure_of
-from srm_mbs.model.mechanism import MechanismData
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 RESTARTS = 4
 STEPS = 4
@@ -45,7 +45,7 @@ class IdleMotion:
 
 @dataclass(frozen=True)
 class Mobility:
-    """Degrees of freedom of a mechanism without its drives, counted and true.
+    """Degrees of freedom of a mechanism without its drives, by Gruebler's count and by the rank.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Mobility:
     planar_gruebler
         That count with the rows that act in the plane; None if the mechanism is not planar.
     rank, degrees_of_freedom
-        True (structural) rank of the rows, and nv minus it.
+        Structural rank of the rows, and nv minus it.
     redundant_rows
         Rows that are zero in every closed configuration; left out of the solve.
     pivoted_redundancy
@@ -85,8 +85,9 @@ class Mobility:
     idle: tuple[IdleMotion, ...]
 
 
+@per_model
 def mobility(mechanism: MechanismData) -> Mobility:
-    """Count and analyse the degrees of freedom of ``mechanism``, whose drives take them away again.
+    """The degrees of freedom of ``mechanism`` without its drives.
 
     Raises
     ------
@@ -143,19 +144,15 @@ def _samples(mechanism: MechanismData) -> list[FloatArray]:
     samples = [np.array(mechanism.q0)]
     structure = structure_of(mechanism)
     if structure.rank:
-        walker = ManifoldSampler(mechanism, structure.units)
-        rng = np.random.default_rng(1)
-        samples += walker.walk(samples[0], rng, RESTARTS, STEPS)
+        sampler = ManifoldSampler(mechanism, structure.units)
+        samples += sampler.walk(samples[0], np.random.default_rng(1), RESTARTS, STEPS)
     return samples
 
 
 def _unreachable(mechanism: MechanismData, rates: FloatArray) -> tuple[str, ...]:
-    stuck = []
-    for name in mechanism.joint_names:
-        joint = mechanism.joint(name)
-        if not (rates[joint.idx_v : joint.idx_v + joint.nv] > RANK).any():
-            stuck.append(name)
-    return tuple(stuck)
+    """The joints all of whose ``rates`` (nv,) are zero."""
+    joints = [(name, mechanism.joint(name)) for name in mechanism.joint_names]
+    return tuple(name for name, j in joints if not (rates[j.idx_v : j.idx_v + j.nv] > RANK).any())
 
 
 def _compounds(mechanism: MechanismData) -> list[tuple[tuple[str, ...], IndexArray]]:

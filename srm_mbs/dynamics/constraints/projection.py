@@ -50,6 +50,12 @@ def cholesky(M: FloatArray) -> FloatArray:
     return U  # type: ignore[no-any-return]
 
 
+def symmetric(M: FloatArray) -> FloatArray:
+    """M (nv, nv) whole, of which Pinocchio computes the upper triangle."""
+    upper = np.triu(M)
+    return upper + np.triu(upper, 1).T
+
+
 def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
     """L^-1 right = U^-T right, for ``right`` (n,) or (n, k)."""
     return lapack.dtrtrs(U, right, trans=1)[0]  # type: ignore[no-any-return]
@@ -173,7 +179,7 @@ class Projection:
     rank
         Structural rank: the number of pivots that are used in a regular configuration.
     sigma_ref
-        Median of the last structural pivot over the closed samples of the load-time walk.
+        Median of the last structural pivot over the closed samples of the load-time analysis.
     order
         The rows along the graph of the loops, for many of them; see
         :func:`~srm_mbs.dynamics.constraints.row_algebra.graph_order`.

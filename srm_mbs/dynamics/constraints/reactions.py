@@ -75,8 +75,7 @@ def _multipliers(
     for i in range(len(t)):
         terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
         yhat = terms.multiplier().copy()
-        pin.crba(model, data, q[i], pin.Convention.WORLD)
-        rows.update(data, q[i], with_bias=False)
+        rows.evaluate(model, data, q[i])
         U = cholesky(data.M)
         W = whiten(U, (rows.G / scale[:, None]).T)
         left, singular, right = np.linalg.svd(W, full_matrices=False)

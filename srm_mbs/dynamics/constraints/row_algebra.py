@@ -190,13 +190,6 @@ class RowAlgebra(Protocol):
     def solve(self, g: FloatArray) -> FloatArray:
         """E g (nv,): the shortest x in the metric M with G x = g (rows,) in the rows in use."""
 
-    def multiplier(self, white: FloatArray) -> FloatArray:
-        """Pi R^-1 Q^T white (rows,), zero in rows that are not in use: the transpose of
-        :meth:`solve` where M = 1."""
-
-    def complement(self) -> FloatArray:
-        """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
-
 
 class DenseAlgebra:
     """:class:`RowAlgebra` by LAPACK, with pivots along ``order`` if there is one."""
@@ -207,7 +200,6 @@ class DenseAlgebra:
         self.pivots = self.row_squares = np.zeros(0)
 
     def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
-        """See :class:`RowAlgebra`."""
         self._U = None if M is None else cholesky(M)
         W = G.T if self._U is None else whiten(self._U, G.T)
         self.row_squares = (W * W).sum(axis=0)
@@ -227,7 +219,7 @@ class DenseAlgebra:
         """Q x or Q^T x for x (nv, k), with the reflections of the rows in use."""
         if self.rank == 0:
             return x
-        out: FloatArray = lapack.dormqr(
+        return lapack.dormqr(  # type: ignore[no-any-return]
             side="L",
             trans="T" if transposed else "N",
             a=self._packed[:, : self.rank],
@@ -235,117 +227,90 @@ class DenseAlgebra:
             c=x,
             lwork=64 * x.shape[1],
         )[0]
-        return out
 
     def tangential(self, w: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
         white = (w if self._U is None else self._U @ w)[:, None]
         inside = self._times_q(white, transposed=True)
         inside[: self.rank] = 0.0
         return self._coloured(self._times_q(inside)[:, 0])
 
     def solve(self, g: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
         x = np.zeros((self._packed.shape[0], 1))
         if self.rank:
             R = self._packed[: self.rank, : self.rank]
             x[: self.rank, 0] = whiten(R, g[self._order[: self.rank]])
         return self._coloured(self._times_q(x)[:, 0])
 
-    def multiplier(self, white: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        out = np.zeros(self._packed.shape[1])
-        if self.rank:
-            R = self._packed[: self.rank, : self.rank]
-            inside = self._times_q(white[:, None], transposed=True)[: self.rank, 0]
-            out[self._order[: self.rank]] = unwhiten(R, inside)
-        return out
-
-    def complement(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        nv = self._packed.shape[0]
-        return self._times_q(np.eye(nv)[:, self.rank :])
-
     def _coloured(self, white: FloatArray) -> FloatArray:
         return white if self._U is None else unwhiten(self._U, white)
 
 
 class CompiledAlgebra:
-    """:class:`RowAlgebra` by the kernel: sparse where that pays."""
+    """:class:`RowAlgebra` by the kernel's ``algebra``: sparse where that pays."""
 
-    def __init__(self, kernel_system: Any) -> None:
-        self._kernel_system = kernel_system
+    def __init__(self, algebra: Any) -> None:
+        self._algebra = algebra
         self._one: FloatArray | None = None
 
     @property
     def entries(self) -> int:
         """Numbers that Q and R hold."""
-        return self._kernel_system.entries  # type: ignore[no-any-return]
+        return self._algebra.entries  # type: ignore[no-any-return]
 
     @property
     def rank(self) -> int:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.rank  # type: ignore[no-any-return]
+        return self._algebra.rank  # type: ignore[no-any-return]
 
     @property
     def pivots(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        falling: FloatArray = np.sort(self._kernel_system.pivots)[::-1]
-        return falling
+        return np.sort(self._algebra.pivots)[::-1]
 
     @property
     def row_squares(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.row_squares  # type: ignore[no-any-return]
+        return self._algebra.row_squares  # type: ignore[no-any-return]
 
     def factor(self, M: FloatArray | None, G: FloatArray, cut: float = 0.0) -> None:
-        """See :class:`RowAlgebra`."""
         if M is None:
             if self._one is None:
                 self._one = np.eye(G.shape[1])
             M = self._one
         try:
-            self._kernel_system.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
+            self._algebra.factor(np.asfortranarray(M), np.ascontiguousarray(G), cut)
         except ArithmeticError:
             cholesky(M)  # raises if the fault is in the mass matrix
             raise EvaluationError("the closures are not finite") from None
 
     def tangential(self, w: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
+        return self._algebra.tangential(np.ascontiguousarray(w))  # type: ignore[no-any-return]
 
     def solve(self, g: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
+        return self._algebra.solve(np.ascontiguousarray(g))  # type: ignore[no-any-return]
 
     def multiplier(self, white: FloatArray) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        return self._kernel_system.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
+        """Pi R^-1 Q^T white (rows,), zero in rows that are not in use: the transpose of
+        :meth:`solve` where M = 1."""
+        return self._algebra.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
 
     def complement(self) -> FloatArray:
-        """See :class:`RowAlgebra`."""
-        basis: FloatArray = self._kernel_system.complement()
-        return basis.T
+        """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
+        return self._algebra.complement().T  # type: ignore[no-any-return]
 
 
-def row_algebra(
-    pattern: BoolArray, model: pin.Model | None = None, choice: str = "auto"
-) -> RowAlgebra:
-    """The algebra of rows with entries where ``pattern`` (rows, nv) is true.
+def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebra:
+    """The algebra of rows with entries where ``pattern`` (rows, nv) is true: by the kernel for
+    more than ``KERNEL_ABOVE`` coordinates, otherwise by LAPACK.
 
     Parameters
     ----------
     model
         The tree, if M is its mass matrix, and not 1.
-    choice
-        ``"dense"``: LAPACK; ``"kernel"``: the kernel; ``"auto"``: the kernel for many coordinates.
     """
     from srm_mbs._kernel import core
 
     rows, nv = pattern.shape
     parents = [-1] * nv if model is None else coordinate_parents(model)
     order = graph_order(pattern, parents)
-    if core is None or choice == "dense" or (choice == "auto" and nv <= KERNEL_ABOVE) or not rows:
+    if core is None or nv <= KERNEL_ABOVE or not rows:
         return DenseAlgebra(order)
     supports = [np.flatnonzero(p).tolist() for p in pattern]
     return CompiledAlgebra(
@@ -391,7 +356,7 @@ class RankRevealingQR:
 
 
 def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
-    """A (m, n) with everything below ``cut`` as zero."""
+    """Null space and solution of A (m, n)."""
     algebra = _pivoted(A, cut)
     if algebra is not None:
         return RankRevealingQR(algebra.complement(), algebra.solve)
@@ -399,8 +364,7 @@ def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
     rank = int(np.sum(size > cut))
 
     def solve(b: FloatArray) -> FloatArray:
-        out: FloatArray = right[:rank].T @ ((left[:, :rank].T @ b) / size[:rank])
-        return out
+        return right[:rank].T @ ((left[:, :rank].T @ b) / size[:rank])  # type: ignore[no-any-return]
 
     return RankRevealingQR(right[rank:].T, solve)
 
@@ -408,12 +372,7 @@ def rank_revealing_qr(A: FloatArray, cut: float) -> RankRevealingQR:
 def null_basis(A: FloatArray, cut: float) -> FloatArray:
     """Orthonormal basis (n, n - rank) of the x with A x = 0, for A (m, n) with everything below
     ``cut`` as zero."""
-    algebra = _pivoted(A, cut)
-    if algebra is not None:
-        return algebra.complement()
-    _, size, right = np.linalg.svd(A)
-    out: FloatArray = right[int(np.sum(size > cut)) :].T
-    return out
+    return rank_revealing_qr(A, cut).null
 
 
 def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
@@ -423,8 +382,7 @@ def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
     algebra = _pivoted(A, rcond * longest)
     if algebra is not None:
         return algebra.solve(b)
-    out: FloatArray = np.asarray(np.linalg.lstsq(A, b, rcond=rcond)[0], dtype=np.float64)
-    return out
+    return np.asarray(np.linalg.lstsq(A, b, rcond=rcond)[0], dtype=np.float64)
 
 
 def smallest_singular_value(A: FloatArray, zero: float) -> float:
@@ -444,7 +402,7 @@ def singular_value(A: FloatArray, k: int) -> float:
     return float(np.linalg.svd(A, compute_uv=False)[k - 1])
 
 
-def _pivoted(A: FloatArray, cut: float) -> RowAlgebra | None:
+def _pivoted(A: FloatArray, cut: float) -> CompiledAlgebra | None:
     """The factorisation of A by the kernel, if it is there and A has many columns."""
     if A.shape[1] <= ARPACK_ABOVE:
         return None

@@ -13,10 +13,8 @@ m = R u, have
     G  = d^T X_lin (J_a - J_b),             Gdot v = d . (B_lin + w x r) + |d x r|^2/|p|,
     G  = (m x n)^T X_ang (J_a - J_b),       Gdot v = n . (B_ang x m + w x (w x m)),
 
-with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row has constant
-entries c_i in G, and Gdot v = 0.
-
-A joint row is a linear relation of joint coordinates, g = sum c_i q_i - s.
+with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row, the linear
+relation g = sum c_i q_i - s of joint coordinates, has constant entries c_i in G, and Gdot v = 0.
 
 Vectors of three numbers are plain floats here, because NumPy's overhead is many times the cost of
 their products.  They are in the axes of the joint that carries b (the world's for a closure to the
@@ -31,7 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pinocchio as pin
@@ -40,7 +38,6 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.mechanism import MechanismData, per_model
 
 Vector = Sequence[float]
 """Three numbers."""
@@ -95,58 +92,61 @@ def from_world(R: Sequence[Vector], a: Vector) -> Triple:
     return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
 
 
-class JointRows:
-    """The kept, scaled joint rows of one closure.
+class _JointTerm(NamedTuple):
+    """c q of one joint in a joint row."""
 
-    Attributes
-    ----------
-    G : (count, nv)
-        Their constant Jacobian.
-    first_row, count
-        Index of the first one among the rows of the mechanism, and their number.
-    support : (nv,)
-        0: the world Jacobian has no part in them.
-    """
+    coefficient: float
+    in_q: int
+    in_v: int
+    continuous: bool
+    """Whether q is an angle that is stored as (cos, sin)."""
+
+
+class _JointRows:
+    """The kept, scaled joint rows of one closure; their Jacobian ``G`` (count, nv) is constant."""
 
     def __init__(
         self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
     ) -> None:
         kept = [(row, float(s)) for row, s, k in zip(loop.rows.joint_rows, 1.0 / scale, keep) if k]
         self.first_row, self.count = start, len(kept)
-        self.support = np.zeros(model.nv)
+        self.support = np.zeros(model.nv)  # the world Jacobian has no part in them
         self.G = np.zeros((self.count, model.nv))
-        # (c_i, place of q_i in q, in v) of each joint, and the offset, over the row scale.
-        self._terms: list[tuple[list[tuple[float, int, int]], float]] = []
+        # The terms of each row, and its offset, over the row scale.
+        self._rows: list[tuple[list[_JointTerm], float]] = []
         for own, (row, factor) in zip(self.G, kept):
             terms = []
             for c, name in zip(row.coefficients, row.joints):
                 joint = model.joints[model.getJointId(name)]
-                terms.append((factor * c, int(joint.idx_q), int(joint.idx_v)))
+                terms.append(_JointTerm(factor * c, joint.idx_q, joint.idx_v, joint.nq == 2))
                 own[joint.idx_v] = factor * c
-            self._terms.append((terms, factor * row.offset))
+            self._rows.append((terms, factor * row.offset))
 
     def constants(self) -> list[dict[str, Any]]:
         """Constants of each row for the compiled kernel."""
         return [
             {
-                "row": self.first_row + i,
-                "coefficients": np.array([c for c, _, _ in terms]),
-                "in_q": [k for _, k, _ in terms],
-                "in_v": [k for _, _, k in terms],
+                "row": row,
+                "coefficients": np.array([term.coefficient for term in terms]),
+                "in_q": [term.in_q for term in terms],
+                "in_v": [term.in_v for term in terms],
                 "offset": offset,
             }
-            for i, (terms, offset) in enumerate(self._terms)
+            for row, (terms, offset) in enumerate(self._rows, self.first_row)
         ]
 
     def bind(self, data: pin.Data) -> None:
         """Do nothing: joint rows depend on q alone."""
 
     def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
-        """Append for each row six zeros for G, which is set apart, then g, then Gdot v = 0."""
-        for terms, offset in self._terms:
+        """Append for each row six zeros for G, which is constant, then g, then Gdot v = 0.
+
+        Angles that are stored as (cos, sin), of which drives have rows, are in [-pi, pi].
+        """
+        for terms, offset in self._rows:
             g = -offset
-            for c, k, _ in terms:
-                g += c * q[k]
+            for c, k, _, continuous in terms:
+                g += c * (math.atan2(q[k + 1], q[k]) if continuous else q[k])
             out += 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, g, 0.0
 
 
@@ -349,6 +349,8 @@ class LoopKinematics:
     ----------
     g : (m,), G : (m, nv), bias : (m,)
         Closure errors, their Jacobian in tangent coordinates, and Gdot v, after :meth:`update`.
+    target_rate : (m,)
+        s' of the drives, so that the rates of the errors are G v - s'; 0 in the rows of loops.
     """
 
     def __init__(
@@ -362,25 +364,27 @@ class LoopKinematics:
         total = sum(loop.rows.count for loop in loops)
         scale = np.ones(total) if scale is None else scale
         mask = np.ones(total, dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
-        self._loops: list[_LoopRows | JointRows] = []
+        self._loops: list[_LoopRows | _JointRows] = []
+        supports = [np.zeros((0, model.nv))]
+        self._constant: list[tuple[slice, FloatArray]] = []
+        self._anchored = 0
         at = m = 0
         for loop in loops:
             rows = slice(at, at + loop.rows.count)
-            kind = JointRows if loop.rows.joint_rows else _LoopRows
+            kind = _JointRows if loop.rows.joint_rows else _LoopRows
             resolved = kind(model, loop, scale[rows], mask[rows], m)
             at = rows.stop
-            m += resolved.count
-            if resolved.count:
-                self._loops.append(resolved)
-        self._support = np.zeros((m, model.nv))
-        for resolved in self._loops:
-            first = resolved.first_row
-            self._support[first : first + resolved.count] = resolved.support
-        self._joint_rows = [loop for loop in self._loops if isinstance(loop, JointRows)]
-        self._constant = [
-            (slice(rows.first_row, rows.first_row + rows.count), rows.G)
-            for rows in self._joint_rows
-        ]
+            if not resolved.count:
+                continue
+            self._loops.append(resolved)
+            supports.append(np.tile(resolved.support, (resolved.count, 1)))
+            own = slice(m, m + resolved.count)
+            m = own.stop
+            if isinstance(resolved, _JointRows):
+                self._constant.append((own, resolved.G))
+            else:
+                self._anchored = m
+        self._support = np.concatenate(supports)
         place = (np.cumsum(mask) - 1).tolist()
         size = scale.tolist()
         self._eliminations = [
@@ -395,9 +399,10 @@ class LoopKinematics:
         table = self._numbers.reshape(m, 8)
         self._wrenches, self.g, self.bias = table[:, :6], table[:, 6], table[:, 7]
         self.G = np.zeros(self._support.shape)
+        self.target_rate = np.zeros(m)
         self._data: pin.Data | None = None
 
-    def copy_workspace(self) -> LoopKinematics:
+    def copy_workspace(self) -> Self:
         """The same rows with memory of their own: anchors are not looked up again."""
         other = copy(self)
         other._loops = [copy(loop) for loop in self._loops]
@@ -416,7 +421,12 @@ class LoopKinematics:
         ``eliminations``."""
         return {
             "loops": [loop.constants() for loop in self._loops if isinstance(loop, _LoopRows)],
-            "joint_rows": [row for rows in self._joint_rows for row in rows.constants()],
+            "joint_rows": [
+                row
+                for rows in self._loops
+                if isinstance(rows, _JointRows)
+                for row in rows.constants()
+            ],
             "eliminations": [
                 (e.row, e.other, e.factor, np.flatnonzero(self._support[e.row]).tolist())
                 for e in self._eliminations
@@ -442,8 +452,8 @@ class LoopKinematics:
         for loop in self._loops:
             loop.evaluate(q, with_bias, numbers)
         self._numbers[:] = numbers
-        G = self.G
-        np.dot(self._wrenches, self._J, G)
+        G, anchored = self.G, slice(self._anchored)
+        np.dot(self._wrenches[anchored], self._J, G[anchored])
         np.multiply(G, self._support, G)
         for own, entries in self._constant:
             G[own] = entries
@@ -451,38 +461,37 @@ class LoopKinematics:
             for each in (G, self.g, self.bias):
                 each[row] -= factor * each[other]
 
+    def evaluate(
+        self, model: pin.Model, data: pin.Data, q: FloatArray, v: FloatArray | None = None
+    ) -> None:
+        """Compute the kinematics in ``data`` at q (nq,), and :meth:`update`; Gdot v if v (nv,) is
+        given."""
+        pin.crba(model, data, q, pin.Convention.WORLD)
+        if v is not None:
+            pin.nonLinearEffects(model, data, q, v)
+        self.update(data, q, with_bias=v is not None)
 
-def all_rows(mechanism: MechanismData) -> LoopKinematics:
-    """All rows of a mechanism's closures, unscaled, with memory of their own."""
-    return _all_rows(mechanism).copy_workspace()
+    def move_to(self, t: float) -> None:
+        """Do nothing: the rows of loops do not depend on the time t (s)."""
 
-
-@per_model
-def _all_rows(mechanism: MechanismData) -> LoopKinematics:
-    return LoopKinematics(mechanism.model, mechanism.loops)
+    def errors(
+        self, model: pin.Model, t: FloatArray, q: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """g - s and G v - s' (n, rows) at n times t (n,) and states q (n, nq), v (n, nv)."""
+        data = workspace(model)
+        g, c = np.empty((2, len(q), len(self.g)))
+        for i in range(len(q)):
+            self.evaluate(model, data, q[i])
+            self.move_to(t[i])
+            g[i], c[i] = self.g, self.G @ v[i] - self.target_rate
+        return g, c
 
 
 def closure_errors(
-    model: pin.Model,
-    loops: Sequence[LoopClosure],
-    q: FloatArray,
-    v: FloatArray,
-    rows: LoopKinematics | None = None,
+    model: pin.Model, loops: Sequence[LoopClosure], q: FloatArray, v: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv).
-
-    ``rows``: from :func:`all_rows`, where a mechanism is at hand.
-    """
-    rows = LoopKinematics(model, loops) if rows is None else rows
-    data = workspace(model)
-    g = np.empty((len(q), len(rows.g)))
-    c = np.empty_like(g)
-    for i in range(len(q)):
-        pin.crba(model, data, q[i], pin.Convention.WORLD)
-        rows.update(data, q[i], with_bias=False)
-        g[i] = rows.g
-        c[i] = rows.G @ v[i]
-    return g, c
+    """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv)."""
+    return LoopKinematics(model, loops).errors(model, np.zeros(len(q)), q, v)
 
 
 def row_wrenches(loop: LoopClosure, model: pin.Model, data: pin.Data) -> FloatArray:

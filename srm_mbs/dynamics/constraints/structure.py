@@ -23,6 +23,7 @@ from srm_mbs.dynamics.constraints.projection import (
     PIVOT_ZERO,
     cholesky,
     pivoted_qr,
+    symmetric,
     unwhiten,
     whiten,
 )
@@ -54,9 +55,12 @@ CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
 CLOSURE_ROUNDING = 1e-14
 """Closure error, in row units, at which Newton's iteration ends."""
+CLOSED = 1e-11
+"""Closure error, in row units, below which a configuration is closed."""
 RESTARTS = 10
+"""Number of walks from the start."""
 WALK_STEPS = 12
-"""Walks from the start, and steps of each."""
+"""Number of steps of a walk."""
 STRUCTURAL_PIVOT = 1e-6
 """A pivot (of scaled rows) above this counts as independent."""
 ZERO_ROW = 1e-9
@@ -76,7 +80,7 @@ class ManifoldSampler:
     Parameters
     ----------
     mechanism, units
-        The mechanism, and the units in which it counts.
+        The mechanism, and the units of its coordinates and rows.
 
     Attributes
     ----------
@@ -87,6 +91,7 @@ class ManifoldSampler:
     """
 
     def __init__(self, mechanism: MechanismData, units: Units) -> None:
+        self._mechanism = mechanism
         self.model = mechanism.model
         self.data = workspace(self.model)
         self.units = units
@@ -96,22 +101,19 @@ class ManifoldSampler:
         self.scale = np.ones(len(self._rows.g))
         self.eliminations: tuple[Elimination, ...] = ()
         pattern = self._pattern = self._rows.pattern()
-        self._anchored = [
-            at
-            for at, closure in enumerate(loop for loop in mechanism.loops for _ in loop.row_names)
-            if not closure.rows.joint_rows
-        ]
+        closures = [loop for loop in mechanism.loops for _ in loop.row_names]
+        self._anchored = [row for row, loop in enumerate(closures) if not loop.rows.joint_rows]
+        # All rows and those of the loops in the mass metric, those of the loops in units.
         self._all = row_algebra(pattern, self.model)
         driven = self.closed < len(self.scale)
         self._loops = row_algebra(pattern[: self.closed], self.model) if driven else self._all
-        self._plain = row_algebra(pattern[: self.closed])
+        self._in_units = row_algebra(pattern[: self.closed])
         self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
     def _evaluate(self, q: FloatArray) -> None:
         """g and G of all rows, and M in ``data``, at q."""
-        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self._rows.update(self.data, q, with_bias=False)
+        self._rows.evaluate(self.model, self.data, q)
         self._factorised = None
 
     def _scaled(self, q: FloatArray) -> FloatArray:
@@ -148,22 +150,22 @@ class ManifoldSampler:
                 by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
                 try:
                     longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
-                    self._plain.factor(None, by_unit, CLOSING_RANK * longest)
+                    self._in_units.factor(None, by_unit, CLOSING_RANK * longest)
                 except EvaluationError:
                     return None
-                return pin.integrate(self.model, q, -self._plain.solve(g) * unit)  # type: ignore[no-any-return]
+                return pin.integrate(self.model, q, -self._in_units.solve(g) * unit)  # type: ignore[no-any-return]
 
             return float(np.abs(g).max()), step
 
         return newton(q, linearise, iterations + 1, tolerance=CLOSURE_ROUNDING, monotone=False)
 
-    def set_scale(self, mechanism: MechanismData, rng: np.random.Generator) -> None:
+    def set_scale(self, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""
         squares = np.zeros_like(self.scale)
         uncancelled = np.zeros(2)
         for _ in range(OPEN_SAMPLES):
             spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
-            rows, _ = self.factorised(pin.integrate(self.model, mechanism.q0, spread))
+            rows, _ = self.factorised(pin.integrate(self.model, self._mechanism.q0, spread))
             squares += rows.row_squares
             # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
             J = world_jacobian(self.data)
@@ -176,7 +178,7 @@ class ManifoldSampler:
         squares /= OPEN_SAMPLES
         uncancelled /= OPEN_SAMPLES
         at = 0
-        for loop in mechanism.loops:
+        for loop in self._mechanism.loops:
             lengths, turns, joints = loop.rows.blocks
             own = squares[at : at + loop.rows.count]
             scale = self.scale[at : at + loop.rows.count]
@@ -199,13 +201,10 @@ class ManifoldSampler:
         rows, _ = self.factorised(q)
         count = len(self.scale)
         X = np.array([rows.solve(row) for row in np.eye(count)])
-        upper = np.triu(self.data.M)
-        M = upper + np.triu(upper, 1).T
-        size = np.sqrt(np.maximum(((X @ M) * X).sum(axis=1), 0.0))
+        size = np.sqrt(np.maximum(((X @ symmetric(self.data.M)) * X).sum(axis=1), 0.0))
         # A row is no further from a span than it is long, unless it is not in use.
         used = size * np.sqrt(rows.row_squares) > 0.5
-        out: FloatArray = np.divide(1.0, size, out=np.full(count, np.nan), where=used)
-        return out
+        return np.where(used, 1.0 / np.where(used, size, 1.0), np.nan)
 
     def separate(self, samples: Sequence[FloatArray], kept: BoolArray) -> None:
         """Find eliminations for rows that are nearly parallel to others between the same bodies.
@@ -285,7 +284,7 @@ class ManifoldSampler:
         move = direction * (reach / size)
         for _ in range(8):
             closed, error = self.close(pin.integrate(self.model, q, move))
-            if error < 1e-11:
+            if error < CLOSED:
                 return closed
             move = 0.5 * move
         return None
@@ -303,11 +302,11 @@ class ManifoldSampler:
         The first steps of two of them go along the velocity ``first`` (nv,) and against it, unless
         it is zero.
         """
-        along = [] if first is None or not np.abs(first).max() > 0.0 else [first, -first]
+        along = [] if first is None or not first.any() else [first, -first]
         for restart in range(restarts):
             q = start
             for k in range(steps):
-                # The walk moves drives: every closed configuration counts, driven there or not.
+                # Drives may move: every closed configuration counts, driven there or not.
                 _, rows = self.factorised(q)
                 if rows.rank == self.model.nv:
                     break
@@ -379,15 +378,15 @@ class Structure:
 
 
 def _closed(
-    mechanism: MechanismData, walker: ManifoldSampler, rng: np.random.Generator
+    mechanism: MechanismData, sampler: ManifoldSampler, rng: np.random.Generator
 ) -> Iterator[FloatArray]:
     """The closed configurations that the analysis looks at."""
-    start, error = walker.close(mechanism.q0, iterations=100)
-    if error < 1e-11:
+    start, error = sampler.close(mechanism.q0, iterations=100)
+    if error < CLOSED:
         yield start
     else:
         start = np.array(mechanism.q0)
-    yield from walker.walk(start, rng, RESTARTS, WALK_STEPS, mechanism.v0)
+    yield from sampler.walk(start, rng, RESTARTS, WALK_STEPS, mechanism.v0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,49 +401,40 @@ class _Samples:
 
     def ranks(self) -> IndexArray:
         """The number (n,) of independent rows in each."""
-        ranks: IndexArray = (self.pivots > STRUCTURAL_PIVOT).sum(axis=1)
-        return ranks
+        return np.count_nonzero(self.pivots > STRUCTURAL_PIVOT, axis=1)  # type: ignore[no-any-return]
 
     def last_pivots(self, rank: int) -> FloatArray:
         """The last structural pivot in the configurations of that rank."""
-        last: FloatArray = self.pivots[self.ranks() == rank, rank - 1]
-        return last
+        return self.pivots[self.ranks() == rank, rank - 1]  # type: ignore[no-any-return]
 
 
-def _sampled(walker: ManifoldSampler, configurations: Iterable[FloatArray]) -> _Samples:
-    rows, closed_rows, nv = len(walker.scale), walker.closed, walker.model.nv
-    visited: list[FloatArray] = []
-    pivots: list[FloatArray] = []
-    of_loops: list[FloatArray] = []
-    largest = np.zeros(rows)
+def _sampled(sampler: ManifoldSampler, configurations: Iterable[FloatArray]) -> _Samples:
+    visited, pivots, of_loops = [], [], []
+    largest = np.zeros(len(sampler.scale))
     for q in configurations:
-        every, loops = walker.factorised(q)
-        np.maximum(largest, np.sqrt(every.row_squares), out=largest)
+        rows, loops = sampler.factorised(q)
+        np.maximum(largest, np.sqrt(rows.row_squares), out=largest)
         visited.append(q)
-        pivots.append(every.pivots)
+        pivots.append(rows.pivots)
         of_loops.append(loops.pivots)
-
-    def stacked(found: list[FloatArray], count: int) -> FloatArray:
-        return np.array(found) if found else np.zeros((0, min(count, nv)))
-
-    return _Samples(visited, stacked(pivots, rows), stacked(of_loops, closed_rows), largest)
+    return _Samples(visited, np.array(pivots), np.array(of_loops), largest)
 
 
-def _balanced(walker: ManifoldSampler, samples: _Samples, rank: int) -> _Samples:
+def _balanced(sampler: ManifoldSampler, samples: _Samples, rank: int) -> _Samples:
     """``samples`` after :meth:`ManifoldSampler.separate` and :meth:`ManifoldSampler.balance`; as
     they are, with their scale, if that does not raise the last pivot or makes more rows
     independent."""
     regular = np.flatnonzero(samples.ranks() == rank)
     chosen = regular[:: -(-len(regular) // BALANCING_SAMPLES)]
-    scale = walker.scale
+    scale = sampler.scale
     measured = [samples.configurations[i] for i in chosen]
-    walker.separate(measured, samples.largest > ZERO_ROW)
-    walker.balance(measured)
-    again = _sampled(walker, samples.configurations)
+    sampler.separate(measured, samples.largest > ZERO_ROW)
+    sampler.balance(measured)
+    again = _sampled(sampler, samples.configurations)
     before = float(np.median(samples.last_pivots(rank)))
     if int(again.ranks().max()) == rank and np.median(again.last_pivots(rank)) > before:
         return again
-    walker.scale, walker.eliminations = scale, ()
+    sampler.scale, sampler.eliminations = scale, ()
     return samples
 
 
@@ -472,24 +462,21 @@ def analyse(mechanism: MechanismData) -> Structure:
     if not names:
         return Structure((), np.ones(0), np.ones(0, bool), 0, 0, 1.0, units, 0, ())
     rng = np.random.default_rng(0)
-    walker = ManifoldSampler(mechanism, units)
-    walker.set_scale(mechanism, rng)
-    samples = _sampled(walker, _closed(mechanism, walker, rng))
-    notes: list[str] = []
+    sampler = ManifoldSampler(mechanism, units)
+    sampler.set_scale(rng)
+    samples = _sampled(sampler, _closed(mechanism, sampler, rng))
     if not samples.configurations:
-        notes.append(
-            "no closed configuration was found: the loops do not close near the initial guess"
-        )
+        note = "no closed configuration was found: the loops do not close near the initial guess"
         kept = np.ones(len(names), dtype=bool)
-        rank = min(len(names), mechanism.model.nv)
-        closed = min(walker.closed, mechanism.model.nv)
-        return Structure(names, walker.scale, kept, rank, closed, 1.0, units, 0, tuple(notes))
+        rank, loop_rank = (min(rows, mechanism.model.nv) for rows in (len(names), sampler.closed))
+        return Structure(names, sampler.scale, kept, rank, loop_rank, 1.0, units, 0, (note,))
+    notes: list[str] = []
     kept = samples.largest > ZERO_ROW
-    kept[walker.closed :] = True
+    kept[sampler.closed :] = True
     loop_rank = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     rank = int(samples.ranks().max())
     if rank and np.median(samples.last_pivots(rank)) < SMALL_REFERENCE_PIVOT:
-        samples = _balanced(walker, samples, rank)
+        samples = _balanced(sampler, samples, rank)
     sigma_ref = float(np.median(samples.last_pivots(rank))) if rank else 1.0
     if rank < loop_rank + len(mechanism.drives):
         driven = ", ".join(repr(drive.name) for drive in mechanism.drives)
@@ -506,18 +493,17 @@ def analyse(mechanism: MechanismData) -> Structure:
                 f"{smallest_pivot:.1e}, largest redundant pivot {redundant:.1e}"
             )
             log.warning("%s: %s", mechanism.name, notes[-1])
-    visited = len(samples.configurations)
     return Structure(
         names,
-        walker.scale,
+        sampler.scale,
         kept,
         rank,
         loop_rank,
         sigma_ref,
         units,
-        visited,
+        len(samples.configurations),
         tuple(notes),
-        walker.eliminations,
+        sampler.eliminations,
     )
 
 

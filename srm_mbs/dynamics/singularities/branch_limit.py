@@ -60,6 +60,11 @@ NEAR = 1e-2
 """Largest distance (units) of the requested configuration from the singular one."""
 
 
+def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
+    """The polynomial through ``values`` (k, ...) at ``times`` (k,), at zero."""
+    return np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
+
+
 class BranchLimit:
     """P and z = E (Gdot v - s'') on one branch at q.
 
@@ -107,18 +112,13 @@ class BranchLimit:
             if len(found) < len(nodes):
                 continue
             values = np.array([self._normal_part(k, node) for k, node in enumerate(found)])
-            normal = self._at_zero(times, values)
-            accuracy = float(np.abs(normal - self._at_zero(times[1:-1], values[1:-1])).max())
+            normal = _at_zero(times, values)
+            accuracy = float(np.abs(normal - _at_zero(times[1:-1], values[1:-1])).max())
             if accuracy < self.accuracy:
                 self.accuracy, self._normal = accuracy, normal
                 self._times, self._nodes, self._normals = times, found, values
             if accuracy < ACCURATE:
                 break
-
-    @staticmethod
-    def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
-        out: FloatArray = np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
-        return out
 
     def _follow(self, q: FloatArray, move: FloatArray) -> FloatArray | None:
         """The configuration of the branch near q (+) move, moved off it along the normals only."""
@@ -167,33 +167,31 @@ class BranchLimit:
     def projector(self) -> FloatArray:
         """P (nv, nv) in the model's coordinates."""
         nv = len(self._unit)
-        out: FloatArray = self._normal[:, :nv] * self._unit[:, None] / self._unit
-        return out
+        return self._normal[:, :nv] * self._unit[:, None] / self._unit
 
     def _off(self, normal: FloatArray, v: FloatArray) -> FloatArray:
-        out: FloatArray = normal @ self._geometry.rates(v) * self._unit
-        return out
+        """[P, -E s'] (v, 1) (nv,) in the model's coordinates, for ``normal`` = [P, -E s']."""
+        return normal @ self._geometry.rates(v) * self._unit
 
     def off_branch(self, v: FloatArray) -> FloatArray:
         """P v - E s' (nv,): the part of the velocity v (nv,) that leads off the branch."""
         return self._off(self._normal, v)
 
-    def _bend(self, k: int, node: FloatArray, v: FloatArray) -> FloatArray:
+    def _quadratic_at(self, k: int, node: FloatArray, v: FloatArray) -> FloatArray:
         """E (Gdot v - s'') (nv,) at node k for the velocity v (nv,) of the branch there."""
         if k == CENTRE:
             acceleration = self._centre.limit_acceleration(v, np.zeros(len(v)))
             return -acceleration if acceleration is not None else np.zeros(len(v))
         bias = self._geometry.bias(node, self._geometry.rates(v))
-        out: FloatArray = self._generalised_inverse(node, bias[:, None])[:, 0] * self._unit
-        return out
+        return self._generalised_inverse(node, bias[:, None])[:, 0] * self._unit
 
     def quadratic(self, v: FloatArray) -> FloatArray:
         """z = E (Gdot v - s'') (nv,) at q for the velocity v (nv,), model coordinates."""
         values = [
-            self._bend(k, node, v - self._off(normal, v))
+            self._quadratic_at(k, node, v - self._off(normal, v))
             for k, (node, normal) in enumerate(zip(self._nodes, self._normals))
         ]
-        return self._at_zero(self._times, np.array(values))
+        return _at_zero(self._times, np.array(values))
 
     def multiplier(self, v: FloatArray, free: FloatArray) -> FloatArray:
         """yhat (nv,) at q for the velocity v and the acceleration ``free`` = M^-1 f without
@@ -222,8 +220,7 @@ def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray
     normal = null - tangent @ (tangent.T @ null)
     effects = np.array([(singular.hessians(t) @ normal).ravel() for t in tangent.T]).T
     wanted = effects @ (tangent.T @ u)
-    out: FloatArray = tangent @ determined_solution(effects, wanted)
-    return out
+    return tangent @ determined_solution(effects, wanted)
 
 
 def branch_limit(

@@ -37,8 +37,7 @@ def _two_lines(form: FloatArray) -> FloatArray:
     if not (low < 0.0 < high and min(-low, high) > ISOLATED * max(-low, high)):
         return np.zeros((0, 2))
     along = np.sqrt(np.array([high, -low]) / (high - low))
-    out: FloatArray = np.array([vectors @ along, vectors @ (along * [1.0, -1.0])])
-    return out
+    return np.array([vectors @ along, vectors @ (along * [1.0, -1.0])])
 
 
 def _newton(forms: FloatArray, metric: FloatArray, target: FloatArray | None) -> FloatArray:
@@ -61,10 +60,10 @@ def _newton(forms: FloatArray, metric: FloatArray, target: FloatArray | None) ->
         else:
             balance = (w - target) @ metric + np.einsum("ij,ija->ia", mu, Bw)
             residual = np.concatenate([quadratic, balance], axis=1)
-            bent = metric + np.einsum("ij,jab->iab", mu, forms)
+            hessian = metric + np.einsum("ij,jab->iab", mu, forms)
             upper = np.concatenate([2.0 * Bw, corner], axis=2)
             matrix = np.concatenate(
-                [upper, np.concatenate([bent, np.swapaxes(Bw, 1, 2)], axis=2)], axis=1
+                [upper, np.concatenate([hessian, np.swapaxes(Bw, 1, 2)], axis=2)], axis=1
             )
         step = np.einsum("iab,ib->ia", np.linalg.pinv(matrix, rcond=1e-12), residual)
         # A singular matrix on the way must not throw a start to infinity.
@@ -75,8 +74,7 @@ def _newton(forms: FloatArray, metric: FloatArray, target: FloatArray | None) ->
             break
     good = np.abs(residual).max(axis=1) <= SOLVED
     good &= np.linalg.svd(matrix, compute_uv=False)[:, -1] > ISOLATED
-    out: FloatArray = w[good]
-    return out
+    return w[good]  # type: ignore[no-any-return]
 
 
 def branch_tangents(
@@ -121,7 +119,7 @@ def branch_tangents(
     unseen = right[seen:].T
     # The complement in the mass metric: the distance to an arriving velocity splits there.
     complement = np.linalg.svd(unseen.T @ metric)[2][p - seen :].T
-    bent = complement.T @ independent.reshape(k, p, p) @ complement
+    restricted = complement.T @ independent.reshape(k, p, p) @ complement
     inner = complement.T @ metric @ complement
     inner = inner / np.trace(inner) * seen
     target, base = np.zeros(seen), np.zeros(p)
@@ -131,13 +129,15 @@ def branch_tangents(
         target, base = split[:seen], unseen @ split[seen:]
     speed = float(np.linalg.norm(target))
     if seen - singular.nullity == 1:
-        lines = _two_lines(bent[0]) if seen == 2 and k == 1 else _newton(bent, inner, None)
+        lines = (
+            _two_lines(restricted[0]) if seen == 2 and k == 1 else _newton(restricted, inner, None)
+        )
         if speed > 0.0:
             share = (lines @ inner @ target) / np.einsum("ia,ab,ib->i", lines, inner, lines)
             share[np.abs(share) < 1e-12 * speed] = speed
             lines = lines * share[:, None]
     elif speed > 0.0 and not driven:
-        lines = _newton(bent, inner, target / speed) * speed
+        lines = _newton(restricted, inner, target / speed) * speed
     else:
         return none
     found = (lines @ complement.T + base) @ null.T

@@ -57,8 +57,7 @@ def determined_solution(rows: FloatArray, right: FloatArray) -> FloatArray:
     """
     left, size, basis = np.linalg.svd(rows, full_matrices=False)
     used = size > DETERMINED
-    out: FloatArray = basis[used].T @ ((left[:, used].T @ right) / size[used])
-    return out
+    return basis[used].T @ ((left[:, used].T @ right) / size[used])  # type: ignore[no-any-return]
 
 
 def refine_singular_point(
@@ -263,8 +262,7 @@ class SingularConfiguration:
         motions = self.null @ np.random.default_rng(0).standard_normal((self.null.shape[1], count))
         values = np.array([self.curvature(motion) for motion in motions.T]).T
         turned, size, _ = np.linalg.svd(values / np.sqrt(count), full_matrices=False)
-        out: FloatArray = self.left @ turned[:, size > VANISHING]
-        return out
+        return self.left @ turned[:, size > VANISHING]  # type: ignore[no-any-return]
 
     @cached_property
     def participants(self) -> Participants:
@@ -284,8 +282,7 @@ class SingularConfiguration:
         """
         bias, q = self.geometry.bias, self.q
         columns = [0.25 * (bias(q, u + e) - bias(q, u - e)) for e in np.eye(len(u))]
-        out: FloatArray = self.left.T @ np.array(columns).T
-        return out
+        return self.left.T @ np.array(columns).T
 
     def third_derivative(self, u: FloatArray) -> FloatArray:
         """u_j^T D^3 g[v, v, v] (n,) for the rates u (nv,)."""
@@ -326,8 +323,7 @@ class SingularConfiguration:
         rank = int(np.sum(singular > DETERMINED))
         if rank != self.structural_rank:
             return None
-        out: FloatArray = right[rank:].T
-        return out
+        return right[rank:].T
 
     def limit_acceleration(self, v: FloatArray, free: FloatArray) -> FloatArray | None:
         """Acceleration v' (nv,) of the motion through here with the velocity v (nv,).
@@ -352,8 +348,7 @@ class SingularConfiguration:
         gap = right * size**2 - rows @ (free / unit)
         white = np.linalg.solve(U.T, rows.T).T
         fit = determined_solution(white / np.linalg.norm(white, 2), gap / np.linalg.norm(white, 2))
-        out: FloatArray = free + unit * np.linalg.solve(U, fit)
-        return out
+        return free + unit * np.linalg.solve(U, fit)
 
 
 def analyse_singular(

@@ -10,13 +10,15 @@ only if the loop has no other joint.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import WORLD
 
 Direction = tuple[float, float, float]
@@ -52,6 +54,21 @@ class Body:
     name: str
     inertia: pin.Inertia | None = None
     visuals: tuple[Element, ...] = ()
+
+
+def inertia_tensor(moments: Sequence[float] | FloatArray) -> FloatArray:
+    """The tensor (3, 3) of the moments xx, yy, zz, xy, xz, yz (kg m^2)."""
+    xx, yy, zz, xy, xz, yz = moments
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def inertia_at(
+    placement: pin.SE3, mass: float, moments: Sequence[float] | FloatArray
+) -> pin.Inertia:
+    """Inertia in the body's frame, from the moments about the centre of mass, which is at
+    ``placement``, in its axes (:func:`inertia_tensor`)."""
+    R = placement.rotation
+    return pin.Inertia(mass, placement.translation, R @ inertia_tensor(moments) @ R.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +134,15 @@ class Joint:
         first, second = _negative(self.axis), self.second_axis
         if second is not None:
             first, second = _negative(second), first
-        values = {key: getattr(self, key) for key in self.__dataclass_fields__}
-        values |= {
-            "parent": self.child,
-            "child": self.parent,
-            "in_parent": self.in_child,
-            "in_child": self.in_parent,
-            "axis": first,
-            "second_axis": second,
-        }
-        return Joint(**values)
+        return replace(
+            self,
+            parent=self.child,
+            child=self.parent,
+            in_parent=self.in_child,
+            in_child=self.in_parent,
+            axis=first,
+            second_axis=second,
+        )
 
 
 def _negative(axis: Direction) -> Direction:
@@ -151,14 +167,6 @@ class SpanningTree:
     joints: tuple[Joint, ...]
     reversed: tuple[str, ...]
     cut: tuple[Joint, ...]
-
-
-class NoTreeError(Exception):
-    """Cutting the joints that the user named does not leave a tree; ``joint`` is at fault."""
-
-    def __init__(self, joint: str, problem: str, remedy: str) -> None:
-        super().__init__(problem)
-        self.joint, self.problem, self.remedy = joint, problem, remedy
 
 
 def _graph(joints: Sequence[Joint], root: str) -> Any:
@@ -196,7 +204,7 @@ def spanning_tree(joints: Sequence[Joint], root: str, cut: Sequence[str] = ()) -
 
     Raises
     ------
-    NoTreeError
+    InputError
         If cutting ``cut`` does not leave a tree.
     """
     import networkx
@@ -236,27 +244,29 @@ def _check_cut(
     cut: Sequence[str],
     root: str,
 ) -> None:
+    """Refuse joints to ``cut`` that there are not, that leave a loop, or that separate a body."""
+
+    def fault(problem: str, remedy: str) -> InputError:
+        return InputError(problem, element="cut", remedy=remedy)
+
     known = [joint.name for joint in joints]
-    proposal = "Left out, cut is " + repr([j.name for j in spanning_tree(joints, root).cut])
     for name in cut:
         if name not in known:
-            raise NoTreeError(
-                name, f"there is no joint {name!r} to cut", f"Known: {', '.join(known)}"
-            )
+            raise fault(f"there is no joint {name!r} to cut", f"Known: {', '.join(known)}")
+    cutting = f"cutting {', '.join(map(repr, cut))}"
+    proposal = f"Left out, cut is {[joint.name for joint in spanning_tree(joints, root).cut]}"
     for joint in candidates:
         if joint.name not in chosen:
-            raise NoTreeError(
-                joint.name,
-                f"cutting {', '.join(map(repr, cut))} leaves a loop through joint {joint.name!r}",
+            raise fault(
+                f"{cutting} leaves a loop through joint {joint.name!r}",
                 f"Cut one joint of each loop. {proposal}",
             )
     reached = distances(candidates, root)
     for joint in joints:
         for body in (joint.parent, joint.child):
             if body not in reached:
-                raise NoTreeError(
-                    joint.name,
-                    f"cutting {', '.join(map(repr, cut))} separates {body!r} from {root!r}",
+                raise fault(
+                    f"{cutting} separates {body!r} from {root!r}",
                     f"Cut one joint of each loop only. {proposal}",
                 )
 
@@ -265,10 +275,8 @@ def components(bodies: Mapping[str, Body], joints: Sequence[Joint]) -> Iterator[
     """Connected components, their bodies in the order of the file; ``world`` is the ground."""
     import networkx
 
-    graph = _graph(joints, WORLD)
-    graph.add_nodes_from(bodies)
-    left = dict.fromkeys((WORLD, *bodies))
-    while left:
-        found = networkx.node_connected_component(graph, next(iter(left)))
-        yield [body for body in left if body in found]
-        left = {body: None for body in left if body not in found}
+    graph = networkx.MultiGraph()
+    graph.add_nodes_from((WORLD, *bodies))
+    graph.add_edges_from((joint.parent, joint.child) for joint in joints)
+    for found in networkx.connected_components(graph):
+        yield [body for body in (WORLD, *bodies) if body in found]

@@ -7,8 +7,9 @@ same freedom; :data:`CLOSURE_OF` has the names of joint types of all formats.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
@@ -16,11 +17,10 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.joint_graph import (
     Body,
     Joint,
-    NoTreeError,
     SpanningTree,
     components,
     spanning_tree,
@@ -62,6 +62,19 @@ def origin(parent: Element, placement: pin.SE3) -> None:
             xyz=numbers(placement.translation),
             rpy=numbers(rpy(placement.rotation)),
         )
+
+
+def visual(
+    placement: pin.SE3, shape: str, sizes: Mapping[str, str], rgba: Iterable[float] | None
+) -> Element:
+    """A ``<visual>``: the element ``shape`` of its geometry with the attributes ``sizes``; red,
+    green, blue and opacity."""
+    out = Element("visual")
+    origin(out, placement)
+    SubElement(SubElement(out, "geometry"), shape, dict(sizes))
+    if rgba is not None:
+        SubElement(SubElement(out, "material", name=""), "color", rgba=numbers(rgba))
+    return out
 
 
 def anchor(link: str, placement: pin.SE3) -> dict[str, Any]:
@@ -164,7 +177,7 @@ AXIS_TOLERANCE = 1e-9
 """Norm of the difference of two unit vectors below which they are the same axis."""
 
 
-def placement(xyz: Sequence[float], rpy: Sequence[float]) -> pin.SE3:
+def placement(xyz: Sequence[float] | FloatArray, rpy: Sequence[float] | FloatArray) -> pin.SE3:
     """Placement of a URDF <origin>; m and rad."""
     return pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
 
@@ -284,10 +297,11 @@ MODEL_FRAME = "__model__"
 """Massless root link of a floating robot: the frame in which the file places its bodies."""
 
 
+@dataclass(eq=False)
 class GraphTranslator:
     """Translates bodies and joints of one file; raises :class:`InputError` at the first fault.
 
-    Parameters
+    Attributes
     ----------
     file, name
         Of the file, for messages, and of the robot.
@@ -301,23 +315,18 @@ class GraphTranslator:
         The body that floats if nothing connects it with the ground.
     free
         Bodies that move freely beside others, and the names of their joints.
+    notes
+        Sentences about the translation.
     """
 
-    def __init__(
-        self,
-        file: str,
-        name: str,
-        bodies: Mapping[str, Body],
-        placements: Mapping[str, pin.SE3],
-        joints: Sequence[Joint],
-        root: str,
-        free: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
-        self.file, self.name = file, name
-        self.bodies, self.placements = dict(bodies), placements
-        self.joints = list(joints)
-        self.root, self.free = root, free
-        self.notes: list[str] = []
+    file: str
+    name: str
+    bodies: Mapping[str, Body]
+    placements: Mapping[str, pin.SE3]
+    joints: Sequence[Joint]
+    root: str
+    free: Mapping[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def translate(self, cut: Sequence[str] = ()) -> Translation:
         """The tree and the entries ``base``, ``loop`` and ``force``.
@@ -328,21 +337,14 @@ class GraphTranslator:
             Names of the joints to cut; empty: chosen by :func:`spanning_tree`.
         """
         base, root = self._rooted()
-        try:
+        with naming(file=self.file):
             tree = spanning_tree(self.joints, root, cut)
-        except NoTreeError as error:
-            raise InputError(
-                error.problem, file=self.file, element="cut", remedy=error.remedy
-            ) from error
         entries: dict[str, Any] = {"base": base} if base != "fixed" else {}
-        loops = [self._closure(joint) for joint in tree.cut]
+        if tree.cut:
+            entries["loop"] = [self._closure(joint) for joint in tree.cut]
         forces = [
-            force
-            for joint in self.joints
-            for force in (self._bushing(joint) if joint in tree.cut else self._spring(joint))
+            force for joint in self.joints for force in self._springs(joint, joint in tree.cut)
         ]
-        if loops:
-            entries["loop"] = loops
         if forces:
             entries["force"] = forces
         self._add_notes(tree)
@@ -357,18 +359,17 @@ class GraphTranslator:
             root = self.root
             if is_identity(self.placements[root]):
                 return "floating", root
-            frame = Body(MODEL_FRAME)
-            self.bodies = {MODEL_FRAME: frame, **self.bodies}
-            self.joints.insert(
-                0,
-                Joint(f"{MODEL_FRAME}::{root}", "fixed", MODEL_FRAME, root, self.placements[root]),
-            )
+            self.bodies = {MODEL_FRAME: Body(MODEL_FRAME), **self.bodies}
+            name = f"{MODEL_FRAME}::{root}"
+            held = Joint(name, "fixed", MODEL_FRAME, root, self.placements[root])
+            self.joints = (held, *self.joints)
             return "floating", MODEL_FRAME
         for part in free:
             known = next((body for body in part if body in self.free), None)
             body = known or (self.root if self.root in part else part[0])
             name = self.free.get(body, f"{body}::free")
-            self.joints.append(Joint(name, "floating", WORLD, body, self.placements[body]))
+            moving = Joint(name, "floating", WORLD, body, self.placements[body])
+            self.joints = (*self.joints, moving)
             if known is None:
                 self.notes.append(
                     f"nothing connects {body!r} with the ground: it moves freely by the joint "
@@ -376,12 +377,14 @@ class GraphTranslator:
                 )
         return "fixed", WORLD
 
+    def _fault(self, joint: Joint, problem: str, remedy: str) -> InputError:
+        return InputError(problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy)
+
     def _refuse_cut(self, joint: Joint, why: str) -> InputError:
-        return InputError(
+        return self._fault(
+            joint,
             f"it closes a loop and has {why}, which no closure has",
-            file=self.file,
-            element=f"joint {joint.name!r}",
-            remedy="Name another joint of the loop in cut",
+            "Name another joint of the loop in cut",
         )
 
     def _closure(self, joint: Joint) -> dict[str, Any]:
@@ -401,20 +404,17 @@ class GraphTranslator:
             (joint.child, joint.in_child),
             joint.axis,
             joint.second_axis,
-            fault=lambda problem, remedy: InputError(
-                problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy
-            ),
+            fault=partial(self._fault, joint),
         )
 
-    def _bushing(self, joint: Joint) -> list[dict[str, Any]]:
-        """Spring and damper of a joint that is cut, in the one direction that it leaves free."""
-        if not (joint.stiffness or joint.damping):
-            return []
-        if joint.type not in ("revolute", "prismatic"):
-            raise self._refuse_cut(joint, "damping or a spring")
-        return [
-            bushing(
-                f"{joint.name}::spring",
+    def _springs(self, joint: Joint, cut: bool) -> Iterator[dict[str, Any]]:
+        """Spring and damper of a joint; the damping of a joint of the tree is in the URDF."""
+        name = f"{joint.name}::spring"
+        if cut and (joint.stiffness or joint.damping):
+            if joint.type not in ("revolute", "prismatic"):
+                raise self._refuse_cut(joint, "damping or a spring")
+            yield bushing(
+                name,
                 joint.type,
                 (joint.parent, joint.in_parent),
                 (joint.child, joint.in_child),
@@ -423,21 +423,14 @@ class GraphTranslator:
                 damping=joint.damping,
                 rest=joint.rest,
             )
-        ]
-
-    def _spring(self, joint: Joint) -> list[dict[str, Any]]:
-        """The spring of a joint of the tree; its damping is in the URDF."""
-        if not joint.stiffness:
-            return []
-        return [
-            {
+        elif joint.stiffness:
+            yield {
                 "type": "torsion_spring",
-                "name": f"{joint.name}::spring",
+                "name": name,
                 "joint": joint.name,
                 "stiffness": joint.stiffness,
                 "rest_angle": joint.rest,
             }
-        ]
 
     def _add_notes(self, tree: SpanningTree) -> None:
         """Note the joints that are cut, and those whose parent and child changed places."""

@@ -7,267 +7,90 @@ refused.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.xml import XmlValues
+from srm_mbs.errors import InputError
+from srm_mbs.formats.xml import XmlValues, words
 
-PLACED = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
-SECTIONS = (
-    "compiler",
-    "option",
-    "default",
-    "asset",
-    "worldbody",
-    "equality",
-    "tendon",
-    "contact",
-    "actuator",
-    "include",
-)
+
+def _table(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    return {tag: words(names) for tag, names in rows.items()}
+
+
+SECTIONS = words("compiler option default asset worldbody equality tendon contact actuator include")
 """Sections that are read, or looked into."""
-IGNORED_SECTIONS = (
-    "size",
-    "visual",
-    "statistic",
-    "sensor",
-    "keyframe",
-    "custom",
-    "extension",
-)
-BODY_READ = ("inertial", "joint", "freejoint", "geom", "site", "body", "frame")
+IGNORED_SECTIONS = words("size visual statistic sensor keyframe custom extension")
+BODY_READ = words("inertial joint freejoint geom site body frame")
 BODY_IGNORED = ("camera", "light")
-ATTRIBUTES: dict[str, tuple[str, ...]] = {
-    "compiler": (
-        "angle",
-        "eulerseq",
-        "coordinate",
-        "autolimits",
-        "inertiafromgeom",
-        "inertiagrouprange",
-        "boundmass",
-        "boundinertia",
-        "balanceinertia",
-        "settotalmass",
-        "meshdir",
-        "assetdir",
-    ),
-    "option": ("gravity", "wind", "density", "viscosity"),
-    "body": ("name", "childclass", "mocap", "gravcomp", *PLACED),
-    "frame": ("name", "childclass", *PLACED),
-    "inertial": ("mass", "diaginertia", "fullinertia", *PLACED),
-    "joint": (
-        "name",
-        "class",
-        "type",
-        "pos",
-        "axis",
-        "springdamper",
-        "stiffness",
-        "range",
-        "limited",
-        "ref",
-        "springref",
-        "armature",
-        "damping",
-        "frictionloss",
-        "actuatorgravcomp",
-    ),
-    "freejoint": ("name",),
-    "geom": (
-        "name",
-        "class",
-        "type",
-        "group",
-        "size",
-        "mass",
-        "density",
-        "shellinertia",
-        "fromto",
-        "mesh",
-        "rgba",
-        "material",
-        *PLACED,
-    ),
-    "site": ("name", "class", "fromto", *PLACED),
-    "equality": ("active", "class"),
-    "connect": ("name", "class", "active", "body1", "body2", "anchor", "site1", "site2"),
-    "weld": (
-        "name",
-        "class",
-        "active",
-        "body1",
-        "body2",
-        "anchor",
-        "relpose",
-        "site1",
-        "site2",
-    ),
-    "tendon": ("stiffness", "damping", "frictionloss", "springlength", "armature", "class"),
-    "spatial": (
-        "name",
-        "class",
-        "stiffness",
-        "damping",
-        "frictionloss",
-        "springlength",
-        "armature",
-    ),
-    "mesh": ("name", "class", "file", "scale", "inertia", "refpos", "refquat"),
-    "material": ("name", "class", "rgba"),
-}
-"""Attributes that are read; those of a joint equality are in JOINT_EQUALITY."""
-JOINT_EQUALITY = ("name", "class", "active", "joint1", "joint2", "polycoef")
-_CONTACT = ("solref", "solimp", "margin", "gap", "user")
-IGNORED_ATTRIBUTES: dict[str, tuple[str, ...]] = {
-    "compiler": (
-        "strippath",
-        "texturedir",
-        "discardvisual",
-        "usethread",
-        "fusestatic",
-        "alignfree",
-        "convexhull",
-        "conflict",
-        "exactmeshinertia",
-        "saveinertial",
-    ),
-    "option": (
-        "timestep",
-        "apirate",
-        "impratio",
-        "tolerance",
-        "ls_tolerance",
-        "noslip_tolerance",
-        "ccd_tolerance",
-        "mpr_tolerance",
-        "magnetic",
-        "o_margin",
-        "o_solref",
-        "o_solimp",
-        "o_friction",
-        "integrator",
-        "cone",
-        "jacobian",
-        "solver",
-        "iterations",
-        "ls_iterations",
-        "noslip_iterations",
-        "ccd_iterations",
-        "mpr_iterations",
-        "sdf_iterations",
-        "sdf_initpoints",
-        "actuatorgroupdisable",
-        "collision",
-        "sleep_tolerance",
-    ),
-    "body": ("user", "sleep"),
-    "joint": (
-        "group",
-        "user",
-        "margin",
-        "solreflimit",
-        "solimplimit",
-        "solreffriction",
-        "solimpfriction",
-        "actuatorfrcrange",
-        "actuatorfrclimited",
-    ),
-    "freejoint": ("group", "align"),
-    "geom": (
-        *_CONTACT,
-        "contype",
-        "conaffinity",
-        "condim",
-        "priority",
-        "friction",
-        "solmix",
-        "hfield",
-        "fitscale",
-        "fluidshape",
-        "fluidcoef",
-    ),
-    "site": ("type", "group", "material", "size", "rgba", "user"),
-    "equality": ("solref", "solimp"),
-    "connect": ("solref", "solimp"),
-    "weld": ("solref", "solimp", "torquescale"),
-    "tendon": (*_CONTACT, "group", "limited", "range", "width", "material", "rgba"),
-    "spatial": (
-        *_CONTACT,
-        "group",
-        "limited",
-        "range",
-        "width",
-        "material",
-        "rgba",
-        "actuatorfrclimited",
-        "actuatorfrcrange",
-        "solreflimit",
-        "solimplimit",
-        "solreffriction",
-        "solimpfriction",
-    ),
-    "mesh": (
-        "content_type",
-        "smoothnormal",
-        "vertex",
-        "normal",
-        "texcoord",
-        "face",
-        "maxhullvert",
-        "builtin",
-        "params",
-        "material",
-    ),
-    "material": (
-        "texture",
-        "texrepeat",
-        "texuniform",
-        "emission",
-        "specular",
-        "shininess",
-        "reflectance",
-        "metallic",
-        "roughness",
-    ),
-}
-GEOMS = (
-    "sphere",
-    "capsule",
-    "ellipsoid",
-    "cylinder",
-    "box",
-    "mesh",
-    "plane",
-    "hfield",
-    "sdf",
+PLACED = "pos quat axisangle xyaxes zaxis euler"
+ATTRIBUTES = _table(
+    {
+        "compiler": """angle eulerseq coordinate autolimits inertiafromgeom inertiagrouprange
+            boundmass boundinertia balanceinertia settotalmass meshdir assetdir""",
+        "option": "gravity wind density viscosity",
+        "body": f"name childclass mocap gravcomp {PLACED}",
+        "frame": f"name childclass {PLACED}",
+        "inertial": f"mass diaginertia fullinertia {PLACED}",
+        "joint": """name class type pos axis springdamper stiffness range limited ref springref
+            armature damping frictionloss actuatorgravcomp""",
+        "freejoint": "name",
+        "geom": f"""name class type group size mass density shellinertia fromto mesh rgba material
+            {PLACED}""",
+        "site": f"name class fromto {PLACED}",
+        "equality": "active class",
+        "connect": "name class active body1 body2 anchor site1 site2",
+        "weld": "name class active body1 body2 anchor relpose site1 site2",
+        "tendon": "stiffness damping frictionloss springlength armature class",
+        "spatial": "name class stiffness damping frictionloss springlength armature",
+        "mesh": "name class file scale inertia refpos refquat",
+        "material": "name class rgba",
+    }
 )
+"""Attributes that are read; those of a joint equality are in JOINT_EQUALITY."""
+JOINT_EQUALITY = words("name class active joint1 joint2 polycoef")
+CONTACT = "solref solimp margin gap user"
+IGNORED_ATTRIBUTES = _table(
+    {
+        "compiler": """strippath texturedir discardvisual usethread fusestatic alignfree convexhull
+            conflict exactmeshinertia saveinertial""",
+        "option": """timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance
+            mpr_tolerance magnetic o_margin o_solref o_solimp o_friction integrator cone jacobian
+            solver iterations ls_iterations noslip_iterations ccd_iterations mpr_iterations
+            sdf_iterations sdf_initpoints actuatorgroupdisable collision sleep_tolerance""",
+        "body": "user sleep",
+        "joint": """group user margin solreflimit solimplimit solreffriction solimpfriction
+            actuatorfrcrange actuatorfrclimited""",
+        "freejoint": "group align",
+        "geom": f"""{CONTACT} contype conaffinity condim priority friction solmix hfield fitscale
+            fluidshape fluidcoef""",
+        "site": "type group material size rgba user",
+        "equality": "solref solimp",
+        "connect": "solref solimp",
+        "weld": "solref solimp torquescale",
+        "tendon": f"{CONTACT} group limited range width material rgba",
+        "spatial": f"""{CONTACT} group limited range width material rgba actuatorfrclimited
+            actuatorfrcrange solreflimit solimplimit solreffriction solimpfriction""",
+        "mesh": """content_type smoothnormal vertex normal texcoord face maxhullvert builtin params
+            material""",
+        "material": """texture texrepeat texuniform emission specular shininess reflectance metallic
+            roughness""",
+    }
+)
+GEOMS = words("sphere capsule ellipsoid cylinder box mesh plane hfield sdf")
 """Types of geom, the default first."""
-DEFAULTS_OF_OTHERS = (
-    "camera",
-    "light",
-    "pair",
-    "general",
-    "motor",
-    "position",
-    "velocity",
-    "intvelocity",
-    "damper",
-    "cylinder",
-    "muscle",
-    "adhesion",
-    "dcmotor",
-    "texture",
+DEFAULTS_OF_OTHERS = words(
+    """camera light pair general motor position velocity intvelocity damper cylinder muscle adhesion
+    dcmotor texture"""
 )
 """Defaults of elements that are not read."""
-
-
 MAIN = "main"
-ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
+"""The default class that all others inherit from."""
+ORIENTATIONS = words("quat axisangle xyaxes zaxis euler")
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -286,19 +109,13 @@ class Compiler:
     mesh_folder: str = ""
 
 
-@dataclass
 class MjcfValues(XmlValues):
     """Values of one file, with its compiler settings and default classes."""
 
-    file: str
-    compiler: Compiler = field(default_factory=Compiler)
-    classes: dict[str, dict[str, dict[str, str]]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        XmlValues.__init__(self, self.file)
-        self.classes[MAIN] = {}
-
-    # Defaults -------------------------------------------------------------------------------
+    def __init__(self, file: str) -> None:
+        super().__init__(file)
+        self.compiler = Compiler()
+        self.classes: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
 
     def read_defaults(self, node: Element, parent: str | None = None) -> None:
         """Read a ``<default>`` and those inside it."""
@@ -320,25 +137,26 @@ class MjcfValues(XmlValues):
         for child in node:
             if child.tag not in (*ATTRIBUTES, *DEFAULTS_OF_OTHERS, "default"):
                 raise self.fault(where, f"unknown element <{child.tag}>", "Correct its name")
-            if child.tag != "default" and child.tag in ATTRIBUTES:
-                self.known(child, f"{where}, <{child.tag}>")
+            if child.tag in ATTRIBUTES:
+                self.own(child, f"{where}, <{child.tag}>")
                 mine.setdefault(child.tag, {}).update(child.attrib)
         # Nested classes inherit all attributes, also those that follow them in the file.
         for child in node.findall("default"):
             self.read_defaults(child, name)
 
-    def known(self, node: Element, where: str) -> None:
-        """Refuse unknown attributes; those that do not affect the motion are ignored."""
-        ignored = IGNORED_ATTRIBUTES.get(node.tag, ())
-        for key in node.attrib:
-            if key not in ATTRIBUTES[node.tag] and key not in ignored:
-                raise self.fault(
-                    where,
-                    f"<{node.tag}> has an unknown attribute {key!r}",
-                    f"Known: {', '.join((*ATTRIBUTES[node.tag], *ignored))}",
-                )
+    def own(self, node: Element, where: str) -> Attributes:
+        """Attributes of ``node``, which are known; those without effect on the motion are ignored.
 
-    def resolved(self, node: Element, childclass: str, where: str, tag: str = "") -> dict[str, str]:
+        Parameters
+        ----------
+        node, where
+            The element and its name for messages.
+        """
+        known = (*ATTRIBUTES[node.tag], *IGNORED_ATTRIBUTES.get(node.tag, ()))
+        self.only(node, where, known)
+        return Attributes(self, node.attrib, where)
+
+    def resolved(self, node: Element, childclass: str, where: str, tag: str = "") -> Attributes:
         """Attributes of ``node`` over those of its class.
 
         Parameters
@@ -350,48 +168,78 @@ class MjcfValues(XmlValues):
         tag
             Under which the defaults stand, if that is not the element's own.
         """
-        self.known(node, where)
+        given = self.own(node, where)
         name = node.get("class") or childclass or MAIN
         if name not in self.classes:
-            raise self.fault(
-                where, f"there is no default class {name!r}", f"Known: {', '.join(self.classes)}"
-            )
-        return {**self.classes[name].get(tag or node.tag, {}), **node.attrib}
-
-    # Values ---------------------------------------------------------------------------------
-
-    def get(
-        self, given: Mapping[str, str], key: str, count: int, default: str, where: str
-    ) -> FloatArray:
-        """``count`` numbers of the attribute ``key``."""
-        return self.numbers(given.get(key, default), count, where, key)
-
-    def number(self, given: Mapping[str, str], key: str, default: float, where: str) -> float:
-        """One number of the attribute ``key``."""
-        if key not in given:
-            return default
-        return float(self.numbers(given[key], 1, where, key)[0])
-
-    def choice(self, given: Mapping[str, str], key: str, known: tuple[str, ...], where: str) -> str:
-        """A word of the attribute ``key``; the first of ``known`` by default."""
-        word = given.get(key, known[0])
-        if word not in known:
-            raise self.fault(where, f"{key} is {word!r}", f"Known: {', '.join(known)}")
-        return word
-
-    def flag(self, given: Mapping[str, str], key: str, default: bool, where: str) -> bool:
-        """``true`` or ``false``."""
-        return default if key not in given else self.truth(given[key], where, key)
+            raise self.unknown(where, f"there is no default class {name!r}", self.classes)
+        defaults = self.classes[name].get(tag or node.tag, {})
+        return Attributes(self, {**defaults, **given.texts}, where)
 
     def angle(self, value: float) -> float:
         """An angle of the file in rad."""
         return float(np.deg2rad(value)) if self.compiler.degrees else value
 
-    def placement(self, given: Mapping[str, str], where: str) -> pin.SE3:
-        """``pos`` and the orientation."""
-        return pin.SE3(self.rotation(given, where), self.get(given, "pos", 3, "0 0 0", where))
+    def quaternion(self, wxyz: FloatArray, where: str, what: str) -> FloatArray:
+        """The rotation (3, 3) of a quaternion (4,) of any length, the real part first."""
+        w, x, y, z = self.direction(wxyz, where, what)
+        return np.asarray(pin.Quaternion(w, x, y, z).matrix())
 
-    def rotation(self, given: Mapping[str, str], where: str) -> FloatArray:
+
+@dataclass(frozen=True, eq=False)
+class Attributes:
+    """Attributes of one element, with those of its default class.
+
+    Attributes
+    ----------
+    values
+        The file.
+    texts
+        By name.
+    where
+        The element, for messages.
+    """
+
+    values: MjcfValues
+    texts: Mapping[str, str]
+    where: str
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.texts
+
+    def fault(self, problem: str, remedy: str) -> InputError:
+        """The error to raise about this element."""
+        return self.values.fault(self.where, problem, remedy)
+
+    def text(self, key: str, default: str = "") -> str:
+        return self.texts.get(key, default)
+
+    def numbers(self, key: str, count: int | tuple[int, ...], default: str = "") -> FloatArray:
+        """``count`` numbers, or as many as one of several counts."""
+        return self.values.numbers(self.text(key, default), count, self.where, key)
+
+    def number(self, key: str, default: float = 0.0) -> float:
+        return float(self.numbers(key, 1)[0]) if key in self else default
+
+    def direction(self, key: str, default: str = "") -> FloatArray:
+        """A unit vector (3,)."""
+        return self.values.direction(self.numbers(key, 3, default), self.where, key)
+
+    def choice(self, key: str, known: tuple[str, ...]) -> str:
+        """One of the words ``known``, by default the first."""
+        word = self.text(key, known[0])
+        if word not in known:
+            raise self.values.unknown(self.where, f"{key} is {word!r}", known)
+        return word
+
+    def flag(self, key: str, default: bool = False) -> bool:
+        """``true`` or ``false``."""
+        return self.values.truth(self.texts[key], self.where, key) if key in self else default
+
+    def placement(self) -> pin.SE3:
+        """``pos`` and the orientation."""
+        return pin.SE3(self.rotation(), self.numbers("pos", 3, "0 0 0"))
+
+    def rotation(self) -> FloatArray:
         """The orientation (3, 3), in any of the notations of MJCF.
 
         Raises
@@ -399,39 +247,38 @@ class MjcfValues(XmlValues):
         InputError
             If it is written in two ways, or a direction is zero.
         """
-        ways = [way for way in ORIENTATIONS if way in given]
-        if len(ways) > 1 and ways[:1] == ["quat"]:
+        ways = [way for way in ORIENTATIONS if way in self]
+        if len(ways) > 1 and ways[0] == "quat":
             ways = ways[1:]  # in MuJoCo the others replace a quaternion
         if len(ways) > 1:
-            raise self.fault(where, f"{' and '.join(ways)} are both given", "Keep one")
+            raise self.fault(f"{' and '.join(ways)} are both given", "Keep one")
+        values = self.values
         match ways:
             case ["quat"]:
-                w, x, y, z = self.direction(self.get(given, "quat", 4, "", where), where, "quat")
-                return np.asarray(pin.Quaternion(w, x, y, z).matrix())
+                return values.quaternion(self.numbers("quat", 4), self.where, "quat")
             case ["axisangle"]:
-                *axis, angle = self.get(given, "axisangle", 4, "", where)
-                unit = self.direction(np.array(axis), where, "axisangle")
-                return np.asarray(pin.AngleAxis(self.angle(angle), unit).matrix())
+                *axis, angle = self.numbers("axisangle", 4)
+                unit = values.direction(np.array(axis), self.where, "axisangle")
+                return np.asarray(pin.AngleAxis(values.angle(angle), unit).matrix())
             case ["xyaxes"]:
-                both = self.get(given, "xyaxes", 6, "", where)
-                x_axis = self.direction(both[:3], where, "xyaxes")
+                both = self.numbers("xyaxes", 6)
+                x_axis = values.direction(both[:3], self.where, "xyaxes")
                 y_axis = both[3:] - x_axis * (x_axis @ both[3:])
-                y_axis = self.direction(y_axis, where, "xyaxes")
+                y_axis = values.direction(y_axis, self.where, "xyaxes")
                 return np.column_stack([x_axis, y_axis, np.cross(x_axis, y_axis)])
             case ["zaxis"]:
-                return z_along(
-                    self.direction(self.get(given, "zaxis", 3, "", where), where, "zaxis")
-                )
+                return z_along(self.direction("zaxis"))
             case ["euler"]:
-                return self._euler(self.get(given, "euler", 3, "", where))
+                return self._euler()
         return np.eye(3)
 
-    def _euler(self, angles: FloatArray) -> FloatArray:
+    def _euler(self) -> FloatArray:
         """The rotation (3, 3) of ``euler``; lower-case letters of the sequence are intrinsic,
         capitals extrinsic rotations."""
         out = np.eye(3)
-        for letter, angle in zip(self.compiler.sequence, angles):
-            turn = pin.AngleAxis(self.angle(angle), np.array(AXES[letter.lower()])).matrix()
+        for letter, angle in zip(self.values.compiler.sequence, self.numbers("euler", 3)):
+            axis = np.array(AXES[letter.lower()])
+            turn = pin.AngleAxis(self.values.angle(angle), axis).matrix()
             out = out @ turn if letter.islower() else turn @ out
         return out
 

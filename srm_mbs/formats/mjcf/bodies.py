@@ -6,6 +6,8 @@ subtracted from its limits and from the rest position of its spring.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -14,9 +16,9 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.graph.joint_graph import NO_LIMIT, Body, Joint
+from srm_mbs.formats.graph.joint_graph import NO_LIMIT, Body, Joint, inertia_at
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
-from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, MjcfValues
+from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
 from srm_mbs.model.anchors import WORLD
 
@@ -60,7 +62,7 @@ class BodyReader:
 
     def world(self, node: Element) -> None:
         """Read a ``<worldbody>``."""
-        self._contents(node, WORLD, pin.SE3.Identity(), "", {})
+        self._contents(node, WORLD, pin.SE3.Identity(), "", defaultdict(list))
 
     # Bodies ---------------------------------------------------------------------------------
 
@@ -72,16 +74,15 @@ class BodyReader:
         if name in self.placements or name == WORLD:
             problem = "two bodies have this name" if name != WORLD else "'world' is the ground"
             raise values.fault(where, problem, "Rename one of them")
-        values.known(node, where)
-        given = node.attrib
-        if values.flag(given, "mocap", False, where):
-            raise values.fault(where, "mocap bodies are not read by this version", "Remove mocap")
-        if values.number(given, "gravcomp", 0.0, where) != 0.0:
-            raise values.fault(where, "gravcomp is not read by this version", "Remove it")
-        childclass = node.get("childclass", childclass)
-        in_parent = around * values.placement(given, where)
+        given = values.own(node, where)
+        if given.flag("mocap"):
+            raise given.fault("mocap bodies are not read by this version", "Remove mocap")
+        if given.number("gravcomp") != 0.0:
+            raise given.fault("gravcomp is not read by this version", "Remove it")
+        childclass = given.text("childclass", childclass)
+        in_parent = around * given.placement()
         self.placements[name] = self.placements[parent] * in_parent
-        found: dict[str, list[Any]] = {"joint": [], "geom": [], "inertial": []}
+        found: dict[str, list[Any]] = defaultdict(list)
         self.bodies[name] = Body(name)
         if parent in self._moving or any(c.tag in ("joint", "freejoint") for c in node):
             self._moving.add(name)
@@ -106,25 +107,23 @@ class BodyReader:
         for child in node:
             match child.tag:
                 case "inertial":
-                    found.get("inertial", []).append((child, around))
-                case "geom" if name == WORLD:
-                    read_geom(values, child, childclass, around, name)
-                    values.ignore("<geom> of the world")
+                    found["inertial"].append((child, around))
                 case "geom":
                     found["geom"].append(read_geom(values, child, childclass, around, name))
+                    if name == WORLD:
+                        values.ignore("<geom> of the world")
                 case "site":
                     self._site(child, name, around, childclass)
                 case "body":
                     self.body(child, name, around, childclass)
                 case "frame":
-                    values.known(child, where)
-                    inner = around * values.placement(child.attrib, f"{where}, <frame>")
+                    given = values.own(child, f"{where}, <frame>")
                     if child.find("joint") is not None or child.find("freejoint") is not None:
                         raise values.fault(
                             where, "a joint inside a <frame> is not read", "Put it into the body"
                         )
-                    inside = child.get("childclass", childclass)
-                    self._contents(child, name, inner, inside, found)
+                    inside = given.text("childclass", childclass)
+                    self._contents(child, name, around * given.placement(), inside, found)
                 case "joint" | "freejoint" if name == WORLD:
                     raise values.fault("<worldbody>", "the world has no joints", "Put it in a body")
 
@@ -132,59 +131,38 @@ class BodyReader:
         name = node.get("name")
         where = f"site {name!r}"
         given = self.values.resolved(node, childclass, where)
-        placement = around * self.values.placement(given, where)
+        placement = around * given.placement()
         if "fromto" in given:
-            ends = self.values.numbers(given["fromto"], 6, where, "fromto")
+            ends = given.numbers("fromto", 6)
             placement = around * pin.SE3(np.eye(3), 0.5 * (ends[:3] + ends[3:]))
         if name:
             if name in self.sites:
-                raise self.values.fault(where, "two sites have this name", "Rename one of them")
+                raise given.fault("two sites have this name", "Rename one of them")
             self.sites[name] = (body, placement)
 
     def _finished(
         self, name: str, inertials: list[tuple[Element, pin.SE3]], geoms: list[Geom]
     ) -> Body:
         """The body with its inertia and visuals."""
-        values = self.values
-        compiler = values.compiler
+        compiler = self.values.compiler
         where = f"body {name!r}"
-        visuals = [v for g in geoms for v in visuals_of(values, g, self.meshes, self.colours)]
+        visuals = [v for geom in geoms for v in visuals_of(geom, self.meshes, self.colours)]
         if name not in self._moving and compiler.total_mass <= 0.0:
             return Body(name, None, tuple(visuals))
         inertia: pin.Inertia | None = None
         if len(inertials) > 1:
-            raise values.fault(where, "<inertial> is given twice", "Keep one")
+            raise self.values.fault(where, "<inertial> is given twice", "Keep one")
         use_geoms = compiler.inertia_from_geom
         if inertials and use_geoms != "true":
             node, around = inertials[0]
-            inertia = around.act(self._inertial(node, where))
+            inertia = around.act(_inertial(self.values.own(node, f"{where}, <inertial>")))
         elif use_geoms != "false":
             low, high = compiler.groups
             for geom in geoms:
-                if not low <= geom.group <= high:
-                    continue
-                part = inertia_of(geom, self.meshes, values.file)
+                part = inertia_of(geom, self.meshes) if low <= geom.group <= high else None
                 if part is not None:
                     inertia = part if inertia is None else inertia + part
         return Body(name, self._bounded(inertia), tuple(visuals))
-
-    def _inertial(self, node: Element, where: str) -> pin.Inertia:
-        values = self.values
-        values.known(node, f"{where}, <inertial>")
-        given = node.attrib
-        if "mass" not in given:
-            raise values.fault(where, "<inertial> has no mass", "Give it")
-        mass = values.number(given, "mass", 0.0, where)
-        placed = values.placement(given, f"{where}, <inertial>")
-        if "fullinertia" in given:
-            xx, yy, zz, xy, xz, yz = values.get(given, "fullinertia", 6, "", where)
-            about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            if "diaginertia" in given:
-                raise values.fault(where, "fullinertia and diaginertia are both given", "Keep one")
-        else:
-            about = np.diag(values.get(given, "diaginertia", 3, "0 0 0", where))
-        turn = placed.rotation
-        return pin.Inertia(mass, placed.translation, turn @ about @ turn.T)
 
     def _bounded(self, inertia: pin.Inertia | None) -> pin.Inertia | None:
         """The inertia with at least the mass and principal moments that the compiler demands."""
@@ -202,10 +180,9 @@ class BodyReader:
         total = sum(body.inertia.mass for body in self.bodies.values() if body.inertia is not None)
         if wanted <= 0.0 or total <= 0.0:
             return
+        factor = wanted / total
         for name, body in self.bodies.items():
-            if body.inertia is not None:
-                factor = wanted / total
-                inertia = body.inertia
+            if (inertia := body.inertia) is not None:
                 scaled = pin.Inertia(factor * inertia.mass, inertia.lever, factor * inertia.inertia)
                 self.bodies[name] = replace(body, inertia=scaled)
 
@@ -236,9 +213,8 @@ class BodyReader:
     def _name(self, default: str, given: str) -> str:
         name = given or default
         if name in self._names:
-            raise self.values.fault(
-                f"joint {name!r}", "two joints have this name", "Rename one of them"
-            )
+            where = f"joint {name!r}"
+            raise self.values.fault(where, "two joints have this name", "Rename one of them")
         self._names.add(name)
         return name
 
@@ -250,89 +226,34 @@ class BodyReader:
         name = self._name(f"{child}::joint", node.get("name", ""))
         where = f"joint {name!r}"
         if node.tag == "freejoint":
-            values.known(node, where)
-            given, kind = dict(node.attrib), "free"
+            given, kind = values.own(node, where), "free"
         else:
             given = values.resolved(node, childclass, where)
-            kind = values.choice(given, "type", JOINT_TYPES, where)
-        acting = self._acting(given, where)
+            kind = given.choice("type", JOINT_TYPES)
+        acting = _acting(given)
         if kind == "free":
             if parent != WORLD or not alone:
-                raise values.fault(
-                    where, "only a body of the world, with no other joint, moves freely", "Use ball"
+                raise given.fault(
+                    "only a body of the world, with no other joint, moves freely", "Use ball"
                 )
             if any(acting.values()):
-                raise values.fault(
-                    where,
+                raise given.fault(
                     "damping, friction, armature and stiffness of a free joint are not read",
                     "Set them to 0",
                 )
             self.free[child] = name
             return None
-        where_it_is = pin.SE3(np.eye(3), values.get(given, "pos", 3, "0 0 0", where))
+        where_it_is = pin.SE3(np.eye(3), given.numbers("pos", 3, "0 0 0"))
         placed = Joint(name, URDF_TYPES[kind], parent, child, at * where_it_is, where_it_is)
         if kind == "ball":
             self._ball_spring(placed, acting.pop("stiffness"))
             return replace(placed, **acting)
-        axis = values.direction(values.get(given, "axis", 3, "0 0 1", where), where, "axis")
-        x, y, z = axis.tolist()
-        ref, rest = (self._coordinate(given, key, kind, where) for key in ("ref", "springref"))
-        self.references[name] = ref
-        return replace(
-            placed,
-            axis=(x, y, z),
-            rest=rest - ref,
-            **self._limits(given, kind, ref, where),
-            **acting,
-        )
-
-    def _acting(self, given: dict[str, str], where: str) -> dict[str, Any]:
-        values = self.values
-        if values.flag(given, "actuatorgravcomp", False, where):
-            values.ignore("actuatorgravcomp attribute")
-        if "springdamper" in given and values.get(given, "springdamper", 2, "", where).any():
-            raise values.fault(
-                where, "springdamper is not read by this version", "Give stiffness and damping"
-            )
-        found = {
-            ours: values.number(given, theirs, 0.0, where)
-            for ours, theirs in (
-                ("stiffness", "stiffness"),
-                ("damping", "damping"),
-                ("friction", "frictionloss"),
-                ("armature", "armature"),
-            )
-        }
-        for key, value in found.items():
-            if value < 0.0:
-                raise values.fault(where, f"its {key} is negative", "Give a value >= 0")
-        if found["friction"]:
-            values.remark(
-                "frictionloss acts as smoothed Coulomb friction, not as MuJoCo's soft constraint",
-                where,
-            )
-        return found
-
-    def _coordinate(self, given: dict[str, str], key: str, kind: str, where: str) -> float:
-        value = self.values.number(given, key, 0.0, where)
-        return self.values.angle(value) if kind == "hinge" else value
-
-    def _limits(self, given: dict[str, str], kind: str, ref: float, where: str) -> dict[str, Any]:
-        values = self.values
-        word = values.choice(given, "limited", ("auto", "true", "false"), where)
-        if "range" not in given or word == "false":
-            return {}
-        if word == "auto" and not values.compiler.autolimits:
-            raise values.fault(where, "it has a range, but autolimits is off", "Write limited")
-        low, high = values.get(given, "range", 2, "", where)
-        if low == high == 0.0:
-            return {}
-        if low >= high:
-            raise values.fault(where, "the range does not increase", "Exchange the two")
-        if kind == "hinge":
-            low, high = values.angle(low), values.angle(high)
-        clipped: FloatArray = np.clip([low - ref, high - ref], -NO_LIMIT, NO_LIMIT)
-        return {"lower": float(clipped[0]), "upper": float(clipped[1])}
+        x, y, z = given.direction("axis", "0 0 1").tolist()
+        in_si = values.angle if kind == "hinge" else float
+        self.references[name] = ref = in_si(given.number("ref"))
+        rest = in_si(given.number("springref")) - ref
+        limits = _limits(given, in_si, ref)
+        return replace(placed, axis=(x, y, z), rest=rest, **limits, **acting)
 
     def _ball_spring(self, joint: Joint, stiffness: float) -> None:
         """The spring of a ball joint, with a moment of -k times the rotation vector: a bushing."""
@@ -346,3 +267,55 @@ class BodyReader:
                     "stiffness": [0.0, 0.0, 0.0, stiffness, stiffness, stiffness],
                 }
             )
+
+
+def _inertial(given: Attributes) -> pin.Inertia:
+    """The inertia in the frame in which the ``<inertial>`` is placed."""
+    if "mass" not in given:
+        raise given.fault("<inertial> has no mass", "Give it")
+    if "fullinertia" in given and "diaginertia" in given:
+        raise given.fault("fullinertia and diaginertia are both given", "Keep one")
+    if "fullinertia" in given:
+        moments = given.numbers("fullinertia", 6)
+    else:
+        moments = np.append(given.numbers("diaginertia", 3, "0 0 0"), np.zeros(3))
+    return inertia_at(given.placement(), given.number("mass"), moments)
+
+
+def _acting(given: Attributes) -> dict[str, Any]:
+    """Stiffness, damping, friction and armature of a joint."""
+    if given.flag("actuatorgravcomp"):
+        given.values.ignore("actuatorgravcomp attribute")
+    if "springdamper" in given and given.numbers("springdamper", 2).any():
+        raise given.fault("springdamper is not read by this version", "Give stiffness and damping")
+    found = {
+        "stiffness": given.number("stiffness"),
+        "damping": given.number("damping"),
+        "friction": given.number("frictionloss"),
+        "armature": given.number("armature"),
+    }
+    for key, value in found.items():
+        if value < 0.0:
+            raise given.fault(f"its {key} is negative", "Give a value >= 0")
+    if found["friction"]:
+        given.values.remark(
+            "frictionloss acts as smoothed Coulomb friction, not as MuJoCo's soft constraint",
+            given.where,
+        )
+    return found
+
+
+def _limits(given: Attributes, in_si: Callable[[float], float], ref: float) -> dict[str, Any]:
+    """``lower`` and ``upper`` against the pose of the file; none without a range."""
+    word = given.choice("limited", ("auto", "true", "false"))
+    if "range" not in given or word == "false":
+        return {}
+    if word == "auto" and not given.values.compiler.autolimits:
+        raise given.fault("it has a range, but autolimits is off", "Write limited")
+    low, high = given.numbers("range", 2)
+    if low == high == 0.0:
+        return {}
+    if low >= high:
+        raise given.fault("the range does not increase", "Exchange the two")
+    clipped: FloatArray = np.clip([in_si(low) - ref, in_si(high) - ref], -NO_LIMIT, NO_LIMIT)
+    return {"lower": float(clipped[0]), "upper": float(clipped[1])}

@@ -6,15 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
-from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, origin
-from srm_mbs.formats.mjcf.attributes import GEOMS, MjcfValues, z_along
+from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
+from srm_mbs.formats.mjcf.attributes import GEOMS, Attributes, MjcfValues, z_along
 
 DENSITY = 1000.0
 """kg/m^3, MuJoCo's default."""
@@ -23,6 +22,7 @@ SIZES = {"sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3}
 ALONG = ("capsule", "cylinder", "ellipsoid", "box")
 """Shapes that may be given by two ends."""
 MASSLESS = ("plane", "hfield")
+GIVE_INERTIAL = "Give the body an <inertial>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,7 @@ class Geom:
     mass: float | None
     density: float
     group: int
-    where: str
-    given: Mapping[str, str]
+    given: Attributes
 
 
 def read_geom(
@@ -60,44 +59,40 @@ def read_geom(
     InputError
         Naming the geom.
     """
-    where = f"body {body!r}, geom {node.get('name', '')!r}"
-    given = values.resolved(node, childclass, where)
-    kind = values.choice(given, "type", GEOMS, where)
+    given = values.resolved(node, childclass, f"body {body!r}, geom {node.get('name', '')!r}")
+    kind = given.choice("type", GEOMS)
     if "mesh" in given and "type" not in given:
         kind = "mesh"
-    placement = values.placement(given, where)
+    placement = given.placement()
     sizes = np.zeros(3)
     needed = SIZES.get(kind, 0)
-    text = given.get("size", "")
-    found = values.numbers(text, (1, 2, 3), where, "size") if text.split() else np.zeros(0)
+    found = given.numbers("size", (1, 2, 3)) if given.text("size").strip() else np.zeros(0)
     if needed:
-        ends = given.get("fromto")
-        if ends is not None:
+        if "fromto" in given:
             if kind not in ALONG:
-                raise values.fault(where, f"a {kind} takes no fromto", "Give pos and size")
-            both = values.numbers(ends, 6, where, "fromto")
+                raise given.fault(f"a {kind} takes no fromto", "Give pos and size")
+            both = given.numbers("fromto", 6)
             along = both[:3] - both[3:]  # as MuJoCo turns it
-            half = 0.5 * float(np.linalg.norm(along))
-            turn = z_along(values.direction(along, where, "fromto"))
+            turn = z_along(values.direction(along, given.where, "fromto"))
             placement = pin.SE3(turn, 0.5 * (both[:3] + both[3:]))
             wide = found[:1] if needed == 2 else np.repeat(found[:1], 2)
-            found = np.append(wide, half)
+            found = np.append(wide, 0.5 * float(np.linalg.norm(along)))
         if len(found) < needed or (found[:needed] <= 0.0).any():
-            raise values.fault(where, f"a {kind} needs {needed} positive size(s)", "Give size")
+            raise given.fault(f"a {kind} needs {needed} positive size(s)", "Give size")
         sizes[:needed] = found[:needed]
-    mass = values.number(given, "mass", -1.0, where) if "mass" in given else None
+    mass = given.number("mass") if "mass" in given else None
     if mass is not None and mass < 0.0:
-        raise values.fault(where, "its mass is negative", "Give a mass >= 0")
-    density = values.number(given, "density", DENSITY, where)
+        raise given.fault("its mass is negative", "Give a mass >= 0")
+    density = given.number("density", DENSITY)
     if density < 0.0:
-        raise values.fault(where, "its density is negative", "Give a density >= 0")
-    if values.flag(given, "shellinertia", False, where):
-        raise values.fault(where, "shellinertia is not read by this version", "Give <inertial>")
-    group = int(values.number(given, "group", 0, where))
-    return Geom(kind, around * placement, sizes, mass, density, group, where, given)
+        raise given.fault("its density is negative", "Give a density >= 0")
+    if given.flag("shellinertia"):
+        raise given.fault("shellinertia is not read by this version", "Give <inertial>")
+    group = int(given.number("group"))
+    return Geom(kind, around * placement, sizes, mass, density, group, given)
 
 
-def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], file: str) -> pin.Inertia | None:
+def inertia_of(geom: Geom, meshes: Mapping[str, Mesh]) -> pin.Inertia | None:
     """Inertia of a solid shape in its body's frame; None without mass.
 
     Raises
@@ -108,52 +103,38 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], file: str) -> pin.Inertia
     if geom.kind in MASSLESS or geom.mass == 0.0 or (geom.mass is None and geom.density == 0.0):
         return None
     if geom.kind == "mesh":
-        own = _enclosed(geom, meshes.get(geom.given.get("mesh", "")), file)
+        own = _enclosed(geom.given, meshes.get(geom.given.text("mesh")))
     elif geom.kind in SIZES:
         volume, moments = _solid(geom.kind, geom.sizes)
         own = pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
     else:
-        raise InputError(
-            f"the inertia of a {geom.kind} is not computed by this version",
-            file=file,
-            element=geom.where,
-            remedy="Give the body an <inertial>",
+        raise geom.given.fault(
+            f"the inertia of a {geom.kind} is not computed by this version", GIVE_INERTIAL
         )
     density = geom.density if geom.mass is None else geom.mass / own.mass
     return geom.placement.act(pin.Inertia(density * own.mass, own.lever, density * own.inertia))
 
 
-def _enclosed(geom: Geom, mesh: Mesh | None, file: str) -> pin.Inertia:
+def _enclosed(given: Attributes, mesh: Mesh | None) -> pin.Inertia:
     """Inertia of the solid of density 1 kg/m^3 that a mesh encloses: inertia="exact"."""
     if mesh is None or mesh.inertia != "exact":
-        raise InputError(
+        raise given.fault(
             "the inertia of a mesh is read from its triangles only, and only if MuJoCo does so too",
-            file=file,
-            element=geom.where,
-            remedy='Give the body an <inertial>, or the <mesh file=...> inertia="exact"',
+            f'{GIVE_INERTIAL}, or the <mesh file=...> inertia="exact"',
         )
     import coal  # type: ignore[import-untyped]
 
-    path = Path(file).parent / mesh.file
+    path = Path(given.values.file).parent / mesh.file
     try:
         shape = coal.MeshLoader().load(str(path), mesh.scale)
         volume = float(shape.computeVolume())
         about = np.array(shape.computeMomentofInertiaRelatedToCOM())
         centre = np.array(shape.computeCOM())
     except Exception as error:  # Boost.Python raises whatever the C++ reader throws
-        raise InputError(
-            f"the mesh file {str(path)!r} cannot be read: {error}",
-            file=file,
-            element=geom.where,
-            remedy="Give the body an <inertial>",
-        ) from error
+        problem = f"the mesh file {str(path)!r} cannot be read: {error}"
+        raise given.fault(problem, GIVE_INERTIAL) from error
     if not volume > 0.0:
-        raise InputError(
-            f"the triangles of {str(path)!r} enclose no volume",
-            file=file,
-            element=geom.where,
-            remedy="Give the body an <inertial>",
-        )
+        raise given.fault(f"the triangles of {str(path)!r} enclose no volume", GIVE_INERTIAL)
     return pin.Inertia(volume, centre, about)
 
 
@@ -182,57 +163,36 @@ def _solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:
             return volume, np.array([across, across, axial]) / volume
 
 
-def visuals_of(
-    values: MjcfValues,
-    geom: Geom,
-    meshes: Mapping[str, Mesh],
-    colours: Mapping[str, str],
-) -> list[Element]:
+def visuals_of(geom: Geom, meshes: Mapping[str, Mesh], colours: Mapping[str, str]) -> list[Element]:
     """``<visual>`` elements of URDF; none, with a remark, for a shape that URDF does not have.
 
     Parameters
     ----------
-    values, geom
-        The file and the shape.
+    geom
+        The shape.
     meshes
         Those of ``<asset>``, by name.
     colours
         Red, green, blue, opacity of the materials of ``<asset>``, by name.
     """
-    at, (a, b, c) = geom.placement, geom.sizes
-    shapes: list[tuple[str, dict[str, str], pin.SE3]] = []
+    given, at, (a, b, c) = geom.given, geom.placement, geom.sizes
+    shapes: list[tuple[pin.SE3, str, dict[str, str]]] = []
     match geom.kind:
         case "sphere":
-            shapes = [("sphere", {"radius": numbers([a])}, at)]
+            shapes = [(at, "sphere", {"radius": numbers([a])})]
         case "box":
-            shapes = [("box", {"size": numbers([2 * a, 2 * b, 2 * c])}, at)]
+            shapes = [(at, "box", {"size": numbers([2 * a, 2 * b, 2 * c])})]
         case "cylinder" | "capsule":
-            tube = {"radius": numbers([a]), "length": numbers([2 * b])}
-            shapes = [("cylinder", tube, at)]
+            shapes = [(at, "cylinder", {"radius": numbers([a]), "length": numbers([2 * b])})]
             if geom.kind == "capsule":
-                shapes += [
-                    (
-                        "sphere",
-                        {"radius": numbers([a])},
-                        at * pin.SE3(np.eye(3), np.array([0.0, 0.0, end])),
-                    )
-                    for end in (-b, b)
-                ]
-        case "mesh" if geom.given.get("mesh") in meshes:
-            mesh = meshes[geom.given["mesh"]]
+                ends = [at * pin.SE3(np.eye(3), np.array([0.0, 0.0, z])) for z in (-b, b)]
+                shapes += [(end, "sphere", {"radius": numbers([a])}) for end in ends]
+        case "mesh" if given.text("mesh") in meshes:
+            mesh = meshes[given.text("mesh")]
             own = {"filename": mesh.file, "scale": numbers(mesh.scale)}
-            shapes = [("mesh", own, at * mesh.axes)]
+            shapes = [(at * mesh.axes, "mesh", own)]
         case kind:
-            values.remark(f"a geom of the type {kind} is not drawn", geom.where)
-    rgba = geom.given.get("rgba") or colours.get(geom.given.get("material", ""))
-    out = []
-    for tag, attributes, place in shapes:
-        visual = Element("visual")
-        origin(visual, place)
-        SubElement(SubElement(visual, "geometry"), tag, attributes)
-        if rgba is not None:
-            colour = values.numbers(rgba, 4, geom.where, "rgba")
-            material = SubElement(visual, "material", name="")
-            SubElement(material, "color", rgba=numbers(colour))
-        out.append(visual)
-    return out
+            given.values.remark(f"a geom of the type {kind} is not drawn", given.where)
+    text = given.text("rgba", colours.get(given.text("material"), ""))
+    rgba = given.values.numbers(text, 4, given.where, "rgba") if shapes and text else None
+    return [visual(*shape, rgba) for shape in shapes]

@@ -7,9 +7,7 @@ drops ``<equality><joint>`` and activates what is inactive.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -19,7 +17,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
-from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, MjcfValues
+from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
 from srm_mbs.formats.mjcf.geoms import Mesh
@@ -27,8 +25,6 @@ from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.xml import parse_xml
 
 GRAVITY = "0 0 -9.81"
-LARGEST_INCLUDE_DEPTH = 20
-"""Largest number of files that include each other."""
 FORCES_OFF = ("passive", "spring", "damper", "frictionloss", "constraint")
 """Flags that would disable forces that this package applies."""
 
@@ -41,10 +37,7 @@ def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -
             continue
         name = child.get("file", "")
         where = f"<include> {name!r}"
-        if depth >= LARGEST_INCLUDE_DEPTH:
-            raise values.fault(
-                where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
-            )
+        values.check_include(depth, where)
         try:
             text = (folder / name).read_text(encoding="utf-8-sig")
         except (OSError, ValueError) as error:
@@ -63,57 +56,49 @@ def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -
 
 def _compiler(values: MjcfValues, node: Element) -> None:
     """Read a ``<compiler>``."""
-    where, compiler = "<compiler>", values.compiler
-    values.known(node, where)
+    given, compiler = values.own(node, "<compiler>"), values.compiler
     for key in ("usethread", "fusestatic", "discardvisual"):
-        if key in node.attrib:
-            values.truth(node.get(key), where, key)
-    given = node.attrib
+        given.flag(key)
     if "angle" in given:
-        compiler.degrees = values.choice(given, "angle", ("degree", "radian"), where) == "degree"
-    values.choice(given, "coordinate", ("local",), where)
-    compiler.sequence = given.get("eulerseq", compiler.sequence)
+        compiler.degrees = given.choice("angle", ("degree", "radian")) == "degree"
+    given.choice("coordinate", ("local",))
+    compiler.sequence = given.text("eulerseq", compiler.sequence)
     if len(compiler.sequence) != 3 or not set(compiler.sequence) <= set("xyzXYZ"):
-        raise values.fault(where, f"eulerseq is {compiler.sequence!r}", "Write three of xyzXYZ")
-    compiler.autolimits = values.flag(given, "autolimits", compiler.autolimits, where)
+        raise given.fault(f"eulerseq is {compiler.sequence!r}", "Write three of xyzXYZ")
+    compiler.autolimits = given.flag("autolimits", compiler.autolimits)
     if "inertiafromgeom" in given:
-        known = ("auto", "true", "false")
-        compiler.inertia_from_geom = values.choice(given, "inertiafromgeom", known, where)
-    if values.flag(given, "balanceinertia", False, where):
-        raise values.fault(where, "balanceinertia is not read by this version", "Remove it")
-    for key, name in (
-        ("boundmass", "bound_mass"),
-        ("boundinertia", "bound_inertia"),
-        ("settotalmass", "total_mass"),
-    ):
-        setattr(compiler, name, values.number(given, key, getattr(compiler, name), where))
+        compiler.inertia_from_geom = given.choice("inertiafromgeom", ("auto", "true", "false"))
+    if given.flag("balanceinertia"):
+        raise given.fault("balanceinertia is not read by this version", "Remove it")
+    compiler.bound_mass = given.number("boundmass", compiler.bound_mass)
+    compiler.bound_inertia = given.number("boundinertia", compiler.bound_inertia)
+    compiler.total_mass = given.number("settotalmass", compiler.total_mass)
     if "inertiagrouprange" in given:
-        low, high = values.get(given, "inertiagrouprange", 2, "", where)
+        low, high = given.numbers("inertiagrouprange", 2)
         compiler.groups = (int(low), int(high))
-    folder = given.get("meshdir", given.get("assetdir", compiler.mesh_folder))
-    compiler.mesh_folder = folder
+    folder = given.text("assetdir", compiler.mesh_folder)
+    compiler.mesh_folder = given.text("meshdir", folder)
 
 
 def _option(values: MjcfValues, nodes: list[Element]) -> tuple[list[float], bool]:
     """Gravity, and whether equality constraints are switched off."""
     gravity, disabled = GRAVITY, False
     for node in nodes:
-        values.known(node, "<option>")
+        given = values.own(node, "<option>")
         values.children(node, "<option>", ("flag",), ())
-        gravity = node.get("gravity", gravity)
+        gravity = given.text("gravity", gravity)
         for key in ("density", "viscosity"):
-            if values.number(node.attrib, key, 0.0, "<option>") != 0.0:
-                raise values.fault("<option>", f"the {key} of a medium is not read", "Remove it")
+            if given.number(key) != 0.0:
+                raise given.fault(f"the {key} of a medium is not read", "Remove it")
         for flag in node.findall("flag"):
-            for key, word in flag.attrib.items():
-                off = word == "disable"
-                if key in FORCES_OFF and off:
-                    raise values.fault(
-                        "<option>", f'<flag {key}="disable"> is not read', "Remove what is disabled"
-                    )
-                if key == "gravity" and off:
-                    gravity = "0 0 0"
-                disabled |= key == "equality" and off
+            off = {key for key, word in flag.attrib.items() if word == "disable"}
+            refused = next((key for key in FORCES_OFF if key in off), None)
+            if refused:
+                problem = f'<flag {refused}="disable"> is not read'
+                raise given.fault(problem, "Remove what is disabled")
+            if "gravity" in off:
+                gravity = "0 0 0"
+            disabled |= "equality" in off
     return values.numbers(gravity, 3, "<option>", "gravity").tolist(), disabled
 
 
@@ -122,32 +107,29 @@ def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
     for node in section:
         if node.tag not in ("mesh", "material"):
             continue
-        where = f"<{node.tag}> {node.get('name', '')!r}"
-        given = values.resolved(node, "", where)
+        given = values.resolved(node, "", f"<{node.tag}> {node.get('name', '')!r}")
         if node.tag == "material":
             if "rgba" in given:
-                tree.colours[given.get("name", "")] = given["rgba"]
+                tree.colours[given.text("name")] = given.text("rgba")
         elif "file" in given:
-            path = Path(values.compiler.mesh_folder) / given["file"]
-            scale = values.get(given, "scale", 3, "1 1 1", where)
+            path = Path(values.compiler.mesh_folder) / given.text("file")
+            scale = given.numbers("scale", 3, "1 1 1")
             moved = "refpos" in given or "refquat" in given
-            inertia = "" if moved else given.get("inertia", "legacy")
-            name = given.get("name") or path.stem
-            axes = _mesh_axes(values, given, scale, where)
-            tree.meshes[name] = Mesh(path.as_posix(), scale, inertia, axes)
+            inertia = "" if moved else given.text("inertia", "legacy")
+            name = given.text("name") or path.stem
+            tree.meshes[name] = Mesh(path.as_posix(), scale, inertia, _mesh_axes(given, scale))
 
 
-def _mesh_axes(values: MjcfValues, given: dict[str, str], scale: FloatArray, where: str) -> pin.SE3:
+def _mesh_axes(given: Attributes, scale: FloatArray) -> pin.SE3:
     """Placement of the axes of a mesh file in those of the mesh.
 
     MuJoCo makes S R^T (x - p) of a vertex x, with the scale S, ``refpos`` p and ``refquat`` R.
     """
-    p = values.get(given, "refpos", 3, "0 0 0", where)
-    turned = values.get(given, "refquat", 4, "1 0 0 0", where)
-    w, x, y, z = values.direction(turned, where, "refquat")
-    R = pin.Quaternion(w, x, y, z).matrix()
+    p = given.numbers("refpos", 3, "0 0 0")
+    R = given.values.quaternion(given.numbers("refquat", 4, "1 0 0 0"), given.where, "refquat")
     if np.ptp(scale) > 0.0 and not np.allclose(R, np.eye(3)):
-        values.remark("a mesh with refquat and an unequal scale is drawn unturned", where)
+        what = "a mesh with refquat and an unequal scale is drawn unturned"
+        given.values.remark(what, given.where)
         R = np.eye(3)
     return pin.SE3(R.T, -scale * (R.T @ p))
 
@@ -192,8 +174,7 @@ def translate(document: Document, options: Options) -> Translation:
     tree = BodyReader(values)
     for node in root.findall("asset"):
         _assets(values, tree, node)
-    worlds = root.findall("worldbody")
-    for node in worlds:
+    for node in root.findall("worldbody"):
         tree.world(node)
     if not tree.bodies:
         raise values.fault("<worldbody>", "there is no <body>", "Add one for every body")
@@ -221,15 +202,11 @@ def translate(document: Document, options: Options) -> Translation:
         tree.free,
     )
     made = graph.translate()
-    entries: dict[str, Any] = {"gravity": gravity, **made.entries}
-    _add(entries, "loop", closures.loops)
-    _add(entries, "force", [*tree.forces, *closures.forces])
-    _add(entries, "lock", closures.lock)
-    if closures.held:
-        entries["initial"] = {"q": closures.held}
-    return replace(made, entries=entries, notes=(*made.notes, *values.notes()))
-
-
-def _add(entries: dict[str, Any], key: str, more: list[Any]) -> None:
-    if more:
-        entries[key] = [*entries.get(key, ()), *more]
+    return made.extended(
+        values.notes(),
+        gravity=gravity,
+        loop=closures.loops,
+        force=[*tree.forces, *closures.forces],
+        lock=closures.lock,
+        initial={"q": closures.held} if closures.held else {},
+    )

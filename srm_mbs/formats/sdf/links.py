@@ -8,47 +8,90 @@ frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from urllib.parse import urlsplit
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
-from srm_mbs.formats.graph.joint_graph import Body
-from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, origin
-from srm_mbs.formats.xml import XmlValues
+from srm_mbs.formats.graph.joint_graph import Body, inertia_at
+from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
+from srm_mbs.formats.xml import XmlValues, words
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.coordinates import UNIT_LENGTH_TOLERANCE
 
 MODEL = "__model__"
 SEPARATOR = "::"
 RESERVED = ("world", "__model__", "__root__")
+FRAMES_SINCE = (1, 7)
+"""The first version in which links, joints and models are frames."""
+ROTATION_FORMATS = {"euler_rpy": 6, "quat_xyzw": 7}
+"""Formats of a pose, and how many numbers each has."""
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Context of an element: prefix of its names, its file, and that file's version.
+
+    Attributes
+    ----------
+    depth
+        Number of includes around the file.
+    """
+
+    prefix: str
+    file: str
+    version: tuple[int, int]
+    depth: int = 0
+
+    def full(self, name: str) -> str:
+        """Full name of ``name`` in this context; ``world`` means the ground everywhere."""
+        return WORLD if name == WORLD else self.prefix + name
 
 
 def joint_frame(name: str, version: tuple[int, int]) -> str:
     """Name of a joint's frame; before SDF 1.7 nothing refers to it, and links may have its name."""
-    return name if version >= (1, 7) else f"{name}{SEPARATOR}__joint__"
+    return name if version >= FRAMES_SINCE else f"{name}{SEPARATOR}__joint__"
 
 
-def pose(
-    values: XmlValues, text: str | None, where: str, degrees: bool, quaternion: bool
-) -> pin.SE3:
-    """A pose from its text: x y z and roll pitch yaw, or x y z and a quaternion x y z w."""
-    if not (text or "").split():
-        return pin.SE3.Identity()
-    numbers = values.numbers(text, 7 if quaternion else 6, where, "<pose>")
-    if not quaternion:
-        angles = np.deg2rad(numbers[3:]) if degrees else numbers[3:]
-        return pin.SE3(pin.rpy.rpyToMatrix(angles), numbers[:3])
-    length = float(np.linalg.norm(numbers[3:]))
-    if abs(length - 1.0) > UNIT_LENGTH_TOLERANCE:
-        raise values.fault(
-            where, f"the quaternion of <pose> has length {length:.6g}", "Give a unit quaternion"
-        )
-    return pin.SE3(pin.Quaternion(numbers[3:] / length).matrix(), numbers[:3])
+def pose(values: XmlValues, node: Element, where: str, scope: Scope) -> tuple[pin.SE3, str]:
+    """The ``<pose>`` of an element, and the name of the frame that it names: x y z and roll pitch
+    yaw, or x y z and a quaternion x y z w."""
+    child = node.find("pose")
+    if child is None:
+        return pin.SE3.Identity(), ""
+    older = scope.version < FRAMES_SINCE
+    known = ("frame",) if older else ("relative_to", "degrees", "rotation_format")
+    values.attributes(child, where, known)
+    relative_to = child.get(known[0], "").strip()
+    degrees = values.truth(child.get("degrees", "false"), where, "degrees")
+    form = child.get("rotation_format", "euler_rpy")
+    if form not in ROTATION_FORMATS:
+        raise values.unknown(where, f"there is no rotation_format {form!r}", ROTATION_FORMATS)
+    if not (child.text or "").strip():
+        return pin.SE3.Identity(), relative_to
+    found = values.numbers(child.text, ROTATION_FORMATS[form], where, "<pose>")
+    xyz, turn = found[:3], found[3:]
+    if form == "euler_rpy":
+        R = pin.rpy.rpyToMatrix(np.deg2rad(turn) if degrees else turn)
+    else:
+        length = float(np.linalg.norm(turn))
+        if abs(length - 1.0) > UNIT_LENGTH_TOLERANCE:
+            problem = f"the quaternion of <pose> has length {length:.6g}"
+            raise values.fault(where, problem, "Give a unit quaternion")
+        R = pin.Quaternion(turn / length).matrix()
+    return pin.SE3(R, xyz), relative_to
+
+
+def own_pose(values: XmlValues, node: Element, where: str, scope: Scope) -> pin.SE3:
+    """The ``<pose>`` of an element inside a link, which may be relative to the link only."""
+    placement, relative_to = pose(values, node, where, scope)
+    if relative_to:
+        problem = f"the pose inside a link is relative to {relative_to!r}"
+        raise values.fault(where, problem, "Give it relative to the link")
+    return placement
 
 
 @dataclass
@@ -60,7 +103,6 @@ class _Frame:
     attached_to: str
 
 
-@dataclass
 class Frames:
     """The frames of a file by full name; placed in any order, resolved on demand.
 
@@ -68,9 +110,10 @@ class Frames:
     ``__model__``.
     """
 
-    file: str
-    _frames: dict[str, _Frame] = field(default_factory=dict)
-    _found: dict[str, pin.SE3] = field(default_factory=dict)
+    def __init__(self, values: XmlValues) -> None:
+        self.values = values
+        self._frames: dict[str, _Frame] = {}
+        self._found = {WORLD: pin.SE3.Identity()}
 
     def add(
         self,
@@ -84,21 +127,13 @@ class Frames:
     ) -> None:
         """Place a frame; it is part of the link ``body``, by default of that of ``attached_to``."""
         if name in self._frames:
-            raise InputError(
-                f"two links, joints, frames or models of one model are called {name!r}",
-                file=self.file,
-                element=where,
-                remedy="Rename one of them",
-            )
+            problem = f"two links, joints, frames or models of one model are called {name!r}"
+            raise self.values.fault(where, problem, "Rename one of them")
         self._frames[name] = _Frame(relative_to, placement, where, body, attached_to)
 
     def _unknown(self, name: str, where: str) -> InputError:
-        return InputError(
-            f"there is no link, joint, frame or model {name!r}",
-            file=self.file,
-            element=where,
-            remedy=f"Known: {', '.join((WORLD, *self._frames))}",
-        )
+        problem = f"there is no link, joint, frame or model {name!r}"
+        return self.values.unknown(where, problem, (WORLD, *self._frames))
 
     def placement(self, name: str, where: str) -> pin.SE3:
         """Placement of a frame in the world.
@@ -109,19 +144,16 @@ class Frames:
             If there is no such frame, or it is placed relative to itself.
         """
         chain: list[str] = []
-        while name != WORLD and name not in self._found:
+        while name not in self._found:
             if name not in self._frames:
                 raise self._unknown(name, self._frames[chain[-1]].where if chain else where)
+            frame = self._frames[name]
             if name in chain:
-                raise InputError(
-                    f"its pose is relative to itself: {' -> '.join((*chain, name))}",
-                    file=self.file,
-                    element=self._frames[name].where,
-                    remedy="Break the ring of relative_to",
-                )
+                problem = f"its pose is relative to itself: {' -> '.join((*chain, name))}"
+                raise self.values.fault(frame.where, problem, "Break the ring of relative_to")
             chain.append(name)
-            name = self._frames[name].relative_to
-        at = pin.SE3.Identity() if name == WORLD else self._found[name]
+            name = frame.relative_to
+        at = self._found[name]
         for each in reversed(chain):
             at = at * self._frames[each].placement
             self._found[each] = at
@@ -143,33 +175,17 @@ class Frames:
             if frame.body is not None:
                 return frame.body
             if name in seen:
-                raise InputError(
-                    f"it is attached to itself: {' -> '.join((*seen, name))}",
-                    file=self.file,
-                    element=frame.where,
-                    remedy="Break the ring of attached_to",
-                )
+                problem = f"it is attached to itself: {' -> '.join((*seen, name))}"
+                raise self.values.fault(frame.where, problem, "Break the ring of attached_to")
             seen.append(name)
             name = frame.attached_to
         return WORLD
 
 
-PlaceOf = Callable[[Element, str], pin.SE3]
-
-LINK_READ = ("pose", "inertial", "visual", "collision", "gravity", "kinematic", "static")
-LINK_IGNORED = (
-    "self_collide",
-    "enable_wind",
-    "must_be_base_link",
-    "velocity_decay",
-    "sensor",
-    "projector",
-    "audio_sink",
-    "audio_source",
-    "battery",
-    "light",
-    "particle_emitter",
-    "plugin",
+LINK_READ = ("pose", "inertial", "visual", "gravity", "kinematic", "static")
+LINK_IGNORED = words(
+    "collision self_collide enable_wind must_be_base_link velocity_decay sensor projector "
+    "audio_sink audio_source battery light particle_emitter plugin"
 )
 INERTIAL_READ = ("pose", "frame", "mass", "inertia")
 MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
@@ -177,7 +193,7 @@ MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.
 DEFAULTS = "without <inertial>, <mass> or <inertia> SDF's defaults count (1 kg, 1 kg m^2)"
 
 
-def read_link(values: XmlValues, node: Element, name: str, place_of: PlaceOf) -> Body:
+def read_link(values: XmlValues, node: Element, name: str, scope: Scope) -> Body:
     """One link; its pose is not read here.
 
     Parameters
@@ -186,34 +202,30 @@ def read_link(values: XmlValues, node: Element, name: str, place_of: PlaceOf) ->
         The file and the ``<link>``.
     name
         Its full name.
-    place_of
-        Reads the ``<pose>`` of an element, which names no frame.
+    scope
+        Where it is.
     """
     where = f"link {name!r}"
     values.attributes(node, where, ("name",))
-    values.children(node, where, LINK_READ, LINK_IGNORED, ("visual", "collision"))
+    values.children(node, where, LINK_READ, LINK_IGNORED, ("visual",))
     for tag, acts in (("gravity", True), ("kinematic", False), ("static", False)):
-        child = node.find(tag)
-        if child is not None and values.truth(child.text, where, f"<{tag}>") != acts:
-            raise values.fault(
-                where, f"<{tag}>{child.text}</{tag}> is not simulated by this version", "Remove it"
-            )
-    for collision in node.findall("collision"):
-        values.ignore(f"<{collision.tag}> element")
-    visuals = [_visual(values, visual, name, place_of) for visual in node.findall("visual")]
+        if values.child_truth(node, tag, where, acts) != acts:
+            problem = f"<{tag}>{node.findtext(tag)}</{tag}> is not simulated by this version"
+            raise values.fault(where, problem, "Remove it")
+    visuals = [_visual(values, visual, name, scope) for visual in node.findall("visual")]
     return Body(
         name,
-        _inertia(values, node.find("inertial"), where, place_of),
+        _inertia(values, node.find("inertial"), where, scope),
         tuple(visual for visual in visuals if visual is not None),
     )
 
 
-def _inertia(values: XmlValues, node: Element | None, where: str, place_of: PlaceOf) -> pin.Inertia:
+def _inertia(values: XmlValues, node: Element | None, where: str, scope: Scope) -> pin.Inertia:
     if node is None:
         values.remark(DEFAULTS, where)
         return pin.Inertia(1.0, np.zeros(3), np.eye(3))
     values.attributes(node, where, ("auto",))
-    if node.get("auto") is not None and values.truth(node.get("auto"), where, "auto"):
+    if values.truth(node.get("auto", "false"), where, "auto"):
         raise values.fault(
             where,
             "<inertial auto> (inertia from the collision shapes) is not read by this version",
@@ -223,56 +235,45 @@ def _inertia(values: XmlValues, node: Element | None, where: str, place_of: Plac
         if node.find(tag) is not None:
             raise values.fault(where, f"<{tag}> is not read by this version", "Remove it")
     values.children(node, where, INERTIAL_READ, ())
-    mass, inertia = node.find("mass"), node.find("inertia")
-    if mass is None or inertia is None:
+    inertia = node.find("inertia")
+    if inertia is None or node.find("mass") is None:
         values.remark(DEFAULTS, where)
-    kilograms = 1.0 if mass is None else values.numbers(mass.text, 1, where, "<mass>")[0]
-    moments = dict(MOMENTS)
     if inertia is not None:
         values.children(inertia, where, MOMENTS, ())
-        for key in MOMENTS:
-            child = inertia.find(key)
-            if child is not None:
-                moments[key] = float(values.numbers(child.text, 1, where, f"<{key}>")[0])
-    xx, yy, zz, xy, xz, yz = moments.values()
-    about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    placed = place_of(node, where)
-    turn = placed.rotation
-    return pin.Inertia(float(kilograms), placed.translation, turn @ about @ turn.T)
+    mass = values.child_number(node, "mass", where, 1.0)
+    moments = [values.child_number(inertia, key, where, MOMENTS[key]) for key in MOMENTS]
+    return inertia_at(own_pose(values, node, where, scope), mass, moments)
 
 
-def _visual(values: XmlValues, node: Element, link: str, place_of: PlaceOf) -> Element | None:
+SHAPES = {
+    "box": {"size": (3, "1 1 1")},
+    "sphere": {"radius": (1, "1")},
+    "cylinder": {"radius": (1, "1"), "length": (1, "1")},
+    "mesh": {"scale": (3, "1 1 1")},
+}
+"""Shapes that URDF has as well: their elements, with count and defaults of the numbers in these."""
+
+
+def _visual(values: XmlValues, node: Element, link: str, scope: Scope) -> Element | None:
     """A ``<visual>`` of URDF; None, counted, if URDF has no such shape."""
     where = f"link {link!r}, visual {node.get('name', '')!r}"
+    placement = own_pose(values, node, where, scope)
     shape = node.find("geometry/*")
-    out = Element("visual")
-    origin(out, place_of(node, where))
-    geometry = SubElement(out, "geometry")
-
-    def value(tag: str, count: int, default: str) -> str:
-        text = shape.findtext(tag, default) if shape is not None else default
-        return numbers(values.numbers(text, count, where, f"<{tag}>"))
-
-    match "no geometry" if shape is None else shape.tag:
-        case "box":
-            SubElement(geometry, "box", size=value("size", 3, "1 1 1"))
-        case "sphere":
-            SubElement(geometry, "sphere", radius=value("radius", 1, "1"))
-        case "cylinder":
-            sizes = {key: value(key, 1, "1") for key in ("radius", "length")}
-            SubElement(geometry, "cylinder", sizes)
-        case "mesh":
-            name = mesh_name(node.findtext("geometry/mesh/uri", ""))
-            SubElement(geometry, "mesh", filename=name, scale=value("scale", 3, "1 1 1"))
-        case tag:
-            values.remark(f"a <visual> of the shape <{tag}> is not drawn", f"link {link!r}")
-            return None
+    if shape is None or shape.tag not in SHAPES:
+        tag = "no geometry" if shape is None else shape.tag
+        values.remark(f"a <visual> of the shape <{tag}> is not drawn", f"link {link!r}")
+        return None
+    sizes = {
+        key: numbers(values.numbers(shape.findtext(key, default), count, where, f"<{key}>"))
+        for key, (count, default) in SHAPES[shape.tag].items()
+    }
+    if shape.tag == "mesh":
+        sizes = {"filename": mesh_name(shape.findtext("uri", "")), **sizes}
     colour = node.findtext("material/diffuse") or node.findtext("material/ambient")
+    rgba = None
     if colour is not None:
-        rgba = values.numbers(colour, (3, 4), where, "its colour")
-        material = SubElement(out, "material", name="")
-        SubElement(material, "color", rgba=numbers([*rgba, 1.0][:4]))
-    return out
+        rgba = [*values.numbers(colour, (3, 4), where, "its colour"), 1.0][:4]
+    return visual(placement, shape.tag, sizes, rgba)
 
 
 def mesh_name(uri: str) -> str:

@@ -7,11 +7,10 @@ the file, the key and the remedy.  The keys themselves are in :mod:`srm_mbs.form
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -33,6 +32,8 @@ from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Law, Polynomial, Table
 
+Element = TypeVar("Element")
+
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 """Columns of the table of a wrench; those that are missing are zero."""
 
@@ -53,11 +54,7 @@ class Description(TopEntry):
         InputError
             For an unknown type, a wrong axis, or an anchor without link or frame.
         """
-        out = []
-        for i, entry in enumerate(self.loop):
-            with _labelled("loop", i, entry.name) as label:
-                out.append(LoopClosure(**_with_anchors(label, entry)))
-        return tuple(out)
+        return self._elements("loop", lambda values: LoopClosure(**values))
 
     def coupled_joints(self) -> frozenset[str]:
         """Names of the joints that take part in a coupling."""
@@ -65,15 +62,11 @@ class Description(TopEntry):
 
     def anchors(self) -> Iterator[tuple[str, Any]]:
         """Every anchor with its key, ``loop[0].a`` for example."""
-        entries: list[tuple[str, Iterable[tuple[str, Any]]]] = [
-            (f"{kind}[{i}]", entry)
-            for kind in ("loop", "force", "drive")
-            for i, entry in enumerate(getattr(self, kind))
-        ]
-        for where, entry in entries:
-            for key, value in entry:
-                if isinstance(value, AnchorEntry):
-                    yield f"{where}.{key}", value
+        for kind in ("loop", "force", "drive"):
+            for i, entry in enumerate(getattr(self, kind)):
+                for key, value in entry:
+                    if isinstance(value, AnchorEntry):
+                        yield f"{kind}[{i}].{key}", value
 
     def force_elements(self, tables: CsvFolder | None) -> tuple[ForceElement, ...]:
         """The force elements; without ``tables`` those that follow a law are left out.
@@ -84,17 +77,17 @@ class Description(TopEntry):
             For a value that an element cannot take, an anchor without link or frame, or a table
             that cannot be read.
         """
-        out = []
-        for i, entry in enumerate(self.force):
-            with _labelled("force", i, entry.name) as label:
-                values = _with_anchors(label, entry)
-                kind = values.pop("type")
-                if kind in CSV_KEYS:
-                    if tables is None and (values["law"] or values["table"]):
-                        continue
-                    values = _with_law(kind, values, tables or CsvFolder(Path()))
-                out.append(FORCE_TYPES[kind](**values))
-        return tuple(out)
+
+        def make(values: dict[str, Any]) -> ForceElement | None:
+            kind = values.pop("type")
+            if kind in CSV_KEYS:
+                if tables is None and (values["law"] or values["table"]):
+                    return None
+                values = _with_law(kind, values, tables or CsvFolder(Path()))
+            made: ForceElement = FORCE_TYPES[kind](**values)
+            return made
+
+        return tuple(force for force in self._elements("force", make) if force is not None)
 
     def drives(self, tables: CsvFolder) -> tuple[Drive, ...]:
         """The drives.
@@ -104,25 +97,28 @@ class Description(TopEntry):
         InputError
             For a law or value that a drive cannot take, or a table that cannot be read.
         """
+
+        def make(values: dict[str, Any]) -> Drive:
+            law = _law({key: values.pop(key) for key in LAW_KEYS}, tables)
+            return Drive(law, **values)
+
+        return self._elements("drive", make)
+
+    def _elements(
+        self, kind: str, make: Callable[[dict[str, Any]], Element]
+    ) -> tuple[Element, ...]:
+        """The elements that ``make`` constructs from the tables ``[[kind]]``; errors name them."""
         out = []
-        for i, entry in enumerate(self.drive):
-            with _labelled("drive", i, entry.name or entry.joint or "") as label:
-                values = _with_anchors(label, entry)
-                law = law_from({key: values.pop(key) for key in LAW_KEYS}, tables)
-                out.append(Drive(law, **values))
+        for i, entry in enumerate(getattr(self, kind)):
+            name = entry.name or (kind == "drive" and entry.joint)
+            label = f"{kind} {name!r}" if name else f"{kind}[{i}]"
+            try:
+                out.append(make(_with_anchors(label, entry)))
+            except InputError as error:
+                if not (error.element or "").startswith(kind):
+                    error.element = f"{label}: {error.element}" if error.element else label
+                raise
         return tuple(out)
-
-
-@contextmanager
-def _labelled(kind: str, index: int, name: str) -> Iterator[str]:
-    """Call an element by its name or number in errors that do not name it yet."""
-    label = f"{kind} {name!r}" if name else f"{kind}[{index}]"
-    try:
-        yield label
-    except InputError as error:
-        if not (error.element or "").startswith(kind):
-            error.element = f"{label}: {error.element}" if error.element else label
-        raise
 
 
 def _with_anchors(label: str, entry: BaseModel) -> dict[str, Any]:
@@ -145,7 +141,7 @@ def _anchor(label: str, side: str, entry: Any) -> Anchor:
 # -- laws ------------------------------------------------------------------------------------
 
 
-def law_from(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
+def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
     """The law of ``entry``, keys and their values, None for those that are not given.
 
     Raises
@@ -173,7 +169,7 @@ def law_from(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
             raise InputError(
                 "the values are given twice", remedy="Give table, or t and values, not both"
             )
-        return _table_law(given["table"], given.get("time"), given.get("value"), tables)
+        return _table_law(given, tables)
     _refuse_columns(given)
     missing = [key.name for key in keys if key.default is MISSING and key.name not in given]
     if missing:
@@ -184,9 +180,10 @@ def law_from(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
     return kind(**given)
 
 
-def _table_law(file: str, time: str | None, value: str | None, tables: CsvFolder) -> Table:
-    columns = tables.table(file).columns((time or "t", value or "value"))
-    return Table(*columns.T.tolist())
+def _table_law(keys: Mapping[str, Any], tables: CsvFolder) -> Table:
+    """The law of the columns, by default t and value, of a table in a CSV file."""
+    names = (keys.get("time") or "t", keys.get("value") or "value")
+    return Table(*tables.table(keys["table"]).columns(names).T.tolist())
 
 
 def _refuse_columns(given: Mapping[str, Any]) -> None:
@@ -207,19 +204,18 @@ def _with_law(kind: str, values: Mapping[str, Any], tables: CsvFolder) -> dict[s
         If law and table are both given, neither of them nor a torque, or a table is malformed.
     """
     out = {key: value for key, value in values.items() if key not in TABLE_KEYS}
-    table = values["table"]
     if values["law"] is not None:
         if any(values.get(key) is not None for key in TABLE_KEYS):
             raise InputError("law and table are given", remedy="Give one of them")
-        out["law"] = law_from(dict(values["law"]), tables)
-    elif table is None:
+        out["law"] = _law(dict(values["law"]), tables)
+    elif values["table"] is None:
         _refuse_columns(values)
         if kind == "torque" and values["torque"] is None:
             raise InputError("there is no torque", remedy="Give torque, law or table")
     elif kind == "torque":
-        out["law"] = _table_law(table, values["time"], values["value"], tables)
+        out["law"] = _table_law(values, tables)
     else:
-        out["law"] = _wrench_laws(table, values["time"], tables)
+        out["law"] = _wrench_laws(values["table"], values["time"], tables)
     return out
 
 
@@ -234,22 +230,11 @@ def _wrench_laws(file: str, time: str | None, tables: CsvFolder) -> tuple[Law, .
             remedy="Name the columns of force and moment in the first line",
         )
     t, *columns = table.columns((time or "t", *there)).T.tolist()
-    laws = {name: Table(t, column) for name, column in zip(there, columns)}
+    laws: dict[str, Law] = {name: Table(t, column) for name, column in zip(there, columns)}
     return tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
 
 
 # -- text to tables --------------------------------------------------------------------------
-
-
-def parse_description(text: str, file: str) -> Description:
-    """Parse and check the TOML ``text`` of ``file``.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key or line, and the remedy.
-    """
-    return check_description(parse_toml(text, file), file)
 
 
 def parse_toml(text: str, file: str) -> dict[str, Any]:
@@ -361,11 +346,8 @@ def _location(error: Any) -> tuple[int | str, ...]:
 def _key_path(location: tuple[int | str, ...]) -> str:
     path = ""
     for part in location:
-        if isinstance(part, int):
-            path += f"[{part}]"
-        else:
-            path += f".{part}" if path else part
-    return path
+        path += f"[{part}]" if isinstance(part, int) else f".{part}"
+    return path.removeprefix(".")
 
 
 def _known_keys(location: tuple[int | str, ...]) -> str:

@@ -21,22 +21,14 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs.formats.xml import words
+
 EXTENDED_TYPES = ("spherical", "universal", "screw")
 POSITION_LIMITS = ("lowerPositionLimit", "upperPositionLimit", "positionLimitMargin")
-VELOCITY_VECTORS = (
-    "armature",
-    "rotorInertia",
-    "rotorGearRatio",
-    "damping",
-    "friction",
-    "effortLimit",
-    "lowerEffortLimit",
-    "upperEffortLimit",
-    "velocityLimit",
-    "lowerVelocityLimit",
-    "upperVelocityLimit",
-    "lowerDryFrictionLimit",
-    "upperDryFrictionLimit",
+VELOCITY_VECTORS = words(
+    """armature rotorInertia rotorGearRatio damping friction effortLimit lowerEffortLimit
+    upperEffortLimit velocityLimit lowerVelocityLimit upperVelocityLimit lowerDryFrictionLimit
+    upperDryFrictionLimit"""
 )
 
 

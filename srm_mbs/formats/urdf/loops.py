@@ -26,7 +26,7 @@ import pinocchio as pin
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
-from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling, read_gazebo_joints
+from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
 
 CLOSING = re.compile(r"(closing_.+)_1\Z")
 
@@ -90,7 +90,6 @@ def translate(document: Document, options: Options) -> Translation:
     found = _cut_second_parents(root, elements, options, notes)
     elements.graph = graph = Graph(root)
     found |= elements.read(root)
-    found |= read_gazebo_joints(root, elements)
     found |= _mimics(elements, options, notes)
     loops, remarks = closing_frames(graph.links, options.own)
     elements.loops.extend(loops)
@@ -173,11 +172,9 @@ def _close(joint: Element, reader: LoopElements) -> None:
     limit = joint.find("limit")
     if limit is not None:
         for key in limit.attrib:
-            reader.numbers(limit, key, 1, where)
+            reader.number(limit, key, where)
     damping, friction, armature = (
-        reader.numbers(dynamics, key, 1, where)[0]
-        if (dynamics := joint.find("dynamics")) is not None and dynamics.get(key) is not None
-        else 0.0
+        reader.number_or(0.0, joint.find("dynamics"), key, where)
         for key in ("damping", "friction", "armature")
     )
     for value, what in ((friction, "friction"), (armature, "armature")):
@@ -189,18 +186,14 @@ def _close(joint: Element, reader: LoopElements) -> None:
             )
     if kind == "floating":  # it restrains nothing
         return
-    parent, child = (
-        (reader.link(Element(side, link=link_of(joint, side)), "link", where), frame)
-        for side, frame in (
-            ("parent", reader.origin_of(joint.find("origin"), where)),
-            ("child", pin.SE3.Identity()),
-        )
-    )
+    parent, child = (reader.existing(link_of(joint, side), where) for side in ("parent", "child"))
     axes = [
-        None if (node := joint.find(tag)) is None else reader.numbers(node, "xyz", 3, where)
+        None if (node := joint.find(tag)) is None else reader.vector(node, "xyz", where)
         for tag in ("axis", "axis2")
     ]
-    reader.joint(kind, name, parent, child, axes, damping=damping, where=where)
+    frame = reader.origin_of(joint.find("origin"), where)
+    ends = (parent, frame), (child, pin.SE3.Identity())
+    reader.joint(kind, name, *ends, axes, damping=damping, where=where)
 
 
 # -- mimic -----------------------------------------------------------------------------------
@@ -226,10 +219,8 @@ def _mimics(elements: LoopElements, options: Options, notes: list[str]) -> bool:
             notes.append(f"joint {name!r} does not move: its <mimic> is ignored")
             continue
         leader = mimic.get("joint", "")
-        multiplier, offset = (
-            elements.numbers(mimic, key, 1, where)[0] if mimic.get(key) is not None else default
-            for key, default in (("multiplier", 1.0), ("offset", 0.0))
-        )
+        multiplier = elements.number_or(1.0, mimic, "multiplier", where)
+        offset = elements.number_or(0.0, mimic, "offset", where)
         problem = _mimic_problem(name, leader, joints, locked)
         if problem:
             raise elements.fault(where, *problem)

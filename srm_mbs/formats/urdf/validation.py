@@ -17,42 +17,26 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from srm_mbs.errors import SrmWarning
+from srm_mbs.formats.graph.joint_graph import inertia_tensor
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import XmlFile
+from srm_mbs.formats.xml import XmlFile, local_name, words
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
 IGNORED = {
-    "robot": ("material", "transmission", "gazebo", "sensor", "ros2_control", "verbose"),
-    "link": (
-        "visual",
-        "collision",
-        "contact",
-        "self_filter",
-        "sensor",
-        "self_collision_checking",
-        "collision_checking",
-        "surface",
-        "kinematic",
-        "gravity",
+    "robot": words("material transmission gazebo sensor ros2_control verbose"),
+    "link": words(
+        "visual collision contact self_filter sensor self_collision_checking collision_checking "
+        "surface kinematic gravity"
     ),
-    "joint": ("safety_controller", "calibration", "joint_properties"),
+    "joint": words("safety_controller calibration joint_properties"),
 }
 READ = {
     "robot": ("link", "joint"),
     "link": ("inertial",),
     "inertial": ("origin", "mass", "inertia"),
-    "joint": (
-        "origin",
-        "parent",
-        "child",
-        "axis",
-        "axis2",
-        "thread_pitch",
-        "limit",
-        "dynamics",
-    ),
+    "joint": words("origin parent child axis axis2 thread_pitch limit dynamics"),
 }
 ATTRIBUTES = {
     "link": ("name", "type"),
@@ -76,6 +60,9 @@ INFORMATIVE = {
 """Attributes of other tools found in published files: ignored, with a note."""
 DRAWN_ONLY = ("material", "visual", "collision")
 """Elements that are removed without a note: they do not act."""
+MANY = ("link", "joint")
+"""Elements that may be there several times."""
+DESCRIBE_LOOP = "Describe the loop as [[loop]] in a TOML description and remove the element"
 
 
 class ElementChecker(XmlFile):
@@ -85,89 +72,91 @@ class ElementChecker(XmlFile):
         super().__init__(file)
         self.notes: list[str] = []
 
-    def numbers(self, node: Element, key: str, count: int, where: str) -> list[float]:
+    def vector(self, node: Element, key: str, where: str, count: int = 3) -> list[float]:
         """``count`` finite numbers of attribute ``key``, which is rewritten in one form."""
+        text, tag = node.get(key), local_name(node)
+        if text is None:
+            raise self.fault(where, f"<{tag}> has no {key!r}", f'Give {key}="..."')
         # Limits do not act, and exporters write the largest double there.
-        largest = sys.float_info.max if node.tag == "limit" else LARGEST_MAGNITUDE
-        return self.attribute_numbers(node, key, count, where, largest)
+        largest = sys.float_info.max if tag == "limit" else LARGEST_MAGNITUDE
+        values: list[float] = self.numbers(text, count, where, f"<{tag} {key}>", largest).tolist()
+        node.set(key, " ".join(map(repr, values)))
+        return values
+
+    def vector_or_zero(self, node: Element | None, key: str, where: str) -> list[float]:
+        """Three numbers; zero without the attribute."""
+        if node is None or node.get(key) is None:
+            return [0.0, 0.0, 0.0]
+        return self.vector(node, key, where)
+
+    def number(self, node: Element, key: str, where: str) -> float:
+        """The finite number of attribute ``key``."""
+        return self.vector(node, key, where, 1)[0]
+
+    def number_or(self, default: float, node: Element | None, key: str, where: str) -> float:
+        """The number of attribute ``key``; ``default`` without the attribute."""
+        return default if node is None or node.get(key) is None else self.number(node, key, where)
 
     def attributes(self, node: Element, where: str, count: bool = True) -> None:
         """Refuse unknown attributes; count and remove those that are ignored, or leave them."""
-        known = ATTRIBUTES.get(node.tag)
-        ignored = INFORMATIVE.get(node.tag, ())
-        for key in list(node.attrib):
-            if key in ignored:
-                if not count:
-                    continue
+        ignored = [key for key in INFORMATIVE.get(node.tag, ()) if key in node.attrib]
+        if node.tag in ATTRIBUTES:
+            self.only(node, where, ATTRIBUTES[node.tag], ignored)
+        if count:
+            for key in ignored:
                 self.ignore(f"<{node.tag} {key}> attribute")
                 del node.attrib[key]
-            elif known is not None and key not in known:
-                raise self.fault(
-                    where,
-                    f"<{node.tag}> has an unknown attribute {key!r}",
-                    f"Known: {', '.join(known)}",
-                )
 
     def children(self, node: Element, where: str) -> None:
         """Refuse unknown elements of ``node``; count and remove those that are ignored."""
         read, ignored = READ[node.tag], IGNORED.get(node.tag, ())
         for child in list(node):
-            tag = child.tag
-            local = tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
+            tag, local = child.tag, local_name(child)
+            before = f"{where}, " if where else ""
             if tag in read:
                 self.attributes(child, where)
                 if tag not in READ and len(child):
-                    raise self.fault(
-                        where, f"unknown element <{child[0].tag}> in <{tag}>", "Remove it"
-                    )
+                    problem = f"unknown element <{child[0].tag}> in <{tag}>"
+                    raise self.fault(where, problem, "Remove it")
             elif tag in ignored:
-                self.no_loop_inside(child, where)
-                self.no_inertia_inside(child, where)
+                self.nothing_acts_in(child, f"{before}<{local}>")
                 if tag not in DRAWN_ONLY:
                     self.ignore(f"<{tag}> element")
                 node.remove(child)
             elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
                 raise self.fault(
-                    f"{where}, <xacro:{local}>" if where else f"<xacro:{local}>",
+                    f"{before}<xacro:{local}>",
                     "this is a xacro macro, not URDF",
                     "Run xacro on the file first",
                 )
             elif local in LOOP_ELEMENTS or tag != local:
                 raise self.fault(
-                    f"{where}, <{local}>" if where else f"<{local}>",
+                    f"{before}<{local}>",
                     f"the element <{local}> (a loop, coupling or force of another tool) is not "
                     "read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                    DESCRIBE_LOOP,
                 )
             else:
-                raise self.fault(
-                    where or f"<{tag}>",
-                    f"unknown element <{tag}> in <{node.tag}>",
-                    f"Known: {', '.join((*read, *ignored))}",
-                )
-        for tag in set(read) - {"link", "joint"}:
-            if len(node.findall(tag)) > 1:
+                problem = f"unknown element <{tag}> in <{node.tag}>"
+                raise self.unknown(where or f"<{tag}>", problem, (*read, *ignored))
+        for tag in read:
+            if tag not in MANY and len(node.findall(tag)) > 1:
                 raise self.fault(where, f"<{tag}> is given twice", "Keep one")
 
-    def no_loop_inside(self, node: Element, where: str) -> None:
-        """Refuse loops and couplings inside an element that is ignored as a whole."""
+    def nothing_acts_in(self, node: Element, where: str) -> None:
+        """Refuse loops and couplings in an element that is ignored as a whole, and inertia in one
+        that is only drawn: the link would lose it."""
         for inner in node.iter():
             if inner.tag in (*LOOP_ELEMENTS, "mimic"):
                 raise self.fault(
-                    ", ".join(part for part in (where, f"<{node.tag}>, <{inner.tag}>") if part),
+                    f"{where}, <{inner.tag}>",
                     f"the element <{inner.tag}> (a loop or coupling) inside <{node.tag}> is not "
                     "read by this version",
-                    "Describe the loop as [[loop]] in a TOML description and remove the element",
+                    DESCRIBE_LOOP,
                 )
-
-    def no_inertia_inside(self, node: Element, where: str) -> None:
-        """Refuse inertia inside an element that is only drawn: the link would lose it."""
-        if node.tag not in DRAWN_ONLY:
-            return
-        for inner in node.iter():
-            if inner.tag in ("inertial", "mass", "inertia"):
+            if node.tag in DRAWN_ONLY and inner.tag in ("inertial", "mass", "inertia"):
                 raise self.fault(
-                    where or f"<{node.tag}>",
+                    where,
                     f"<{inner.tag}> inside <{node.tag}> would not act",
                     "Put <mass> and <inertia> into the <inertial> of the link",
                 )
@@ -181,19 +170,14 @@ class ElementChecker(XmlFile):
             if not name:
                 raise self.fault(f"<{tag}>", "it has no name", 'Give name="..."')
             if name in found:
-                raise self.fault(
-                    f"{tag} {name!r}", f"two {tag}s have this name", "Rename one of them"
-                )
+                where = f"{tag} {name!r}"
+                raise self.fault(where, f"two {tag}s have this name", "Rename one of them")
             found[name] = node
         return found
 
     def origin(self, node: Element, where: str) -> None:
-        origin = node.find("origin")
-        if origin is None:
-            return
         for key in ("xyz", "rpy"):
-            if origin.get(key) is not None:
-                self.numbers(origin, key, 3, where)
+            self.vector_or_zero(node.find("origin"), key, where)
 
 
 URDF_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
@@ -206,137 +190,6 @@ ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
 PARALLEL_AXES_TOLERANCE = 1e-6
 """Axes of a universal joint at an angle (rad) below this are parallel."""
-
-
-class JointChecker(ElementChecker):
-    """Checks one joint at a time."""
-
-    def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
-        where = f"joint {name!r}"
-        if name == UNIVERSE or (name == ROOT_JOINT and base != "fixed"):
-            raise self.fault(
-                where,
-                f"the name {name!r} is reserved"
-                + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
-                "Rename the joint",
-            )
-        self.children(joint, where)
-        kind = joint.get("type")
-        if kind not in JOINT_TYPES:
-            raise self.fault(
-                where, f"there is no joint type {kind!r}", f"Known: {', '.join(JOINT_TYPES)}"
-            )
-        self.origin(joint, where)
-        self.axis(joint, kind, where)
-        self.only_of(joint, kind, where)
-        self.limit(joint, kind, where)
-        self.dynamics(joint, kind, where, locked)
-
-    def axis(self, joint: Element, kind: str, where: str) -> None:
-        axis = joint.find("axis")
-        if axis is not None and kind not in WITH_AXIS:
-            joint.remove(axis)
-            axis = None
-        direction = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
-        if kind == "planar" and (direction[:2] != [0.0, 0.0] or direction[2] < 0.0):
-            given = " (the default of URDF)" if axis is None else ""
-            raise self.fault(
-                where,
-                f"the normal of a planar joint is read along z only, not {direction}{given}",
-                'Write <axis xyz="0 0 1"/> and turn the joint by <origin rpy=...>',
-            )
-
-    def direction(self, axis: Element, where: str) -> list[float]:
-        """The unit vector of <axis> or <axis2>, written afresh."""
-        direction = self.numbers(axis, "xyz", 3, where)
-        if not any(direction):
-            raise self.fault(where, "its axis is zero", "Give a direction")
-        # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
-        length = math.hypot(*direction)
-        direction = [component / length for component in direction]
-        axis.set("xyz", " ".join(map(repr, direction)))
-        return direction
-
-    def only_of(self, joint: Element, kind: str, where: str) -> None:
-        """<axis2> of a universal joint and <thread_pitch> of a screw."""
-        for tag, owner in (("axis2", "universal"), ("thread_pitch", "screw")):
-            node = joint.find(tag)
-            if (node is not None) != (kind == owner):
-                raise self.fault(
-                    where,
-                    f"a {kind} joint takes no <{tag}>"
-                    if node is not None
-                    else f"a {owner} joint needs <{tag}>",
-                    "Remove it" if node is not None else "Add it",
-                )
-            if node is None:
-                continue
-            if tag == "thread_pitch":
-                if self.numbers(node, "value", 1, where) == [0.0]:
-                    raise self.fault(
-                        where, "its thread pitch is zero", 'Give m per turn, or type="revolute"'
-                    )
-                continue
-            axis = joint.find("axis")
-            first = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
-            second = self.direction(node, where)
-            if np.linalg.norm(np.cross(first, second)) < PARALLEL_AXES_TOLERANCE:
-                raise self.fault(
-                    where, "<axis> and <axis2> are parallel", "Give them different directions"
-                )
-
-    def limit(self, joint: Element, kind: str, where: str) -> None:
-        limit = joint.find("limit")
-        if limit is None:
-            if kind in ("revolute", "prismatic"):
-                raise self.fault(
-                    where,
-                    f"a {kind} joint needs <limit lower upper effort velocity>",
-                    'Add it, or use type="continuous" for an unlimited angle'
-                    if kind == "revolute"
-                    else "Add it",
-                )
-            return
-        for key in limit.attrib:
-            self.numbers(limit, key, 1, where)
-        if kind not in WITH_LIMIT:
-            joint.remove(limit)
-            return
-        for key in ("effort", "velocity"):
-            if limit.get(key) is None and kind in ("continuous", "screw"):
-                limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
-            (value,) = self.numbers(limit, key, 1, where)
-            if value < 0.0:
-                raise self.fault(
-                    where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
-                )
-        lower, upper = (
-            self.numbers(limit, key, 1, where)[0] if key in limit.attrib else 0.0
-            for key in ("lower", "upper")
-        )
-        if lower > upper:
-            self.notes.append(
-                f"{where}: its limits are none: lower = {lower:g} is above upper = {upper:g}"
-            )
-
-    def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
-        dynamics = joint.find("dynamics")
-        if dynamics is None:
-            return
-        for key in dynamics.attrib:
-            (value,) = self.numbers(dynamics, key, 1, where)
-            if value < 0.0:
-                raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
-            if value != 0.0 and kind in ("floating", "planar") and not locked:
-                raise self.fault(
-                    where,
-                    f"the {key} ({value:g}) of a {kind} joint is not simulated by this version",
-                    "Set it to 0; that of one-degree joints acts",
-                )
-        if not dynamics.attrib:
-            joint.remove(dynamics)
-
-
 LARGEST_TREE_DEPTH = 1000
 """Largest number of links between the root and a leaf: Pinocchio's recursive parser overflows the
 stack in deeper trees."""
@@ -344,7 +197,7 @@ POINT_MASS_GYRATION_SQUARED = 1e-18
 """Square of the radius of gyration (m^2) below which it is rounding: a nanometre."""
 
 
-class UrdfChecker(JointChecker):
+class UrdfChecker(ElementChecker):
     """Walks a URDF once; raises :class:`InputError` at the first fault."""
 
     def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
@@ -396,7 +249,7 @@ class UrdfChecker(JointChecker):
         if origin is not None:  # of no meaning in URDF, but exporters write it with zeros
             self.attributes(origin, where)
             for key in ("xyz", "rpy"):
-                if origin.get(key) is not None and any(self.numbers(origin, key, 3, where)):
+                if any(self.vector_or_zero(origin, key, where)):
                     raise self.fault(
                         where,
                         "<origin> in <link> has no meaning in URDF and would not move anything",
@@ -413,13 +266,11 @@ class UrdfChecker(JointChecker):
         if mass is None or inertia is None:
             missing = "mass" if mass is None else "inertia"
             raise self.fault(where, f"<inertial> has no <{missing}>", "Add it")
-        (value,) = self.numbers(mass, "value", 1, where)
+        value = self.number(mass, "value", where)
         if value < 0.0:
             raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
-        xx, yy, zz, xy, xz, yz = (
-            self.numbers(inertia, key, 1, where)[0] for key in ATTRIBUTES["inertia"]
-        )
-        principal = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        moments = [self.number(inertia, key, where) for key in ATTRIBUTES["inertia"]]
+        principal = np.linalg.eigvalsh(inertia_tensor(moments))
         rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
         if principal[0] < -rounding:
             raise self.fault(
@@ -436,6 +287,126 @@ class UrdfChecker(JointChecker):
             self.notes.append(note)
             warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
 
+    def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
+        where = f"joint {name!r}"
+        if name == UNIVERSE or (name == ROOT_JOINT and base != "fixed"):
+            raise self.fault(
+                where,
+                f"the name {name!r} is reserved"
+                + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
+                "Rename the joint",
+            )
+        self.children(joint, where)
+        kind = joint.get("type")
+        if kind not in JOINT_TYPES:
+            raise self.unknown(where, f"there is no joint type {kind!r}", JOINT_TYPES)
+        self.origin(joint, where)
+        self.axis(joint, kind, where)
+        self.only_of(joint, kind, where)
+        self.limit(joint, kind, where)
+        self.dynamics(joint, kind, where, locked)
+
+    def axis(self, joint: Element, kind: str, where: str) -> None:
+        axis = joint.find("axis")
+        if axis is not None and kind not in WITH_AXIS:
+            joint.remove(axis)
+            axis = None
+        direction = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
+        if kind == "planar" and (direction[:2] != [0.0, 0.0] or direction[2] < 0.0):
+            given = " (the default of URDF)" if axis is None else ""
+            raise self.fault(
+                where,
+                f"the normal of a planar joint is read along z only, not {direction}{given}",
+                'Write <axis xyz="0 0 1"/> and turn the joint by <origin rpy=...>',
+            )
+
+    def direction(self, axis: Element, where: str) -> list[float]:
+        """The unit vector of <axis> or <axis2>, written afresh."""
+        direction = self.vector(axis, "xyz", where)
+        if not any(direction):
+            raise self.fault(where, "its axis is zero", "Give a direction")
+        # Pinocchio does not normalise a tiny axis, and takes 2 x for an inclined one.
+        length = math.hypot(*direction)
+        direction = [component / length for component in direction]
+        axis.set("xyz", " ".join(map(repr, direction)))
+        return direction
+
+    def only_of(self, joint: Element, kind: str, where: str) -> None:
+        """<axis2> of a universal joint and <thread_pitch> of a screw."""
+        for tag, owner in (("axis2", "universal"), ("thread_pitch", "screw")):
+            node = joint.find(tag)
+            if (node is not None) != (kind == owner):
+                raise self.fault(
+                    where,
+                    f"a {kind} joint takes no <{tag}>"
+                    if node is not None
+                    else f"a {owner} joint needs <{tag}>",
+                    "Remove it" if node is not None else "Add it",
+                )
+            if node is None:
+                continue
+            if tag == "thread_pitch":
+                if self.number(node, "value", where) == 0.0:
+                    raise self.fault(
+                        where, "its thread pitch is zero", 'Give m per turn, or type="revolute"'
+                    )
+                continue
+            axis = joint.find("axis")
+            first = [1.0, 0.0, 0.0] if axis is None else self.direction(axis, where)
+            second = self.direction(node, where)
+            if np.linalg.norm(np.cross(first, second)) < PARALLEL_AXES_TOLERANCE:
+                raise self.fault(
+                    where, "<axis> and <axis2> are parallel", "Give them different directions"
+                )
+
+    def limit(self, joint: Element, kind: str, where: str) -> None:
+        limit = joint.find("limit")
+        if limit is None:
+            if kind in ("revolute", "prismatic"):
+                raise self.fault(
+                    where,
+                    f"a {kind} joint needs <limit lower upper effort velocity>",
+                    'Add it, or use type="continuous" for an unlimited angle'
+                    if kind == "revolute"
+                    else "Add it",
+                )
+            return
+        for key in limit.attrib:
+            self.number(limit, key, where)
+        if kind not in WITH_LIMIT:
+            joint.remove(limit)
+            return
+        for key in ("effort", "velocity"):
+            if limit.get(key) is None and kind in ("continuous", "screw"):
+                limit.set(key, "0.0")  # Pinocchio wants both; limits do not act here
+            value = self.number(limit, key, where)
+            if value < 0.0:
+                raise self.fault(
+                    where, f"the limit {key} = {value:g} is negative", "Give a value >= 0"
+                )
+        lower, upper = (self.number_or(0.0, limit, key, where) for key in ("lower", "upper"))
+        if lower > upper:
+            self.notes.append(
+                f"{where}: its limits are none: lower = {lower:g} is above upper = {upper:g}"
+            )
+
+    def dynamics(self, joint: Element, kind: str, where: str, locked: bool) -> None:
+        dynamics = joint.find("dynamics")
+        if dynamics is None:
+            return
+        for key in dynamics.attrib:
+            value = self.number(dynamics, key, where)
+            if value < 0.0:
+                raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
+            if value != 0.0 and kind in ("floating", "planar") and not locked:
+                raise self.fault(
+                    where,
+                    f"the {key} ({value:g}) of a {kind} joint is not simulated by this version",
+                    "Set it to 0; that of one-degree joints acts",
+                )
+        if not dynamics.attrib:
+            joint.remove(dynamics)
+
     def tree(self, links: dict[str, Element], joints: dict[str, Element], base: str) -> None:
         parent_joint: dict[str, str] = {}
         parent_link: dict[str, str] = {}
@@ -449,11 +420,8 @@ class UrdfChecker(JointChecker):
                         f"joint {name!r}", f"it has no <{side} link=...>", f"Name its {side} link"
                     )
                 if link not in links:
-                    raise self.fault(
-                        f"joint {name!r}",
-                        f"its {side} link {link!r} does not exist",
-                        f"Known: {', '.join(links)}",
-                    )
+                    problem = f"its {side} link {link!r} does not exist"
+                    raise self.unknown(f"joint {name!r}", problem, links)
                 ends[side] = link
             child = ends["child"]
             if child in parent_joint:
@@ -473,31 +441,27 @@ class UrdfChecker(JointChecker):
             raise self.fault(
                 "<robot>", problem, "Keep exactly one root link; close loops by [[loop]]"
             )
-        children: dict[str, list[str]] = {}
-        for child, parent in parent_link.items():
-            children.setdefault(parent, []).append(child)
-        level, depth, loose = roots, 0, set(links)
-        while level:
-            if depth > LARGEST_TREE_DEPTH:
-                raise self.fault(
-                    f"link {level[0]!r}",
-                    f"more than {LARGEST_TREE_DEPTH} joints lie between it and the root link",
-                    "Split the chain: Pinocchio cannot read such a deep one",
-                )
-            loose -= set(level)
-            level = [child for link in level for child in children.get(link, ())]
-            depth += 1
-        if loose:
-            ring: dict[str, None] = {}
-            at = next(link for link in links if link in loose)
-            while at not in ring:
-                ring[at] = None
+        depth = {roots[0]: 0}
+        for link in links:
+            at, path = link, dict[str, None]()
+            while at not in depth:
+                if at in path:
+                    raise self.fault(
+                        f"link {at!r}",
+                        f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a "
+                        "ring",
+                        "Close loops by [[loop]] in a TOML description",
+                    )
+                path[at] = None
                 at = parent_link[at]
-            raise self.fault(
-                f"link {at!r}",
-                f"it is its own ancestor: the joints from {parent_link[at]!r} to it form a ring",
-                "Close loops by [[loop]] in a TOML description",
-            )
+            for below in reversed(path):
+                depth[below] = depth[parent_link[below]] + 1
+                if depth[below] > LARGEST_TREE_DEPTH:
+                    raise self.fault(
+                        f"link {below!r}",
+                        f"more than {LARGEST_TREE_DEPTH} joints lie between it and the root link",
+                        "Split the chain: Pinocchio cannot read such a deep one",
+                    )
         for reserved in (WORLD, UNIVERSE):
             if reserved in links and (roots[0] != reserved or base != "fixed"):
                 raise self.fault(

@@ -126,11 +126,9 @@ def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
             zero = 2.0 * start / (-a + np.sqrt(root))
         elif a + 2.0 * b >= 0.0 or root < 0.0:
             return None if line > PREDICTION_STEPS else line
-    return (
-        float(zero)
-        if 1.0 < zero < PREDICTION_STEPS
-        else (line if 1.0 < line < PREDICTION_STEPS and zero <= 1.0 else None)
-    )
+    if zero <= 1.0:
+        zero = line
+    return float(zero) if 1.0 < zero < PREDICTION_STEPS else None
 
 
 class Arrival(IntEnum):
@@ -146,7 +144,7 @@ class Arrival(IntEnum):
 
 def inverse_abscissae(scheme: ButcherTableau) -> list[float]:
     """1/c of the stages and the end (s + 1,); 0 where c is."""
-    return [1.0 / c if c > 0.0 else 0.0 for c in [*scheme.c.tolist(), 1.0]]
+    return [1.0 / c if c > 0.0 else 0.0 for c in scheme.abscissae.tolist()]
 
 
 def sigma_slope(inverse: list[float], sigmas: FloatArray, h: float) -> float:
@@ -217,12 +215,11 @@ class SingularityPlacement(ControlWrapper):
         t_end: float = np.inf,
         arrivals: bool = False,
     ) -> None:
-        super().__init__(inner)
-        self._t_end = t_end
+        super().__init__(inner, t_end)
         self._gaps = Gaps(scheme)
-        self._abscissae = [*scheme.c.tolist(), 1.0]
+        self._abscissae = scheme.abscissae
         self._inverse = inverse_abscissae(scheme)
-        self._later_stages = [j for j, c in enumerate(self._abscissae) if c > 0.0]
+        self._later_stages = np.flatnonzero(self._abscissae > 0.0).tolist()
         self._inner_stages = [j for j in self._later_stages if self._abscissae[j] < 1.0]
         self._middle = scheme.middle
         self._slope = 0.0
@@ -259,9 +256,8 @@ class SingularityPlacement(ControlWrapper):
 
     def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
-        self._t_end = end
+        super().set_target_time(end, grid)
         self._arrival = self._watched
-        self._inner.set_target_time(end, grid)
 
     def _arrives(self, t: float, proposal: Proposal) -> bool:
         """Whether the end beside a singular configuration is to be prepared for."""
@@ -298,7 +294,7 @@ class SingularityPlacement(ControlWrapper):
         movable = self._inner_stages if last else self._later_stages
         if not min((values[i] for i in movable), default=np.inf) < min(reach, 0.5 * values[0]):
             return None
-        zero = zero_within(np.array(self._abscissae), sigmas)
+        zero = zero_within(self._abscissae, sigmas)
         if zero is None or not zero > 0.0:
             return None
         return self._gaps.longest_step(zero * h, 0.98 * h)
@@ -344,8 +340,10 @@ class SlopeOfSigma(ControlWrapper):
     It measures how fast sigma changes, by which the zone is widened for fast passages.
     """
 
-    def __init__(self, inner: StepSizeControl, scheme: ButcherTableau) -> None:
-        super().__init__(inner)
+    def __init__(
+        self, inner: StepSizeControl, scheme: ButcherTableau, t_end: float = np.inf
+    ) -> None:
+        super().__init__(inner, t_end)
         self._inverse = inverse_abscissae(scheme)
         self._slope = 0.0
 

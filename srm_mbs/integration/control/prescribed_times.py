@@ -9,12 +9,13 @@ alike.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
-from srm_mbs.integration.control.step_size import ControlWrapper, Grid, Proposal, StepSizeControl
+from srm_mbs.integration.control.step_size import ControlWrapper, Proposal, StepSizeControl
 from srm_mbs.integration.methods.base import IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.thesis.halved_step import HalvedStep
@@ -59,19 +60,17 @@ class AvoidTimes(ControlWrapper):
         t_end: float,
         step: float | None = None,
     ) -> None:
-        super().__init__(inner)
-        self._t_end, self._step = t_end, step
+        super().__init__(inner, t_end)
+        self._step = step
         self._times = np.sort(times)
-        self._abscissae = np.unique(np.append(scheme.c[scheme.c > 0.0], 1.0))
+        self._abscissae = np.unique(scheme.abscissae[scheme.abscissae > 0.0])
         self._centres = [centre for centre, half in scheme.gaps if half > 1.5 * STAGE_CLEARANCE]
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where it would come too close to a given time."""
         proposal = self._inner.propose(t, limit, memory)
         distances = self._times[self._times > t] - t
-        if not len(distances) or self._clear(proposal.h, distances):
-            return proposal
-        if proposal.singular_arrival:
+        if proposal.singular_arrival or not len(distances) or self._clear(proposal.h, distances):
             return proposal
         self.placed += 1
         longest = proposal.h
@@ -79,11 +78,6 @@ class AvoidTimes(ControlWrapper):
             longest = min(self._step, limit, self._t_end - t)
         h = self._longest_clear(longest, distances)
         return Proposal(h, t + h)
-
-    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
-        """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
-        self._t_end = end
-        super().set_target_time(end, grid)
 
     def _clear(self, h: float, distances: FloatArray) -> bool:
         """Whether a step of length ``h`` stays clear of times at ``distances`` (s)."""
@@ -105,7 +99,7 @@ class AvoidTimes(ControlWrapper):
         return float(next(x for x in candidates if x <= h and self._clear(x, distances)))
 
 
-def suspected(wrappers: Sequence[ControlWrapper]) -> list[float]:
+def suspected(wrappers: Sequence[Any]) -> list[float]:
     """Times (s) up to which the motion may have changed its branch, by the branch guard among the
     ``wrappers``."""
     return [t for wrapper in wrappers for t in wrapper.suspect_times()]

@@ -92,14 +92,20 @@ class StepSizeControl(Protocol):
 class ControlWrapper:
     """Step-size control around ``inner``, which decides unless a subclass does.
 
+    Parameters
+    ----------
+    t_end
+        End of the run (s).
+
     Attributes
     ----------
     placed, replaced
         How many steps were changed in advance, and redone afterwards.
     """
 
-    def __init__(self, inner: StepSizeControl) -> None:
+    def __init__(self, inner: StepSizeControl, t_end: float = np.inf) -> None:
         self._inner = inner
+        self._t_end = t_end
         self.adaptive = inner.adaptive
         self.placed = 0
         self.replaced = 0
@@ -114,6 +120,7 @@ class ControlWrapper:
 
     def set_target_time(self, end: float, grid: Grid | None = None) -> None:
         """See :class:`StepSizeControl`."""
+        self._t_end = end
         self._inner.set_target_time(end, grid)
 
     def suspect_times(self) -> list[float]:

@@ -55,15 +55,15 @@ def check_kernel() -> None:
         )
 
 
-def unsupported_reason(method: Method, placement: str, singular_times: FloatArray) -> str:
-    """Which option of a run the kernel lacks; empty if it has them all."""
+def unsupported_reason(method: Method, placement: str, singular_times: FloatArray) -> str | None:
+    """Which option of a run the kernel lacks; None if it has them all."""
     if not (isinstance(method, PSRM) and method.correction == "split"):
         return "it has the split PSRM only"
     if placement not in PLACEMENTS:
         return f"it has no placement {placement!r}"
     if len(singular_times):
         return "it has no given singular times"
-    return ""
+    return None
 
 
 def uses_kernel(asked: str, method: Method, placement: str, singular_times: FloatArray) -> bool:

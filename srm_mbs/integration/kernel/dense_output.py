@@ -56,7 +56,6 @@ class CompiledDenseOutput(DenseOutput):
         self._mechanism_system = system
         self._scheme = scheme
         self._kernel_system = kernel_system
-        self._compiled: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy may be loaded where there is no kernel.
@@ -65,14 +64,8 @@ class CompiledDenseOutput(DenseOutput):
     def __call__(self, t: FloatArray) -> FloatArray:
         """States (k, nx) at the times ``t`` (k,), in any order; see
         :class:`~srm_mbs.integration.dense_output.DenseOutput`."""
-        if self._steps.count < 2:  # a single step has no neighbours, but perhaps a zone
+        if self._by_reference:
             return super().__call__(t)
-        if self._lone_zones:
-            return super().__call__(t)
-        if len(self._extension.extra_c) and self._steps.rates.shape[1] == self._extension.n_rates:
-            return super().__call__(t)  # loaded without the controller: no stage is to be evaluated
-        if self._compiled is None:
-            self._compiled = self._compile()
         try:
             if self._kernel_system is not None:
                 return self._states(self._kernel_system, t)
@@ -94,15 +87,20 @@ class CompiledDenseOutput(DenseOutput):
             )
 
     @cached_property
-    def _lone_zones(self) -> bool:
-        """Whether a step with a zone has a breakpoint at both ends.
+    def _by_reference(self) -> bool:
+        """Whether only the reference can evaluate it."""
+        steps, extension = self._steps, self._extension
+        if steps.count < 2:  # a single step has no neighbours, but perhaps a zone
+            return True
+        if len(extension.extra_c) and steps.rates.shape[1] == extension.n_rates:
+            return True  # loaded without the controller: no stage is to be evaluated
+        # In a step between two breakpoints the state follows from extra stages, which have no zone
+        # in the kernel.
+        intervals = (steps.smooth_interval(step) for step in steps.zones)
+        return any(last - first < 2 for first, last in intervals)
 
-        The state within it then follows from extra stages, which have no zone in the kernel.
-        """
-        pieces = (self._steps.smooth_interval(step) for step in self._steps.zones)
-        return any(last - first < 2 for first, last in pieces)
-
-    def _compile(self) -> Any:
+    @cached_property
+    def _compiled(self) -> Any:
         system = self._mechanism_system
         return core.DenseOutput(  # type: ignore[union-attr]
             system.nq,

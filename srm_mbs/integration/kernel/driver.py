@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,7 @@ from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunRecord, Tick
 from srm_mbs.integration.events import EventWatch
 from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
-from srm_mbs.integration.kernel.run import (
-    ARRIVAL,
-    BREAKPOINT,
-    CHUNK_FULL,
-    CLOSURES,
-    FINISHED,
-    NOT_EVALUATED,
-    STANDSTILL,
-    TOO_SHORT,
-    CompiledRun,
-)
+from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -40,22 +30,21 @@ class CompiledRecord(RunRecord):
     ----------
     run
         Holds the steps.
-    suspects
-        Ends (s) of steps that were accepted although they may have changed the branch.
     placed, replaced
         Numbers of steps that were placed around a singular configuration, and of attempts that
         were repeated for it.
     """
 
     run: Any = None
-    suspects: list[float] = field(default_factory=list)
     placed: int = 0
     replaced: int = 0
 
+    def suspect_times(self) -> list[float]:
+        """Ends (s) of steps that were accepted although they may have changed the branch."""
+        return list(self.run.suspect_times())
+
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        if self.run is None:
-            return super().data(scheme, tangent_size)
         return steps_from(self.run.take_records(self.t0, self.x0), self.stop)
 
 
@@ -79,27 +68,27 @@ def integrate(
     passing
         Handles breakpoints, if there are any.
     """
-    state = run.start
-    record = CompiledRecord(run.t0, state)
-    record.run = run
+    start = run.start
+    record = CompiledRecord(run.t0, start, run=run)
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
-    start = state
+    stride = 0
+    if one_by_one:
+        stride = getattr(tick, "stride", 1) if events is None else 1
     try:
         if events is not None:
-            events.begin(run.t0, state)
-        reason = CHUNK_FULL
-        while reason in (CHUNK_FULL, BREAKPOINT, ARRIVAL):
+            events.begin(run.t0, start)
+        reason = ReturnReason.CHUNK_FULL
+        while reason is not ReturnReason.FINISHED:
             made = run.count
-            steps = getattr(tick, "stride", 1) if events is None else 1
-            reason = run.advance(steps if one_by_one else 0)
-            if reason == BREAKPOINT and passing is not None:
+            reason = run.advance(stride)
+            if reason is ReturnReason.BREAKPOINT and passing is not None:
                 run.pass_breakpoint(passing)
                 continue
-            if reason == ARRIVAL and passing is not None:
+            if reason is ReturnReason.ARRIVAL and passing is not None:
                 run.arrive(passing)
                 continue
-            if reason not in (CHUNK_FULL, FINISHED):
+            if reason not in (ReturnReason.CHUNK_FULL, ReturnReason.FINISHED):
                 failure = why_stopped(reason, system, run)
                 record.mark_failed(failure, run.t, run.h, run.memory().sigma, run.adaptive)
                 break
@@ -120,22 +109,23 @@ def integrate(
     record.attempts = [
         driver.Attempt(t, h, ratio, DECISIONS[decision]) for t, h, ratio, decision in run.attempts()
     ]
-    record.suspects = run.suspect_times()
     record.placed, record.replaced = run.placed, run.replaced
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
 
 
-def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun) -> RunFailure:
+def why_stopped(
+    reason: ReturnReason, system: ClosedSystem | OpenSystem, run: CompiledRun
+) -> RunFailure:
     """The reason why the kernel stopped, from the reference, which repeats the failed attempt."""
     attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
-    if reason == STANDSTILL:
+    if reason is ReturnReason.STANDSTILL:
         return driver.standstill(run.t - run.time_before(driver.WATCHED_STEPS))
-    if reason == CLOSURES:
+    if reason is ReturnReason.CLOSURES:
         failure = driver.Closures(system, run.norm).failure(run.last())
         return failure or RunFailure.of(StopReason.ERROR_ESTIMATE)
-    if reason == TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
+    if reason is ReturnReason.TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
         return RunFailure.of(StopReason.ROUND_OFF)
     if run.evaluation_failed:
         failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
@@ -147,5 +137,5 @@ def why_stopped(reason: int, system: ClosedSystem | OpenSystem, run: CompiledRun
             except EvaluationError as error:
                 return RunFailure(StopReason.NOT_EVALUATED, str(error))
     return RunFailure.of(
-        StopReason.NOT_FINITE if reason == NOT_EVALUATED else StopReason.ERROR_ESTIMATE
+        StopReason.NOT_FINITE if reason is ReturnReason.NOT_EVALUATED else StopReason.ERROR_ESTIMATE
     )

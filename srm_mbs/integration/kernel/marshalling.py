@@ -29,6 +29,7 @@ from srm_mbs.integration.methods.thesis.regularisation import Regularisation
 # Tests without the compiled kernel import this module, too.
 _core: Any = core
 
+_NO_NUMBERS = np.zeros(0)
 DECISIONS = (StepDecision.ACCEPTED, StepDecision.REJECTED, StepDecision.REPLACED)
 """The decisions that the kernel numbers from 0: ``StepDecision`` in control.hpp."""
 _GROUPS = ("so3", "se3", "se2")
@@ -167,34 +168,24 @@ def state_from(struct: Any) -> IntegratorState:
     )
 
 
-def control_struct(
-    *,
-    h: float = 0.0,
-    xi_old: float = 1.0,
-    just_rejected: bool = False,
-    index: int = 1,
-    slope: float = 0.0,
-    zero: float = np.nan,
-    redo: float = 0.0,
-    redone: int = 0,
-    arrival: int = 0,
-    limit: float = np.inf,
-    tries: int = 0,
-) -> Any:
+_CONTROL_START = {
+    "h": 0.0,
+    "xi_old": 1.0,
+    "just_rejected": False,
+    "index": 1,
+    "slope": 0.0,
+    "zero": np.nan,
+    "redo": 0.0,
+    "redone": 0,
+    "arrival": 0,
+    "limit": np.inf,
+    "tries": 0,
+}
+
+
+def control_struct(**state: float) -> Any:
     """``ControlState`` of control.hpp; by default that of a control before its first step."""
-    return _core.ControlState(
-        h=h,
-        xi_old=xi_old,
-        just_rejected=just_rejected,
-        index=index,
-        slope=slope,
-        zero=zero,
-        redo=redo,
-        redone=redone,
-        arrival=arrival,
-        limit=limit,
-        tries=tries,
-    )
+    return _core.ControlState(**_CONTROL_START | state)
 
 
 def intervals_struct(pieces: SmoothIntervals) -> Any:
@@ -248,17 +239,15 @@ def dense_constants() -> Any:
     )
 
 
+_STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate")
+_STEP_NUMBERS = ("ranks", "error_ratios", "placements", "held")
+
+
 def steps_struct(steps: StepData) -> Any:
     """``StepArrays`` of module.cpp, which refers to the arrays of ``steps``."""
-    n = len(steps.end_rate)
     return _core.StepArrays(
-        times=steps.times,
-        states=steps.states,
-        rates=steps.rates,
-        corrections=steps.corrections,
-        sigmas=steps.sigmas,
-        end_rate=steps.end_rate,
-        break_rates=steps.break_rates.reshape(len(steps.breaks), n),
+        **{name: getattr(steps, name) for name in _STEP_ARRAYS},
+        break_rates=steps.break_rates.reshape(len(steps.breaks), len(steps.end_rate)),
         breaks=steps.breaks.tolist(),
         zones=list(steps.zones),
         end=steps.end,
@@ -268,24 +257,12 @@ def steps_struct(steps: StepData) -> Any:
 def steps_from(records: Any, stop: float | None) -> StepData:
     """The accepted steps in ``StepRecords`` of the kernel; its arrays are not copied."""
     return StepData(
-        times=records.times,
-        states=records.states,
-        rates=records.rates,
-        corrections=records.corrections,
-        sigmas=records.sigmas,
-        ranks=records.ranks,
-        error_ratios=records.error_ratios,
-        placements=records.placements,
-        held=records.held,
-        end_rate=records.end_rate,
+        **{name: getattr(records, name) for name in (*_STEP_ARRAYS, *_STEP_NUMBERS)},
         zones={zone.step: (zone.threshold, history_from(zone.history)) for zone in records.zones},
         stop=stop,
         breaks=records.breaks.astype(int),
         break_rates=records.break_rates,
     )
-
-
-_NO_NUMBERS = np.zeros(0)
 
 
 def system_struct(constants: dict[str, Any]) -> Any:
@@ -301,10 +278,16 @@ def system_struct(constants: dict[str, Any]) -> Any:
     return _core.SystemData(
         closures=[_closure_rows(**rows) for rows in data.pop("loops")],
         joint_rows=[_core.JointRow(**row) for row in data.pop("joint_rows")],
-        eliminations=[_elimination(*row) for row in data.pop("eliminations")],
+        eliminations=[
+            _core.Elimination(row=row, other=other, factor=factor, columns=columns)
+            for row, other, factor, columns in data.pop("eliminations")
+        ],
         drives=[_driven_row(**row) for row in data.pop("drives")],
         forces=[_force(**force) for force in data.pop("forces")],
-        groups=[_group_joint(*joint) for joint in data.pop("groups")],
+        groups=[
+            _core.GroupJoint(group=_GROUPS.index(group), start=start, size=size, position=position)
+            for group, start, size, position in data.pop("groups")
+        ],
         residual_scale=data.pop("gap_scale"),
         wrapped_angles=data.pop("turning"),
         damping=_NO_NUMBERS if damping is None else damping,
@@ -318,16 +301,8 @@ def _closure_rows(support: FloatArray, **rows: Any) -> Any:
     return _core.ClosureRows(columns=columns.tolist(), signs=support[columns].astype(float), **rows)
 
 
-def _elimination(row: int, other: int, factor: float, columns: list[int]) -> Any:
-    return _core.Elimination(row=row, other=other, factor=factor, columns=columns)
-
-
 def _driven_row(curve: dict[str, Any], wound: bool, **row: Any) -> Any:
     return _core.DrivenRow(curve=_core.Curve(**curve), wraps=bool(wound), **row)
-
-
-def _group_joint(group: str, start: int, size: int, position: int) -> Any:
-    return _core.GroupJoint(group=_GROUPS.index(group), start=start, size=size, position=position)
 
 
 _NO_ANCHOR = (0, np.zeros(12))

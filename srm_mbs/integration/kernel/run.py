@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from enum import IntEnum
 from typing import Any
 
 from srm_mbs._kernel import core
@@ -18,17 +19,30 @@ from srm_mbs.integration.methods.psrm import PSRM
 
 CHUNK = 0.1
 """Time (s) after which the kernel returns, so that Ctrl-C interrupts a run."""
-(
-    CHUNK_FULL,
-    FINISHED,
-    TOO_SHORT,
-    STANDSTILL,
-    CLOSURES,
-    NOT_EVALUATED,
-    BREAKPOINT,
-    ARRIVAL,
-) = range(8)
-"""Reasons for which the kernel returns: ``Stop`` in run.hpp."""
+_STEP_RESULT = (
+    *("t", "h", "state", "rates", "end_rate", "correction", "error_ratio", "sigmas", "rank"),
+    *("state_scale", "quiet", "held"),
+)
+"""Fields that a :class:`StepResult` and the ``StepResult`` of the kernel have in common."""
+
+
+class ReturnReason(IntEnum):
+    """Why the kernel returns: ``Stop`` of run.hpp."""
+
+    CHUNK_FULL = 0
+    FINISHED = 1
+    TOO_SHORT = 2
+    """The step is below round-off."""
+    STANDSTILL = 3
+    """The last steps covered almost no time."""
+    CLOSURES = 4
+    """The last step leaves the closures open."""
+    NOT_EVALUATED = 5
+    """A fixed step could not be evaluated."""
+    BREAKPOINT = 6
+    """The next smooth interval begins."""
+    ARRIVAL = 7
+    """The end lies next to a singular configuration."""
 
 
 class CompiledRun:
@@ -91,14 +105,13 @@ class CompiledRun:
             options,
         )
 
-    def advance(self, steps: int = 0) -> int:
-        """Make ``steps`` steps, or with 0 those of CHUNK seconds; the reason of the return
-        (CHUNK_FULL, ...)."""
-        return int(self._run.advance(steps, CHUNK))
+    def advance(self, steps: int = 0) -> ReturnReason:
+        """Make ``steps`` steps, or with 0 those of CHUNK seconds; the reason of the return."""
+        return ReturnReason(self._run.advance(steps, CHUNK))
 
     def attempt_from(
         self, t: float, state: FloatArray, memory: IntegratorState, control: Any
-    ) -> tuple[int, StepDecision | None]:
+    ) -> tuple[ReturnReason, StepDecision | None]:
         """One attempt from a state of the reference, for comparison with it.
 
         Parameters
@@ -111,11 +124,11 @@ class CompiledRun:
 
         Returns
         -------
-        The reason of the return (CHUNK_FULL, ...), and the decision; None if no step was made.
+        The reason of the return, and the decision; None if no step was made.
         """
         known = marshalling.state_struct(memory)
-        stop, decision = self._run.attempt_from(t, state, known, control)
-        return stop, None if decision < 0 else DECISIONS[decision]
+        reason, decision = self._run.attempt_from(t, state, known, control)
+        return ReturnReason(reason), None if decision < 0 else DECISIONS[decision]
 
     def last(self) -> StepResult:
         """The step made last."""
@@ -125,22 +138,11 @@ class CompiledRun:
             history = marshalling.history_from(self._run.last_history())
             zone = Zone(r.zone_threshold, history.predict_near, history.normals)
         return StepResult(
-            t=r.t,
-            h=r.h,
-            state=r.state,
-            rates=r.rates,
-            end_rate=r.end_rate,
-            correction=r.correction,
-            error_ratio=r.error_ratio,
-            sigmas=r.sigmas,
-            rank=r.rank,
+            **{name: getattr(r, name) for name in _STEP_RESULT},
             zone=zone,
             history=history,
             multiplier=None,
-            state_scale=r.state_scale,
-            quiet=r.quiet,
             constraint_residual=r.residual,
-            held=r.held,
         )
 
     def memory(self) -> IntegratorState:

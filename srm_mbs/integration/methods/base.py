@@ -6,6 +6,7 @@ control decides whether the step is accepted, and only :meth:`Method.accept` cha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +16,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+from srm_mbs.integration.methods.tableaus import get_tableau
 
 NEGLIGIBLE = 1e-3
 """Effect of an evaluation, over the tolerance, below which it is not made."""
@@ -115,14 +117,14 @@ class StepResult:
         sigma at the start, the inner stages and the end.
     rank
         Smallest number of rows in use at any stage.
+    state_scale : (n,)
+        |x| of the error weights at the end.
     zone
         The zone, if any stage fell into it, else None.
     history
         The multiplier history that the zone predicts from, else None.
     multiplier : (m,) or None
         yhat at the end point; None if the end point lies in the zone.
-    state_scale : (n,)
-        |x| of the error weights at the end.
     placement
         How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
         ``"redone"``.
@@ -148,10 +150,10 @@ class StepResult:
     error_ratio: float
     sigmas: FloatArray
     rank: int
-    zone: Zone | None
-    history: MultiplierHistory | None
-    multiplier: FloatArray | None
     state_scale: FloatArray
+    zone: Zone | None = None
+    history: MultiplierHistory | None = None
+    multiplier: FloatArray | None = None
     placement: str = ""
     quiet: bool = False
     slope: float = 0.0
@@ -165,7 +167,7 @@ class Method(Protocol):
 
     A method may also have ``run_messages(steps, norm)``: sentences for the message of a run about
     the limits of the method that its accepted steps met
-    (:func:`srm_mbs.integration.messages.method_messages`).
+    (:func:`method_messages`).
     """
 
     @property
@@ -208,3 +210,57 @@ class Method(Protocol):
         EvaluationError
             If the first stage cannot be evaluated.
         """
+
+
+class DelegatingMethod:
+    """A method whose steps are those of another one, its ``stepper``."""
+
+    tableau: str | ButcherTableau
+
+    @property
+    def scheme(self) -> ButcherTableau:
+        """The Runge-Kutta data."""
+        return get_tableau(self.tableau)
+
+    @property
+    def stepper(self) -> Method:
+        """The method that makes the steps."""
+        raise NotImplementedError
+
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
+        """Evaluate the first stage; see :class:`Method`."""
+        return self.stepper.start(system, t, state, norm)
+
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """Propose a step; see :class:`Method`."""
+        return self.stepper.step(system, t, h, state, memory, norm)
+
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        self.stepper.accept(memory, result)
+
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
+    ) -> IntegratorState:
+        """``memory`` after a breakpoint at ``t``; see :class:`Method`."""
+        return self.stepper.resume(system, t, state, memory, norm)
+
+    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+        """Sentences about limits that the accepted ``steps`` of a run met; see :class:`Method`."""
+        return method_messages(self.stepper, steps, norm)
+
+
+def method_messages(method: Method, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+    """Sentences of ``method`` about its limits that the accepted ``steps`` of a run met."""
+    own = getattr(method, "run_messages", None)
+    return "" if own is None else str(own(steps, norm))

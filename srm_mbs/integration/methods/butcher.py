@@ -230,6 +230,11 @@ class ButcherTableau(_Record):
         return int(self.b.shape[0])
 
     @cached_property
+    def abscissae(self) -> FloatArray:
+        """Abscissae (s + 1,) of the stages and of the end."""
+        return np.append(self.c, 1.0)
+
+    @cached_property
     def gaps(self) -> tuple[tuple[float, float], ...]:
         """(centre, half width) of the gaps between 0, the abscissae and 1, the widest first."""
         nodes = sorted({0.0, 1.0, *(x for x in self.c.tolist() if 0.0 < x < 1.0)})

@@ -64,11 +64,6 @@ class MultiplierHistory:
 
         Nodes ahead of ``t`` are dropped.
         """
-        if len(self.times) == KEPT_NODES and self.times[-1] < t:
-            moved, kept = np.empty_like(self.times), np.empty_like(self.values)
-            moved[:-1], moved[-1] = self.times[1:], t
-            kept[:-1], kept[-1] = self.values[1:], value
-            return MultiplierHistory(moved, kept, normals=normals)
         before = self.times < t
         times = np.concatenate([self.times[before], [t]])[-KEPT_NODES:]
         values = np.concatenate([self.values[before], value[None]])[-KEPT_NODES:]

@@ -133,7 +133,7 @@ class BranchStages:
         lingering = False
         self.inaccurate_below = 0.0
         if self.memory.sigma < WATCHED_SIGMA + NEAR_STEPS * self.sigma_change:
-            threshold = self.known_from(LARGEST_ZONE_SIGMA, 1.0)
+            threshold = self.known_from(1.0)
             lingering = threshold < LARGEST_ZONE_SIGMA and self.lingers(threshold)
             # The tolerance alone determines the zone; its predictions and projections need to be
             # as accurate as rounding allows.
@@ -144,7 +144,7 @@ class BranchStages:
                 # A prediction that errs by more than the tolerance is no better than a direct
                 # solve that does.
                 self.inaccurate_below = threshold
-                threshold = self.known_from(LARGEST_ZONE_SIGMA, uncertain)
+                threshold = self.known_from(uncertain)
         self.zone = zone_from(self.history, threshold, self.end)
         if self.zone is not None and lingering:
             self.zone = replace(self.zone, predict=lambda _: None)
@@ -260,15 +260,12 @@ class BranchStages:
         error[self.system.multiplier_part] = self.h * self.history.uncertainty(self.end)
         return self.norm(error, self.weights)
 
-    def known_from(self, longest: float, allowed: float) -> float:
-        """sigma from which the direct solve errs by less than ``allowed`` tolerances; at most
-        ``longest``.
-
-        Without a tolerance (fixed steps): ``longest``.
-        """
+    def known_from(self, allowed: float) -> float:
+        """sigma from which the direct solve errs by less than ``allowed`` tolerances; at most, and
+        without a tolerance (fixed steps), LARGEST_ZONE_SIGMA."""
         if self.norm.negligible == 0.0:
-            return longest
+            return LARGEST_ZONE_SIGMA
         part = self.system.multiplier_part
         error = self.rounding(1.0, self.sigma_change, False)
         error[part] += self.h * POSITION_ROUNDING * np.abs(self.memory.rate[part])
-        return float(min(longest, np.sqrt(self.norm(error, self.weights) / allowed)))
+        return float(min(LARGEST_ZONE_SIGMA, np.sqrt(self.norm(error, self.weights) / allowed)))

@@ -6,30 +6,19 @@ r"""The Predicted Sequential Regularization Method in all its forms.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
 
-from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import System
 from srm_mbs.errors import InputError
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
+from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
-from srm_mbs.integration.methods.split_step import (
-    split_accept,
-    split_resume,
-    split_start,
-    split_step,
-)
+from srm_mbs.integration.methods.split_step import SplitStep
 from srm_mbs.integration.methods.tableaus import get_tableau
-from srm_mbs.integration.methods.thesis.iterated_sweeps import IteratedSweeps, psrm_eps, psrm_sweeps
+from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
 from srm_mbs.integration.methods.thesis.sweep import (
     INTERPOLATIONS,
-    SweepResult,
-    SweepState,
     checked_regulariser,
     interpolant,
 )
@@ -39,7 +28,7 @@ _FORMS = {"exact": ("split", "sweep", "fused"), "simple": ("sweep",)}
 
 
 @dataclass(frozen=True)
-class PSRM:
+class PSRM(DelegatingMethod):
     r"""Predicted sequential regularisation, in all its forms.
 
     =========== ============ ===================================================== ==============
@@ -52,11 +41,12 @@ class PSRM:
     simple      sweep        multiplier held over the step, one corrector (3.1)    h
     =========== ============ ===================================================== ==============
 
-    The split form has the order of its tableau and is the one to use.  Orders of the others
-    (observed ones: ``tests/test_methods.py``): simple 2 with eps proportional to h, 1 with a fixed
-    eps; exact sweeps O(eps h^2) + O(h^4/eps^2) for erk4, so 8/3 with eps = h^(2/3), and
-    O(eps h^4) + O(h^5/eps^2) for dopr54, so 13/3 with eps = h^(1/3).  With a fixed eps the exact
-    sweeps with ``interpolation="stages"``, and the fused form, have the order of the tableau.
+    The split form has the order of its tableau and is the one to use.  Orders of the others, which
+    ``tests/integration/methods/thesis/test_sweeps.py`` observes: simple 2 with eps proportional to
+    h, 1 with a fixed eps; exact sweeps O(eps h^2) + O(h^4/eps^2) for erk4, so 8/3 with
+    eps = h^(2/3), and O(eps h^4) + O(h^5/eps^2) for dopr54, so 13/3 with eps = h^(1/3).  With a
+    fixed eps the exact sweeps with ``interpolation="stages"``, and the fused form, have the order
+    of the tableau.
 
     Parameters
     ----------
@@ -124,65 +114,18 @@ class PSRM:
             return parse_eps(self.eps)
         if self.correction == "split":
             return None
-        return psrm_eps(self.prediction, self.scheme.order)
+        if self.prediction == "simple":
+            return parse_eps("h")
+        return parse_eps("h^(1/3)" if self.scheme.order >= 5 else "h^(2/3)")
 
     @cached_property
-    def sweeps(self) -> IteratedSweeps | None:
-        """The sweeps of all forms but the split one, which has none."""
-        if self.correction in (None, "split") or self.regularisation is None:
-            return None
-        return psrm_sweeps(
-            self.scheme,
-            self.prediction,
-            self.correction,
-            self.regularisation,
-            self._interpolant(),
-        )
-
-    @property
-    def scheme(self) -> ButcherTableau:
-        """The Runge-Kutta data."""
-        return get_tableau(self.tableau)
-
-    def start(
-        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
-    ) -> IntegratorState:
-        """First stage, and the first node of the multiplier history."""
-        if self.sweeps is not None:
-            return self.sweeps.start(system, t, state, norm)
-        return split_start(system, t, state)
-
-    def step(
-        self,
-        system: System,
-        t: float,
-        h: float,
-        state: FloatArray,
-        memory: IntegratorState,
-        norm: ErrorNorm,
-    ) -> StepResult:
-        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        if self.sweeps is not None:
-            return self.sweeps.step(system, t, h, state, cast(SweepState, memory), norm)
-        eps = self.regularisation
-        theta = 1.0 if eps is None else -math.expm1(-h / eps(h))
-        return split_step(system, self.scheme, t, h, state, memory, norm, theta)
-
-    def accept(self, memory: IntegratorState, result: StepResult) -> None:
-        """Move ``memory`` to the end of an accepted step."""
-        if self.sweeps is not None:
-            self.sweeps.accept(cast(SweepState, memory), cast(SweepResult, result))
-            return
-        split_accept(memory, result)
-
-    def resume(
-        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
-    ) -> IntegratorState:
-        """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        if self.sweeps is not None:
-            return self.sweeps.resume(system, t, state, cast(SweepState, memory), norm)
-        return split_resume(system, t, state, memory)
-
-    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
-        """Sentences about sweeps in the message of a run; none for the split form."""
-        return "" if self.sweeps is None else self.sweeps.run_messages(steps, norm)
+    def stepper(self) -> Method:
+        """The split form, or the sweeps of the others."""
+        if self.correction == "split" or self.regularisation is None:
+            return SplitStep(self.scheme, self.regularisation)
+        fused = self.correction == "fused"
+        exact = First.FUSED if fused else First.EXACT
+        first = First.HELD if self.prediction == "simple" else exact
+        how = self._interpolant()
+        sweeps = IteratedSweeps(self.scheme, first, 1, fused, self.regularisation, how)
+        return cast(Method, sweeps)  # its memory is its own, a SweepState

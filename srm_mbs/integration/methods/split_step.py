@@ -16,6 +16,9 @@ evaluations as the tableau has stages, and a few more next to singular configura
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -42,150 +45,156 @@ def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
     return np.vstack([scheme.A[1:], scheme.b]), [*scheme.c[1:].tolist(), 1.0]
 
 
-def split_start(system: System, t: float, state: FloatArray) -> IntegratorState:
-    """First stage, and the first node of the multiplier history."""
-    terms = system.evaluate(t, state)
-    memory = IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
-    if system.has_constraints:
-        memory.history = MultiplierHistory.begin(t, terms.multiplier())
-    return memory
+@dataclass(frozen=True)
+class SplitStep:
+    """The steps of the split PSRM; a :class:`~srm_mbs.integration.methods.base.Method`.
 
-
-def split_step(
-    system: System,
-    scheme: ButcherTableau,
-    t: float,
-    h: float,
-    state: FloatArray,
-    memory: IntegratorState,
-    norm: ErrorNorm,
-    theta: float,
-) -> StepResult:
-    """One step; see :class:`~srm_mbs.integration.methods.base.Method`.
-
-    Raises
-    ------
-    EvaluationError
-        If a stage cannot be evaluated.
+    Parameters
+    ----------
+    scheme
+        Runge-Kutta data.
+    eps
+        Regularisation (s) of a step (s); None for eps -> 0, where theta = 1.
     """
-    s = scheme.n_stages
-    all_weights, fractions = later_stages(scheme)
-    history, start = memory.history, memory.sigma
-    sigma_change = h * memory.sigma_slope
-    branch: BranchStages | None = None
-    zone = None
-    if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
-        weights = norm.weights(memory.state_scale)
-        branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
-        zone = branch.zone
 
-    # Stages.  Zeros, because each stage weighs all s rates: those still to come with 0.
-    rates = np.zeros((s + 1, system.tangent_size))
-    weighed = rates[:s]
-    rates[0] = memory.rate
-    all_sigmas = [start]
-    deficient: list[tuple[int, int, bool]] = []
-    for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
-        delta = stage_weights.dot(weighed)
-        x = system.retract(state, delta)
-        terms = system.evaluate(t + fraction * h, x, zone)
-        all_sigmas.append(terms.sigma)
-        if branch is not None:
-            terms, x, moved = branch(terms, t + fraction * h, fraction, x)
-        rate = terms.rate()
-        rates[j] = system.chart_rate(delta, rate)
-        if terms.rank_deficient:
-            deficient.append((j, terms.rank, terms.held))
-    sigma = terms.sigma
-    change = abs(sigma - start)
-    quiet = branch is None and sigma > WATCHED_SIGMA + FAR_STEPS * change
-    state_scale = system.state_scale(x)
+    scheme: ButcherTableau
+    eps: Callable[[float], float] | None = None
 
-    # Correction at the end.
-    multiplier = normals = None
-    if history is None:
-        correction = np.zeros(0)
-        new_state, end_rate = x, rate.copy()
-    else:
-        correction = terms.correction()
-        if theta != 1.0:
-            correction = theta * correction
-        new_state = system.retract(x, -correction)
-        end_rate = rate - system.rate_change(correction)
-        near = branch is not None or sigma < WATCHED_SIGMA
-        if near and not (quiet or terms.rank_deficient):
-            multiplier = terms.multiplier()
-            if sigma < WATCHED_SIGMA:
-                normals = terms.normals()
-                normals = normals if normals.shape[1] else None
-        if branch is not None and moved is not None:
-            correction = correction + moved
+    def start(
+        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
+    ) -> IntegratorState:
+        """First stage, and the first node of the multiplier history."""
+        terms = system.evaluate(t, state)
+        memory = IntegratorState(terms.rate().copy(), terms.sigma, system.state_scale(state))
+        if system.has_constraints:
+            memory.history = MultiplierHistory.begin(t, terms.multiplier())
+        return memory
 
-    # Error estimate.
-    sigmas = np.array(all_sigmas)
-    error_ratio = 0.0
-    if scheme.error is not None:
-        error = h * (scheme.error @ rates)
-        weights = norm.weights(np.maximum(memory.state_scale, state_scale))
-        if branch is not None and history is not None:
-            if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:
-                error = np.abs(error)
-                for j, *_ in deficient:
-                    if j < s:
-                        uncertainty = history.uncertainty(t + scheme.c[j] * h)
-                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
-            weights = branch.widened(weights, scheme, sigmas)
-        error_ratio = norm(error, weights)
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        scheme, s = self.scheme, self.scheme.n_stages
+        theta = 1.0 if self.eps is None else -math.expm1(-h / self.eps(h))
+        all_weights, fractions = later_stages(scheme)
+        history, start = memory.history, memory.sigma
+        sigma_change = h * memory.sigma_slope
+        branch: BranchStages | None = None
+        zone = None
+        if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
+            weights = norm.weights(memory.state_scale)
+            branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
+            zone = branch.zone
 
-    result = StepResult(
-        t=t,
-        h=h,
-        state=new_state,
-        rates=rates,
-        end_rate=end_rate,
-        correction=correction,
-        error_ratio=error_ratio,
-        sigmas=sigmas,
-        rank=terms.rank,
-        zone=None,
-        history=None,
-        multiplier=multiplier,
-        state_scale=state_scale,
-    )
-    due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
-    if due and history is not None and theta == 1.0:
-        result.constraint_residual = terms.constraint_residual()
-    if quiet:
-        middle, c = scheme.middle
-        halfway = abs(all_sigmas[middle] - start) / c
-        result.quiet = True
-        result.slope = max(change, halfway) / h
+        # Stages.  Zeros, because each stage weighs all s rates: those still to come with 0.
+        rates = np.zeros((s + 1, system.tangent_size))
+        weighed = rates[:s]
+        rates[0] = memory.rate
+        all_sigmas = [start]
+        deficient: list[tuple[int, int, bool]] = []
+        for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
+            delta = stage_weights.dot(weighed)
+            x = system.retract(state, delta)
+            terms = system.evaluate(t + fraction * h, x, zone)
+            all_sigmas.append(terms.sigma)
+            if branch is not None:
+                terms, x, moved = branch(terms, t + fraction * h, fraction, x)
+            rate = terms.rate()
+            rates[j] = system.chart_rate(delta, rate)
+            if terms.rank_deficient:
+                deficient.append((j, terms.rank, terms.held))
+        sigma = terms.sigma
+        change = abs(sigma - start)
+        quiet = branch is None and sigma > WATCHED_SIGMA + FAR_STEPS * change
+        state_scale = system.state_scale(x)
+
+        # Correction at the end.
+        multiplier = normals = None
+        if history is None:
+            correction = np.zeros(0)
+            new_state, end_rate = x, rate.copy()
+        else:
+            correction = terms.correction()
+            if theta != 1.0:
+                correction = theta * correction
+            new_state = system.retract(x, -correction)
+            end_rate = rate - system.rate_change(correction)
+            near = branch is not None or sigma < WATCHED_SIGMA
+            if near and not (quiet or terms.rank_deficient):
+                multiplier = terms.multiplier()
+                if sigma < WATCHED_SIGMA:
+                    normals = terms.normals()
+                    normals = normals if normals.shape[1] else None
+            if branch is not None and moved is not None:
+                correction = correction + moved
+
+        # Error estimate.
+        sigmas = np.array(all_sigmas)
+        error_ratio = 0.0
+        if scheme.error is not None:
+            error = h * (scheme.error @ rates)
+            weights = norm.weights(np.maximum(memory.state_scale, state_scale))
+            if branch is not None and history is not None:
+                if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:
+                    error = np.abs(error)
+                    for j, *_ in deficient:
+                        if j < s:
+                            uncertainty = history.uncertainty(t + scheme.c[j] * h)
+                            error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
+                weights = branch.widened(weights, scheme, sigmas)
+            error_ratio = norm(error, weights)
+
+        result = StepResult(
+            t=t,
+            h=h,
+            state=new_state,
+            rates=rates,
+            end_rate=end_rate,
+            correction=correction,
+            error_ratio=error_ratio,
+            sigmas=sigmas,
+            rank=terms.rank,
+            state_scale=state_scale,
+            multiplier=multiplier,
+        )
+        due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
+        if due and history is not None and theta == 1.0:
+            result.constraint_residual = terms.constraint_residual()
+        if quiet:
+            middle, c = scheme.middle
+            halfway = abs(all_sigmas[middle] - start) / c
+            result.quiet = True
+            result.slope = max(change, halfway) / h
+            return result
+        result.normals = normals
+        if deficient:
+            result.rank = min(rank for _, rank, _ in deficient)
+            result.held = any(held for *_, held in deficient)
+            result.zone, result.history = zone, history
         return result
-    result.normals = normals
-    if deficient:
-        result.rank = min(rank for _, rank, _ in deficient)
-        result.held = any(held for *_, held in deficient)
-        result.zone, result.history = zone, history
-    return result
 
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        memory.steps += 1
+        memory.rate = result.end_rate
+        memory.sigma = float(result.sigmas[-1])
+        memory.state_scale = result.state_scale
+        if memory.history is not None:
+            memory.history = history_after(memory.history, result)
 
-def split_resume(
-    system: System, t: float, state: FloatArray, memory: IntegratorState
-) -> IntegratorState:
-    """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
-    fresh = split_start(system, t, state)
-    fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
-    return fresh
-
-
-def split_accept(memory: IntegratorState, result: StepResult) -> None:
-    """Move ``memory`` to the end of an accepted step."""
-    memory.steps += 1
-    memory.rate = result.end_rate
-    memory.sigma = float(result.sigmas[-1])
-    memory.state_scale = result.state_scale
-    if memory.history is not None:
-        memory.history = history_after(memory.history, result)
+    def resume(
+        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
+    ) -> IntegratorState:
+        """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        fresh = self.start(system, t, state, norm)
+        fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
+        return fresh
 
 
 def history_after(history: MultiplierHistory, result: StepResult) -> MultiplierHistory:

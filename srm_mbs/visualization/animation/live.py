@@ -19,7 +19,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.visualization.animation.joint_motion import JointMotion
-from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat, node_names
+from srm_mbs.visualization.animation.meshcat_scene import draw_picture, node_names
 from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays
 from srm_mbs.visualization.animation.page import (
     DRIFT,
@@ -90,7 +90,6 @@ class LiveView:
     """
 
     def __init__(self, mechanism: Mechanism, *, open_browser: bool = True) -> None:
-        self._meshcat = import_meshcat()
         start = JointMotion(mechanism, np.zeros(1), np.array(mechanism.q0)[None])
         picture = make_picture(start, 1.0, OverlayOptions())
         view = replace(picture.view, distance=CAMERA_MARGIN * picture.view.distance)
@@ -103,10 +102,9 @@ class LiveView:
         names = node_names(mechanism)
         self._joints = sorted({visual.joint for visual in picture.visuals} - {0})
         data["live"] = [names[joint] for joint in self._joints]
-        page = make_page(self._meshcat, mechanism.name, data, None)
-        self.visualizer = serve(self._meshcat, page, picture)
-        self._mechanism = mechanism
-        self._model, self._data = mechanism.model, workspace(mechanism.model)
+        page = make_page(mechanism.name, data, None)
+        self.visualizer = serve(page, picture)
+        self._mechanism, self._data = mechanism, workspace(mechanism.model)
         self._node = self.visualizer["/live"]
         self._began = self._last = 0.0
         self.spent, self.shown, self.stride = 0.0, 0, 1
@@ -156,8 +154,9 @@ class LiveView:
         self._send(t, state, PATIENCE)
 
     def _send(self, t: float, state: FloatArray, patience: float) -> None:
-        q, v = np.split(state, [self._model.nq])
-        pin.forwardKinematics(self._model, self._data, q)
+        model = self._mechanism.model
+        q, v = np.split(state, [model.nq])
+        pin.forwardKinematics(model, self._data, q)
         energy = self._system.energy(state)
         if math.isnan(self._energy):
             self._energy = energy
@@ -190,7 +189,7 @@ class LiveView:
         data = page_data(solution, picture)
         with answered(self.visualizer.window, REPLY_TIME, SERVER_GONE_REMEDY):
             self.visualizer["/about"].set_property("about", json.dumps(data, allow_nan=False))
-            draw_picture(self._meshcat, self.visualizer, picture)
+            draw_picture(self.visualizer, picture)
 
     def wait(self) -> None:
         """Serve until Ctrl-C."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,23 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import WORLD
-from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, Picture, View
+from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, Picture
 from srm_mbs.visualization.animation.shapes import Box, Colour, Cylinder, Mesh, Shape, Sphere
-from srm_mbs.visualization.animation.trajectory import ActiveIntervals, BodyMotion
+from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
 TOP_COLOUR, BOTTOM_COLOUR = (1.0, 1.0, 1.0), (0.90, 0.92, 0.94)
+LAMPS = {
+    "PointLightNegativeX": ((-0.6, 0.9, -1.0), 0.55),
+    "PointLightPositiveX": ((1.0, 0.3, -0.5), 0.25),
+    "FillLight": ((0.0, 1.0, 1.0), 0.2),
+    "AmbientLight": ((0.0, 0.0, 0.0), 0.55),
+}
+"""Directions (right, up, forward) and intensities: two lamps on the side of the camera, upper left
+and right, a faint one opposite to it, and light from all sides."""
+TRACK_TYPES = {"quaternion": "quaternion", "material.color": "color"}
+"""Types in three.js of animated properties that are no vectors."""
+Y_TO_Z = pin.SE3(pin.rpy.rpyToMatrix(0.5 * np.pi, 0.0, 0.0), np.zeros(3)).homogeneous
+"""Rotation (4, 4) of a cylinder, whose axis is y in three.js, to URDF's z."""
 
 
 def import_meshcat() -> Any:
@@ -61,184 +74,157 @@ def node_names(mechanism: Mechanism) -> list[str]:
     return names
 
 
-def _geometry(meshcat: Any, shape: Shape, at: pin.SE3) -> tuple[Any, FloatArray]:
-    """meshcat's geometry of a shape, and its homogeneous placement (4, 4)."""
-    shapes = meshcat.geometry
-    placement = np.array(at.homogeneous)
-    match shape:
-        case Box(size):
-            return shapes.Box(list(size)), placement
-        case Sphere(radius):
-            return shapes.Sphere(radius), placement
-        case Cylinder(radius, length):
-            # Its axis is z in URDF and y in three.js.
-            turn = pin.SE3(pin.rpy.rpyToMatrix(0.5 * np.pi, 0.0, 0.0), np.zeros(3))
-            return shapes.Cylinder(length, radius), placement @ turn.homogeneous
-        case Mesh(vertices, faces):
-            return shapes.TriangularMeshGeometry(vertices, faces), placement
+def draw_picture(scene: Any, picture: Picture) -> None:
+    """Send the whole picture, the motion included, to ``scene``, a meshcat Visualizer."""
+    drawing = _Drawing(scene, picture)
+    drawing.light_scene()
+    drawing.draw_bodies()
+    drawing.draw_overlays()
+    if drawing.animation.clips:
+        # Repeated without end: a page that is opened late still moves; "pause" stops it.
+        scene.set_animation(drawing.animation, play=True, repetitions=math.inf)
 
 
-def _number(colour: Colour) -> int:
+def _number(colour: Sequence[float]) -> int:
+    """Red, green and blue, 0 to 1, as 0xrrggbb."""
     return sum(round(255.0 * c) << s for c, s in zip(colour, (16, 8, 0)))
 
 
-def _material(meshcat: Any, shape: Shape, colour: Colour, in_front: bool) -> Any:
-    flat = isinstance(shape, Mesh)
-    material = meshcat.geometry.MeshPhongMaterial(
-        color=_number(colour), opacity=colour[3], shininess=20.0, flatShading=flat
-    )
-    if in_front:
-        # Transparent objects are drawn last; without depth test, only front faces are drawn.
-        material.transparent, material.side = True, 0
-        material.properties["depthTest"] = False
-    return material
+class _Drawing:
+    """A picture, the scene that it is sent to, and the animation of the nodes there."""
 
+    def __init__(self, scene: Any, picture: Picture) -> None:
+        self.meshcat = import_meshcat()
+        self.scene = scene
+        self.picture = picture
+        self.motion = picture.motion
+        self.frames = picture.motion.frames
+        self.animation = self.meshcat.animation.Animation(default_framerate=self.motion.rate)
 
-def draw_picture(meshcat: Any, scene: Any, picture: Picture) -> None:
-    """Send the whole picture, the motion included, to ``scene``, a meshcat Visualizer."""
-    motion, view = picture.motion, picture.view
-    names = node_names(picture.mechanism)
-    _light_scene(scene, view)
-    root = scene["/mechanism"]
-    animation = meshcat.animation.Animation(default_framerate=motion.rate)
-    _centre(meshcat, animation, root, picture)
-    drawn = {visual.joint for visual in picture.visuals} - {0}
-    for k, joint in enumerate(motion.joints):
-        if joint in drawn:
-            tracks = {
-                "position": ("vector3", motion.positions[:, k]),
-                "quaternion": ("quaternion", motion.quaternions[:, k]),
-            }
-            _animate(meshcat, animation, root[names[joint]], tracks, motion)
-    for number, visual in enumerate(picture.visuals):
-        node = root[f"{names[visual.joint]}/shape_{number}"]
-        _add_shape(meshcat, node, visual.shape, visual.placement, visual.colour)
-        _show_while_active(meshcat, animation, node, visual.active, motion)
-    _draw_overlays(meshcat, scene["/overlays"], picture, animation)
-    if animation.clips:
-        # Repeated without end: a page that is opened late still moves; "pause" stops it.
-        scene.set_animation(animation, play=True, repetitions=math.inf)
+    def light_scene(self) -> None:
+        """Background, lights and camera."""
+        scene, view = self.scene, self.picture.view
+        scene["/Background"].set_property("top_color", list(TOP_COLOUR))
+        scene["/Background"].set_property("bottom_color", list(BOTTOM_COLOUR))
+        scene["/Axes"].set_property("visible", False)
+        scene["/Grid"].set_property("visible", False)
+        for name, (position, intensity) in LAMPS.items():
+            lamp = scene[f"/Lights/{name}/<object>"]
+            lamp.set_property("intensity", intensity)
+            lamp.set_property("distance", 0.0)  # intensity independent of the distance
+            lamp.set_property("position", (view.distance * np.array(position) @ view.axes).tolist())
+        camera = scene["/Cameras/default/rotated/<object>"]
+        camera.set_property("fov", FIELD_OF_VIEW)
+        camera.set_property("near", 0.02 * view.distance)
+        camera.set_property("far", 50.0 * view.distance)
+        # Cameras are placed in the axes of three.js, y up.
+        x, y, z = (-view.distance * view.axes[2]).tolist()
+        camera.set_property("position", [x, z, -y])
 
+    def draw_bodies(self) -> None:
+        """The shapes of the bodies, and the motion of the joints that carry them."""
+        names, root = node_names(self.picture.mechanism), self.scene["/mechanism"]
+        self._centre(root)
+        drawn = {visual.joint for visual in self.picture.visuals} - {0}
+        for k, joint in enumerate(self.motion.joints):
+            if joint in drawn:
+                positions, quaternions = self.motion.positions[:, k], self.motion.quaternions[:, k]
+                self._animate(root[names[joint]], position=positions, quaternion=quaternions)
+        for number, visual in enumerate(self.picture.visuals):
+            node = root[f"{names[visual.joint]}/shape_{number}"]
+            self._add_shape(node, visual.shape, visual.placement, visual.colour)
+            self._show_while_active(node, visual.active)
 
-def _add_shape(
-    meshcat: Any,
-    node: Any,
-    shape: Shape,
-    at: pin.SE3,
-    colour: Colour,
-    in_front: bool = False,
-) -> None:
-    geometry, placement = _geometry(meshcat, shape, at)
-    node.set_object(geometry, _material(meshcat, shape, colour, in_front))
-    node.set_transform(placement)
+    def draw_overlays(self) -> None:
+        """Animated shapes, and paths."""
+        overlays, root = self.picture.overlays, self.scene["/overlays"]
+        if overlays.shapes:
+            self._centre(root)
+        for group in overlays.shapes:
+            node = root[group.name]
+            for number, (shape, at, colour) in enumerate(group.parts):
+                part = node[f"part_{number}"]
+                self._add_shape(part, shape, at, colour, group.in_front)
+                if group.colours is not None:
+                    self._animate(part["<object>"], **{"material.color": group.colours})
+            scale = {} if group.scales is None else {"scale": group.scales}
+            self._animate(node, position=group.positions, quaternion=group.quaternions, **scale)
+            self._show_while_active(node, group.active)
+        geometry = self.meshcat.geometry
+        for trace in overlays.traces:
+            points = geometry.PointsGeometry(trace.points.T.astype(np.float32))
+            material = geometry.LineBasicMaterial(color=_number(trace.colour))
+            root[trace.name].set_object(geometry.Line(points, material))
 
+    def _centre(self, root: Any) -> None:
+        """Keep the target of the camera at the origin."""
+        shift = np.eye(4)
+        shift[:3, 3] = -self.picture.view.target
+        root.set_transform(shift)
+        if self.picture.along is not None:
+            self._animate(root, position=-self.picture.view.target - self.picture.along)
 
-def _centre(meshcat: Any, animation: Any, root: Any, picture: Picture) -> None:
-    """Keep the target of the camera at the origin."""
-    shift = np.eye(4)
-    shift[:3, 3] = -picture.view.target
-    root.set_transform(shift)
-    if picture.along is not None:
-        places = -picture.view.target - picture.along
-        _animate(meshcat, animation, root, {"position": ("vector3", places)}, picture.motion)
-
-
-def _draw_overlays(meshcat: Any, root: Any, picture: Picture, animation: Any) -> None:
-    """Animated shapes, and paths."""
-    overlays = picture.overlays
-    if overlays.shapes:
-        _centre(meshcat, animation, root, picture)
-    for group in overlays.shapes:
-        node = root[group.name]
-        for number, (shape, at, colour) in enumerate(group.parts):
-            part = node[f"part_{number}"]
-            _add_shape(meshcat, part, shape, at, colour, group.in_front)
-            if group.colours is not None:
-                tracks = {"material.color": ("color", group.colours)}
-                _animate(meshcat, animation, part["<object>"], tracks, picture.motion)
-        tracks = {
-            "position": ("vector3", group.positions),
-            "quaternion": ("quaternion", group.quaternions),
-        }
-        if group.scales is not None:
-            tracks["scale"] = ("vector3", group.scales)
-        _animate(meshcat, animation, node, tracks, picture.motion)
-        _show_while_active(meshcat, animation, node, group.active, picture.motion)
-    for trace in overlays.traces:
-        points = meshcat.geometry.PointsGeometry(trace.points.T.astype(np.float32))
-        material = meshcat.geometry.LineBasicMaterial(color=_number(trace.colour))
-        root[trace.name].set_object(meshcat.geometry.Line(points, material))
-
-
-def _light_scene(scene: Any, view: View) -> None:
-    """Background, lights and camera."""
-    scene["/Background"].set_property("top_color", list(TOP_COLOUR))
-    scene["/Background"].set_property("bottom_color", list(BOTTOM_COLOUR))
-    scene["/Axes"].set_property("visible", False)
-    scene["/Grid"].set_property("visible", False)
-    # Two lamps on the side of the camera, upper left and right, and a faint one opposite to it.
-    lamps = {
-        "PointLightNegativeX": ((-0.6, 0.9, -1.0), 0.55),
-        "PointLightPositiveX": ((1.0, 0.3, -0.5), 0.25),
-        "FillLight": ((0.0, 1.0, 1.0), 0.2),
-        "AmbientLight": ((0.0, 0.0, 0.0), 0.55),
-    }
-    for name, (position, intensity) in lamps.items():
-        lamp = scene[f"/Lights/{name}/<object>"]
-        lamp.set_property("intensity", intensity)
-        lamp.set_property("distance", 0.0)  # intensity independent of the distance
-        lamp.set_property("position", (view.distance * np.array(position) @ view.axes).tolist())
-    camera = scene["/Cameras/default/rotated/<object>"]
-    camera.set_property("fov", FIELD_OF_VIEW)
-    camera.set_property("near", 0.02 * view.distance)
-    camera.set_property("far", 50.0 * view.distance)
-    # Cameras are placed in the axes of three.js, y up.
-    x, y, z = (-view.distance * view.axes[2]).tolist()
-    camera.set_property("position", [x, z, -y])
-
-
-def _animate(
-    meshcat: Any,
-    animation: Any,
-    node: Any,
-    values: dict[str, tuple[str, FloatArray]],
-    motion: BodyMotion,
-) -> None:
-    """Set ``node`` to the first of its values, and add a clip if they change.
-
-    ``values`` are property, three.js's type and one row for each key frame.
-    """
-    tracks, frames = {}, motion.frames
-    for name, (kind, rows) in values.items():
-        # A constant value has one key: the pivot of a crank, the direction of a slider.
-        count = len(rows) if np.ptp(rows, axis=0).max() > 1e-12 else 1
-        tracks[name] = meshcat.animation.AnimationTrack(
-            name, kind, frames[:count], rows[:count].tolist()
+    def _add_shape(
+        self, node: Any, shape: Shape, at: pin.SE3, colour: Colour, in_front: bool = False
+    ) -> None:
+        shapes = self.meshcat.geometry
+        placement = np.array(at.homogeneous)
+        match shape:
+            case Box(size):
+                geometry = shapes.Box(list(size))
+            case Sphere(radius):
+                geometry = shapes.Sphere(radius)
+            case Cylinder(radius, length):
+                geometry = shapes.Cylinder(length, radius)
+                placement = placement @ Y_TO_Z
+            case Mesh(vertices, faces):
+                geometry = shapes.TriangularMeshGeometry(vertices, faces)
+        material = shapes.MeshPhongMaterial(
+            color=_number(colour),
+            opacity=colour[3],
+            shininess=20.0,
+            flatShading=isinstance(shape, Mesh),
         )
-        if name != "material.color":
-            node.set_property(name, rows[0].tolist())
-    if any(len(track.frames) > 1 for track in tracks.values()):
-        fps = animation.default_framerate
-        animation.clips[node.path] = meshcat.animation.AnimationClip(tracks, fps=fps)
+        if in_front:
+            # Transparent objects are drawn last; without depth test, only front faces are drawn.
+            material.transparent, material.side = True, 0
+            material.properties["depthTest"] = False
+        node.set_object(geometry, material)
+        node.set_transform(placement)
 
+    def _animate(self, node: Any, **values: FloatArray) -> None:
+        """Set ``node`` to the first of its values, and add a clip if they change.
 
-def _show_while_active(
-    meshcat: Any, animation: Any, node: Any, active: ActiveIntervals | None, motion: BodyMotion
-) -> None:
-    """Show ``node`` during its ``active`` intervals only, exact in time, not to a key frame."""
-    if active is None:
-        return
-    start, end = float(motion.times[0]), float(motion.times[-1])
-    changes = {start: False, end: False}
-    for first, last in active:
-        changes |= {first: True, last: last >= end}
-    times = sorted(changes)
-    node.set_property("visible", changes[times[0]])
-    clip = animation.clips.setdefault(
-        node.path, meshcat.animation.AnimationClip({}, fps=animation.default_framerate)
-    )
-    # All clips have the same last key, so that they have the same duration.
-    frames = [(t - start) * motion.rate for t in times[:-1]] + [len(motion.times) - 1]
-    clip.tracks["visible"] = meshcat.animation.AnimationTrack(
-        "visible", "bool", frames, [changes[t] for t in times]
-    )
+        ``values`` are the properties, one row for each key frame.
+        """
+        animation, tracks = self.meshcat.animation, {}
+        for name, rows in values.items():
+            # A constant value has one key: the pivot of a crank, the direction of a slider.
+            count = len(rows) if np.ptp(rows, axis=0).max() > 1e-12 else 1
+            kind = TRACK_TYPES.get(name, "vector3")
+            tracks[name] = animation.AnimationTrack(
+                name, kind, self.frames[:count], rows[:count].tolist()
+            )
+            if name != "material.color":
+                node.set_property(name, rows[0].tolist())
+        if any(len(track.frames) > 1 for track in tracks.values()):
+            self.animation.clips[node.path] = animation.AnimationClip(tracks, fps=self.motion.rate)
+
+    def _show_while_active(self, node: Any, active: ActiveIntervals | None) -> None:
+        """Show ``node`` during its ``active`` intervals only, exact in time, not to a key frame."""
+        if active is None:
+            return
+        times = self.motion.times
+        start, end = float(times[0]), float(times[-1])
+        changes = {start: False, end: False}
+        for first, last in active:
+            changes |= {first: True, last: last >= end}
+        *changing, _ = sorted(changes)
+        node.set_property("visible", changes[start])
+        # All clips have the same last key, so that they have the same duration.
+        frames = [(t - start) * self.motion.rate for t in changing] + [len(times) - 1]
+        visible = [changes[t] for t in (*changing, end)]
+        animation = self.meshcat.animation
+        clip = animation.AnimationClip({}, fps=self.motion.rate)
+        clip = self.animation.clips.setdefault(node.path, clip)
+        clip.tracks["visible"] = animation.AnimationTrack("visible", "bool", frames, visible)

@@ -28,6 +28,7 @@ from srm_mbs.visualization.animation.trajectory import (
     active_at,
     active_closures,
     active_elements,
+    continuous_sign,
 )
 
 SPRING_COLOUR: Colour = (0.35, 0.38, 0.42, 1.0)
@@ -206,13 +207,13 @@ def make_overlays(
     out = Overlays()
     for number, (spring, active) in enumerate(active_springs(motion)):
         ends = [bodies.path(*side.resolve(model)) for side in (spring.a, spring.b)]
-        out.shapes.append(_spring(f"spring_{number}", spring, ends, extent, active))
+        drawn = _spring(f"spring_{number}", spring, ends, extent)
+        out.shapes.append(replace(drawn, active=active))
     for number, (joint, placement) in enumerate(options.anchors(motion.mechanism)):
         points = bodies.path(joint, placement)
         colour = TRACE_COLOURS[number % len(TRACE_COLOURS)]
         out.traces.append(Trace(f"trace_{number}", points, colour))
-        ball = (Sphere(0.012 * extent), pin.SE3.Identity(), colour)
-        out.shapes.append(AnimatedShape(f"point_{number}", (ball,), points, _unrotated(points)))
+        out.shapes.append(_ball(f"point_{number}", 0.012 * extent, points, colour))
     for draw, requested in ((_draw_reactions, options.reactions), (_draw_gaps, options.gaps)):
         if requested:
             shapes, note = draw(motion, bodies, extent)
@@ -225,16 +226,11 @@ def make_overlays(
 
 
 def _spring(
-    name: str,
-    spring: SpringDamper,
-    ends: list[FloatArray],
-    extent: float,
-    active: ActiveIntervals | None,
+    name: str, spring: SpringDamper, ends: list[FloatArray], extent: float
 ) -> AnimatedShape:
     """A coil, a piston in its cylinder, or both."""
     arrows = ends[1] - ends[0]
-    mean = float(np.linalg.norm(arrows, axis=1).mean())
-    mean = mean if mean > 0.0 else extent
+    mean = float(np.linalg.norm(arrows, axis=1).mean()) or extent
     radius = min(0.02 * extent, 0.2 * mean)
     parts: list[tuple[Shape, pin.SE3, Colour]] = []
     if spring.stiffness:
@@ -243,7 +239,7 @@ def _spring(
         for part, centre, width in ((1.0, 0.5, 0.18), (0.45, 0.4, 0.5)):
             place = pin.SE3(np.eye(3), np.array([0.0, 0.0, centre]))
             parts.append((Cylinder(width * radius, part), place, DAMPER_COLOUR))
-    return replace(_stretched(name, tuple(parts), ends[0], arrows), active=active)
+    return _stretched(name, tuple(parts), ends[0], arrows)
 
 
 def _coil(radius: float, length: float) -> Mesh:
@@ -381,22 +377,12 @@ def _draw_reactions(
     together = np.concatenate([sizes[loop.name][own] for (loop, _), own in zip(loops, active)])
     together = together[np.isfinite(together)]
     top = float(np.percentile(together, FORCE_PERCENTILE)) if len(together) else 0.0
-    ball = Sphere(0.014 * extent)
     shapes = []
     for number, (loop, intervals) in enumerate(loops):
         path = bodies.path(*loop.resolve(model)[0])
+        ball = _ball(f"closure_{number}", 0.014 * extent, path, (*RAMP[0], 1.0))
         colours = ramp_colours(sizes[loop.name] / top if top else 0.0 * sizes[loop.name])
-        shapes.append(
-            AnimatedShape(
-                f"closure_{number}",
-                ((ball, pin.SE3.Identity(), (*RAMP[0], 1.0)),),
-                path,
-                _unrotated(path),
-                colours=colours,
-                in_front=True,
-                active=intervals,
-            )
-        )
+        shapes.append(replace(ball, colours=colours, in_front=True, active=intervals))
     return shapes, {
         "text": "force in the closures",
         "ramp": [f"rgb({', '.join(str(round(255 * c)) for c in colour)})" for colour in RAMP],
@@ -414,9 +400,10 @@ def ramp_colours(parts: FloatArray) -> FloatArray:
 # Orientation --------------------------------------------------------------------------------
 
 
-def _unrotated(positions: FloatArray) -> FloatArray:
-    """Identity quaternions (n, 4) for ``positions`` (n, 3)."""
-    return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
+def _ball(name: str, radius: float, path: FloatArray, colour: Colour) -> AnimatedShape:
+    """A ball of ``radius`` (m) that moves along ``path`` (n, 3) m."""
+    parts = ((Sphere(radius), pin.SE3.Identity(), colour),)
+    return AnimatedShape(name, parts, path, np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
 
 
 def turns_along(directions: FloatArray) -> FloatArray:
@@ -436,9 +423,7 @@ def turns_along(directions: FloatArray) -> FloatArray:
             turn.normalize()
             here = there
         out[i] = turn.coeffs()
-    flips = np.where(np.sum(out[1:] * out[:-1], axis=1) < 0.0, -1.0, 1.0)
-    out[1:] *= np.cumprod(flips)[:, None]
-    return out
+    return continuous_sign(out)
 
 
 def _stretched(

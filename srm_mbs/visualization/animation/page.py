@@ -20,6 +20,7 @@ from srm_mbs.dynamics.scaling import row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
 from srm_mbs.visualization.animation.scene import ASPECT, Picture
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
@@ -84,22 +85,21 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
         times = np.linspace(times[0], times[-1], MAX_SAMPLES)
     times = np.union1d(times, [crossing.time for crossing in crossings])
     run = solution.at(times)
-    values = []
     unit = drift_unit(solution)
+    values = []
+
+    def add(label: str, unit: str, samples: FloatArray) -> None:
+        rounded = [float(f"{x:.{DIGITS}g}") if math.isfinite(x) else None for x in samples.tolist()]
+        values.append({"label": label, "unit": unit, "samples": rounded})
+
     with np.errstate(over="ignore", invalid="ignore"):
         if unit:
-            values.append((DRIFT, unit, run.drift[:, 0]))
-        values.append((ENERGY, "J", run.energy - solution.at(times[:1]).energy))
+            add(DRIFT, unit, run.drift[:, 0])
+        add(ENERGY, "J", run.energy - solution.at(times[:1]).energy)
         if unit and solution.steps.count:
-            values.append(("sigma", "", sigma_at(solution, times)))
-    return {
-        "times": [float(f"{t:.9g}") for t in times],
-        "values": [
-            {"label": label, "unit": unit, "samples": [_rounded(x) for x in samples.tolist()]}
-            for label, unit, samples in values
-        ],
-        "passages": passages,
-    }
+            add("sigma", "", sigma_at(solution, times))
+    seconds = [float(f"{t:.9g}") for t in times.tolist()]
+    return {"times": seconds, "values": values, "passages": passages}
 
 
 def drift_unit(motion: DrawableMotion) -> str:
@@ -127,30 +127,19 @@ def sigma_at(solution: SimulationResult, times: FloatArray) -> FloatArray:
     Linear interpolation between the stages of the run, which record it, as in the plot of the run,
     and zero at the singular passages, which lie between stages.
     """
-    steps = solution.steps
+    steps, passages = solution.steps, [crossing.time for crossing in solution.crossings]
     abscissae = np.append(solution.scheme.c, 1.0)
     stages = steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]
-    known = stages.ravel(), steps.sigmas.ravel()
-    crossings = solution.crossings
-    at = np.append(known[0], [crossing.time for crossing in crossings])
-    sigmas = np.append(known[1], np.zeros(len(crossings)))
-    order = np.argsort(at, kind="stable")
-    return np.interp(times, at[order], sigmas[order])
+    known, sigmas = np.append(stages, passages), np.append(steps.sigmas, np.zeros(len(passages)))
+    order = np.argsort(known, kind="stable")
+    return np.interp(times, known[order], sigmas[order])
 
 
-def _rounded(value: float) -> float | None:
-    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
-
-
-def make_page(
-    meshcat: Any, title: str, data: dict[str, Any], commands: Sequence[dict[str, Any]] | None
-) -> str:
+def make_page(title: str, data: dict[str, Any], commands: Sequence[dict[str, Any]] | None) -> str:
     """One self-contained page.
 
     Parameters
     ----------
-    meshcat
-        The package.
     title
         Of the window.
     data
@@ -160,7 +149,7 @@ def make_page(
         ``static_html``, applies in their order; None for a page that takes them from the server
         that it comes from.
     """
-    root = Path(meshcat.servers.zmqserver.VIEWER_ROOT)
+    root = Path(import_meshcat().servers.zmqserver.VIEWER_ROOT)
     return render(
         FOLDER,
         "page.html.j2",
@@ -204,8 +193,8 @@ def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:
     return packed
 
 
-def write_page(page: str, path: Path) -> None:
-    """Write a page to ``path``; an existing file is replaced.
+def write_file(path: Path, content: bytes) -> None:
+    """Write a page, image or video; an existing file is replaced.
 
     Raises
     ------
@@ -213,9 +202,9 @@ def write_page(page: str, path: Path) -> None:
         If it cannot be written.
     """
     try:
-        path.write_text(page, encoding="utf-8")
+        path.write_bytes(content)
     except OSError as error:
         raise InputError(
-            f"the page cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
+            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
         ) from error
     log.info("written: %s", path)

@@ -27,7 +27,7 @@ from srm_mbs.visualization.animation.page import (
     make_page,
     page_data,
     render,
-    write_page,
+    write_file,
 )
 from srm_mbs.visualization.animation.scene import Picture, make_picture
 from srm_mbs.visualization.animation.server import SERVERLESS, start_server
@@ -102,10 +102,9 @@ def play(
         If ``fps`` is not a positive number, an overlay cannot be drawn, or meshcat is missing or
         cannot start.
     """
-    meshcat = import_meshcat()
     picture = make_picture(solution, check_fps(fps), OverlayOptions(trace, gaps, reactions))
-    data = page_data(solution, picture)
-    visualizer = serve(meshcat, make_page(meshcat, solution.mechanism.name, data, None), picture)
+    page = make_page(solution.mechanism.name, page_data(solution, picture), None)
+    visualizer = serve(page, picture)
     show(visualizer, solution.mechanism.name, open_browser=open_browser)
     if block is None:
         block = not (hasattr(sys, "ps1") or sys.flags.interactive)
@@ -151,12 +150,6 @@ def _close_all() -> None:
         close(_open_visualizers[-1])
 
 
-def _zmq() -> Any:
-    import zmq
-
-    return zmq
-
-
 @contextmanager
 def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[None]:
     """Context in which the server has ``seconds`` to accept each command.
@@ -166,9 +159,10 @@ def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[
     InputError
         If the server does not accept a command in time, or has stopped.
     """
+    import zmq
+
     if window.server_proc.poll() is not None:
         raise InputError("meshcat's server has stopped", remedy=remedy)
-    zmq = _zmq()
     try:
         if window.zmq_socket is None:
             window.connect_zmq()
@@ -183,7 +177,7 @@ def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[
         raise InputError(f"meshcat's server does not answer: {error}", remedy=remedy) from error
 
 
-def serve(meshcat: Any, page: str, picture: Picture) -> Any:
+def serve(page: str, picture: Picture) -> Any:
     """Serve ``page``, and draw ``picture`` in it.
 
     Returns
@@ -196,6 +190,7 @@ def serve(meshcat: Any, page: str, picture: Picture) -> Any:
     InputError
         If the server does not start, or does not answer.
     """
+    meshcat = import_meshcat()
     process, commands, address = start_server(page)
     kind = meshcat.visualizer.ViewerWindow
     window = kind.__new__(kind)  # the constructor would start another server
@@ -206,7 +201,7 @@ def serve(meshcat: Any, page: str, picture: Picture) -> Any:
     _open_visualizers.append(visualizer)
     try:
         with answered(window, REPLY_TIME):
-            draw_picture(meshcat, visualizer, picture)
+            draw_picture(visualizer, picture)
     except BaseException:
         close(visualizer)
         raise
@@ -278,8 +273,8 @@ def export_html(
         If ``fps`` is not a positive number, an overlay cannot be drawn, meshcat is missing, or the
         file cannot be written.
     """
-    options = OverlayOptions(trace, gaps, reactions)
-    write_page(page_of(solution, fps, options, panel=panel), Path(path))
+    page = page_of(solution, fps, OverlayOptions(trace, gaps, reactions), panel=panel)
+    write_file(Path(path), page.encode())
 
 
 def page_of(
@@ -291,12 +286,11 @@ def page_of(
     extra: Iterable[float] = (),
 ) -> str:
     """The page of :func:`export_html`, with key frames at ``extra`` times (s); errors as there."""
-    meshcat = import_meshcat()
     picture = make_picture(solution, check_fps(fps), options, extra)
     recorder = _Recorder()
-    draw_picture(meshcat, meshcat.Visualizer(window=recorder), picture)
+    draw_picture(import_meshcat().Visualizer(window=recorder), picture)
     data = page_data(solution, picture, panel=panel)
-    return make_page(meshcat, solution.mechanism.name, data, recorder.commands)
+    return make_page(solution.mechanism.name, data, recorder.commands)
 
 
 @dataclass(frozen=True)

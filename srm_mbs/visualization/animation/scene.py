@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
@@ -200,11 +201,11 @@ def points_in_view(
     for visual in visuals:
         corners.setdefault(visual.joint, []).append(visual.corners())
     points = [np.concatenate(corners.pop(0))]
+    moved = np.zeros((1, 3)) if along is None else along[chosen]
     for joint, own in corners.items():
         k = motion.joints.index(joint)
-        together = np.concatenate(own)
-        for i in chosen:
-            rotation = pin.Quaternion(motion.quaternions[i, k]).matrix()
-            place = motion.positions[i, k] - (0.0 if along is None else along[i])
-            points.append(together @ rotation.T + place)
+        matrices = Rotation.from_quat(motion.quaternions[chosen, k]).as_matrix()
+        places = motion.positions[chosen, k] - moved
+        turned = np.concatenate(own) @ matrices.transpose(0, 2, 1)
+        points.append((turned + places[:, None]).reshape(-1, 3))
     return np.concatenate(points)

@@ -8,7 +8,6 @@ visuals is drawn as bars between its joints and loop anchors.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
-from srm_mbs.formats.xml import parse_xml
+from srm_mbs.formats.xml import parse_numbers, parse_xml
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
@@ -51,11 +50,6 @@ class Box:
 
     size: tuple[float, float, float]
 
-    def extent(self) -> FloatArray:
-        """Lower and upper corner (2, 3) m of the bounding box."""
-        half = 0.5 * np.array(self.size)
-        return np.array([-half, half])
-
 
 @dataclass(frozen=True)
 class Cylinder:
@@ -64,21 +58,12 @@ class Cylinder:
     radius: float
     length: float
 
-    def extent(self) -> FloatArray:
-        """Lower and upper corner (2, 3) m of the bounding box."""
-        half = np.array([self.radius, self.radius, 0.5 * self.length])
-        return np.array([-half, half])
-
 
 @dataclass(frozen=True)
 class Sphere:
     """A sphere about the origin; m."""
 
     radius: float
-
-    def extent(self) -> FloatArray:
-        """Lower and upper corner (2, 3) m of the bounding box."""
-        return np.array([[-self.radius] * 3, [self.radius] * 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +73,22 @@ class Mesh:
     vertices: FloatArray
     faces: Any
 
-    def extent(self) -> FloatArray:
-        """Lower and upper corner (2, 3) m of the bounding box."""
-        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
 
 Shape = Box | Cylinder | Sphere | Mesh
+
+
+def bounding_box(shape: Shape) -> FloatArray:
+    """Lower and upper corner (2, 3) m in the frame of the shape."""
+    match shape:
+        case Mesh(vertices):
+            return np.array([vertices.min(axis=0), vertices.max(axis=0)])
+        case Box(size):
+            half = 0.5 * np.array(size)
+        case Cylinder(radius, length):
+            half = np.array([radius, radius, 0.5 * length])
+        case Sphere(radius):
+            half = np.full(3, radius)
+    return np.array([-half, half])
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +115,7 @@ class Visual:
 
     def corners(self) -> FloatArray:
         """Corners (8, 3) m of its bounding box, in the joint's frame."""
-        low, high = self.shape.extent()
+        low, high = bounding_box(self.shape)
         choice = np.array(list(np.ndindex(2, 2, 2)))
         corners = np.where(choice == 0, low, high)
         return np.asarray(corners @ self.placement.rotation.T + self.placement.translation)
@@ -159,21 +154,22 @@ def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
         return
     root = parse_xml(source.urdf, source.urdf_path)
     # A colour may be defined anywhere, and be used by its name anywhere else.
-    materials: dict[str, Element] = {}
+    colours: dict[str, Element] = {}
     for material in root.iter("material"):
-        if material.find("color") is not None:
-            materials.setdefault(material.get("name", ""), material)
+        if (colour := material.find("color")) is not None:
+            colours.setdefault(material.get("name", ""), colour)
     meshes = _MeshFiles(Path(source.urdf_path))
     for link in root.findall("link"):
         for element in link.findall("visual"):
             name = link.get("name")
             frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+            joint = int(frame.parentJoint)
             try:
                 yield Visual(
-                    int(frame.parentJoint),
+                    joint,
                     frame.placement * _origin(element),
                     _shape(element, meshes),
-                    _colour(element, materials) or _default_colour(int(frame.parentJoint)),
+                    _colour(element, colours) or _default_colour(joint),
                 )
             except InputError as error:
                 log.warning("link %r is drawn without one of its visuals: %s", name, error)
@@ -182,12 +178,8 @@ def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
 def _numbers(element: Element, key: str, default: str) -> list[float]:
     """As many finite numbers of attribute ``key`` as ``default`` has."""
     text = element.get(key, default)
-    try:
-        values = [float(part) for part in text.split()]
-    except ValueError:
-        values = []
-    count = len(default.split())
-    if len(values) != count or not all(map(math.isfinite, values)):
+    values, count = parse_numbers(text), len(default.split())
+    if values is None or len(values) != count:
         raise InputError(
             f"<{element.tag} {key}={text!r}> is not {count} finite number(s)",
             remedy=f"Write {count} number(s)",
@@ -199,14 +191,13 @@ def _default_colour(joint: int) -> Colour:
     return PALETTE[(joint - 1) % len(PALETTE)] if joint else GROUND_COLOUR
 
 
-def _colour(visual: Element, materials: dict[str, Element]) -> Colour | None:
+def _colour(visual: Element, colours: dict[str, Element]) -> Colour | None:
     material = visual.find("material")
     if material is None:
         return None
     colour = material.find("color")
     if colour is None:
-        shared = materials.get(material.get("name", ""))
-        colour = None if shared is None else shared.find("color")
+        colour = colours.get(material.get("name", ""))
     if colour is None:
         return None
     red, green, blue, opacity = np.clip(_numbers(colour, "rgba", "1 1 1 1"), 0.0, 1.0).tolist()
@@ -250,7 +241,10 @@ class _MeshFiles:
 
     def __init__(self, urdf: Path) -> None:
         self.folder = urdf.parent
-        self.packages = [self.folder, *self.folder.absolute().parents, *_robot_data()]
+        # example-robot-data is installed under the same prefix as Pinocchio.
+        shared = (prefix / "share" for prefix in Path(pin.__file__).parents)
+        data = [folder for folder in shared if (folder / "example-robot-data").is_dir()]
+        self.packages = [self.folder, *self.folder.absolute().parents, *data]
 
     def find(self, name: str) -> Path:
         """Path of the mesh ``name``; raises InputError if there is no such file."""
@@ -294,14 +288,6 @@ class _MeshFiles:
                 f"the mesh file {str(path)!r} holds no triangles", remedy="Give one with triangles"
             )
         return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3))
-
-
-def _robot_data() -> list[Path]:
-    """Folder that holds ``example-robot-data``, installed under the same prefix as Pinocchio."""
-    for prefix in Path(pin.__file__).parents:
-        if (prefix / "share" / "example-robot-data").is_dir():
-            return [prefix / "share"]
-    return []
 
 
 # Bars ---------------------------------------------------------------------------------------
@@ -358,8 +344,7 @@ def _extent(mechanism: Mechanism, ends: list[list[FloatArray]]) -> float:
     pin.forwardKinematics(mechanism.model, data, np.array(mechanism.q0))
     points = [data.oMi[joint].act(end) for joint, own in enumerate(ends) for end in own]
     points += [data.oMi[joint].translation for joint in range(1, mechanism.model.njoints)]
-    diagonal = float(np.linalg.norm(np.ptp(np.array(points), axis=0)))
-    return diagonal if diagonal > 0.0 else 1.0
+    return float(np.linalg.norm(np.ptp(np.array(points), axis=0))) or 1.0
 
 
 def _along(centre: FloatArray, direction: FloatArray) -> pin.SE3:

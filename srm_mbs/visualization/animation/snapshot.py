@@ -13,17 +13,17 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.overlays import OverlayOptions, active_springs
+from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
-from srm_mbs.visualization.animation.shapes import Box, Cylinder, Mesh, Shape
+from srm_mbs.visualization.animation.shapes import Box, Colour, Cylinder, Mesh, Shape
 from srm_mbs.visualization.animation.trajectory import active_at
 
 SIZE = (900, 600)
@@ -61,34 +61,32 @@ def draw_snapshot(solution: SimulationResult, t: float) -> bytes:
     from PIL import Image
 
     start, end = solution.span
-    picture = make_picture(
-        solution, VIEW_FRAMES / (end - start) if end > start else 1.0, OverlayOptions()
-    )
-    mechanism, now = solution.mechanism, np.array([t])
-    data = workspace(mechanism.model)
-    pin.forwardKinematics(mechanism.model, data, solution(t)[0])
+    fps = VIEW_FRAMES / (end - start) if end > start else 1.0
+    picture = make_picture(solution, fps, OverlayOptions(), [t])
+    motion, view = picture.motion, picture.view
+    frame = int(np.abs(motion.times - t).argmin())
     triangles, colours = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
+
+    def add(shape_triangles: FloatArray, placement: pin.SE3, colour: Colour) -> None:
+        triangles.append(_placed(shape_triangles, placement))
+        colours.append(np.tile(colour[:3], (len(shape_triangles), 1)))
+
     for visual in picture.visuals:
-        if not active_at(now, visual.active, end).all():
-            continue
-        own = _triangles(visual.shape)
-        triangles.append(_placed(own, data.oMi[visual.joint] * visual.placement))
-        colours.append(np.tile(visual.colour[:3], (len(own), 1)))
-    for (spring, active), group in zip(
-        active_springs(solution), picture.overlays.shapes, strict=True
-    ):
-        if not active_at(now, active, end).all():
-            continue
-        (ja, a), (jb, b) = (x.resolve(mechanism.model) for x in (spring.a, spring.b))
-        ends = (data.oMi[ja] * a).translation, (data.oMi[jb] * b).translation
-        for shape, placement, colour in group.parts:
-            own = _stretched(_placed(_triangles(shape), placement), ends[0], ends[1])
-            triangles.append(own)
-            colours.append(np.tile(colour[:3], (len(own), 1)))
+        if active_at(np.array([t]), visual.active, end).all():
+            placement = motion.placement(visual.joint, frame) * visual.placement
+            add(_triangles(visual.shape), placement, visual.colour)
+    for spring in picture.overlays.shapes:
+        if active_at(np.array([t]), spring.active, end).all():
+            rotation = pin.Quaternion(spring.quaternions[frame]).matrix()
+            place = pin.SE3(rotation, spring.positions[frame])
+            scale = 1.0 if spring.scales is None else spring.scales[frame]
+            for shape, within, colour in spring.parts:
+                add(_placed(_triangles(shape), within) * scale, place, colour)
     corners = np.concatenate(triangles)
-    view = picture.view
+    if picture.along is not None:
+        view = replace(view, target=view.target + picture.along[frame])
     if len(corners):
-        here = choose_view(mechanism, corners.reshape(-1, 3))
+        here = choose_view(solution.mechanism, corners.reshape(-1, 3))
         view = here if FARTHEST_VIEW * here.distance < view.distance else view
     pixels = _rasterised(corners, np.concatenate(colours), view)
     out = io.BytesIO()
@@ -136,15 +134,6 @@ def _of_quads(quads: FloatArray) -> FloatArray:
 
 def _placed(triangles: FloatArray, placement: pin.SE3) -> FloatArray:
     return np.asarray(triangles @ placement.rotation.T + placement.translation)
-
-
-def _stretched(triangles: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Triangles along z from 0 to 1, rotated and scaled to reach from a to b (m)."""
-    length = float(np.linalg.norm(b - a))
-    if length == 0.0:
-        return np.zeros((0, 3, 3))
-    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (b - a) / length)
-    return _placed(triangles * [1.0, 1.0, length], pin.SE3(turn.matrix(), a))
 
 
 # --- drawing -------------------------------------------------------------------------------------
@@ -207,8 +196,10 @@ def _rasterised(triangles: FloatArray, colours: FloatArray, view: View) -> Float
     y = 0.5 * canvas.height - scale * seen[:, :, 1] / far
     corners = np.stack([x, y, far], axis=2)
     low = np.floor(corners[:, :, :2].min(axis=1)).astype(int)
-    extent = np.ceil(corners[:, :, :2].max(axis=1)).astype(int) - low
-    widest = extent.max(axis=1)
+    high = np.ceil(corners[:, :, :2].max(axis=1)).astype(int)
+    visible = ((low < [canvas.width, canvas.height]) & (high > 0)).all(axis=1)
+    corners, shaded, low, high = corners[visible], shaded[visible], low[visible], high[visible]
+    widest = (high - low).max(axis=1)
     before = -1
     for side in BATCH_SIZES:
         chosen = np.flatnonzero((widest > before) & (widest <= side))
@@ -218,7 +209,7 @@ def _rasterised(triangles: FloatArray, colours: FloatArray, view: View) -> Float
             around = low[part][:, :, None, None]
             canvas.paint(corners[part], shaded[part], around[:, 0] + columns, around[:, 1] + rows)
     for k in np.flatnonzero(widest > before):
-        (left, top), (right, bottom) = low[k].clip(0), low[k] + extent[k]
+        (left, top), (right, bottom) = low[k].clip(0), high[k]
         rows, columns = np.mgrid[top : min(bottom, canvas.height), left : min(right, canvas.width)]
         canvas.paint(corners[k : k + 1], shaded[k : k + 1], columns[None], rows[None])
     return canvas.pixels()

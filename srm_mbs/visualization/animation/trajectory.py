@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
@@ -90,11 +91,8 @@ def active_elements(
             if intervals is None:
                 intervals = []
                 found.append((element, intervals))
-            if intervals and intervals[-1][1] == start:
-                start_before, _ = intervals.pop()
-                intervals.append((start_before, end))
-            else:
-                intervals.append((start, end))
+            goes_on = intervals and intervals[-1][1] == start
+            intervals.append((intervals.pop()[0] if goes_on else start, end))
     whole = [(segments[0].span[0], segments[-1].span[1])]
     return [
         (element, None if intervals == whole else tuple(intervals)) for element, intervals in found
@@ -161,10 +159,16 @@ class BodyMotion:
         if joint == 0:
             return np.tile(offset, (len(self.times), 1))
         k = self.joints.index(joint)
-        axis, w = self.quaternions[:, k, :3], self.quaternions[:, k, 3:]
-        across = 2.0 * np.cross(axis, offset)
-        turned = offset + w * across + np.cross(axis, across)
+        turned = Rotation.from_quat(self.quaternions[:, k]).apply(offset)
         return np.asarray(self.positions[:, k] + turned)
+
+    def placement(self, joint: int, frame: int) -> pin.SE3:
+        """Placement in the world of a joint frame (0: the ground) at a key frame."""
+        if joint == 0:
+            return pin.SE3.Identity()
+        k = self.joints.index(joint)
+        rotation = pin.Quaternion(self.quaternions[frame, k]).matrix()
+        return pin.SE3(rotation, self.positions[frame, k])
 
 
 def sample_motion(
@@ -200,8 +204,8 @@ def sample_motion(
     intervals = math.ceil(min(wanted, allowed))
     sampled, needed = _sampled(motion, joints, np.linspace(start, end, intervals + 1))
     parts = 1  # each interval is divided into as many parts: the requested key frames stay
-    while intervals and parts < min(math.ceil(needed / intervals), allowed // intervals):
-        parts = min(math.ceil(needed / intervals), allowed // intervals)
+    while intervals and parts < (more := min(math.ceil(needed / intervals), allowed // intervals)):
+        parts = more
         times = np.linspace(start, end, parts * intervals + 1)
         sampled, needed = _sampled(motion, joints, times)
     if max(wanted, needed) > allowed:
@@ -232,16 +236,21 @@ def _sampled(
         for k, joint in enumerate(joints):
             placements[i, k] = pin.SE3ToXYZQUAT(data.oMi[joint])
             rates[i, k] = pin.getVelocity(model, data, joint, pin.LOCAL_WORLD_ALIGNED).vector
-    quaternions = placements[:, :, 3:]
-    # q and -q are the same rotation: take the one closer to the previous frame.
-    flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=2) < 0.0, -1.0, 1.0)
-    quaternions[1:] *= np.cumprod(flips, axis=0)[:, :, None]
+    quaternions = continuous_sign(placements[:, :, 3:])
     sampled = BodyMotion(joints, times, placements[:, :, :3], quaternions)
     excess = _interpolation_error(sampled, rates) / INTERPOLATION_TOLERANCE
     intervals = len(times) - 1
     # The error is quadratic in the length of short intervals.
     needed = math.ceil(intervals * min(math.sqrt(excess), 4.0)) if excess > 1.0 else intervals
     return sampled, needed
+
+
+def continuous_sign(quaternions: FloatArray) -> FloatArray:
+    """``quaternions`` (n, ..., 4) with signs so that each is closer to its predecessor: q and -q
+    are the same rotation."""
+    turns_back = np.sum(quaternions[1:] * quaternions[:-1], axis=-1, keepdims=True) < 0.0
+    signs = np.cumprod(np.where(turns_back, -1.0, 1.0), axis=0)
+    return np.concatenate([quaternions[:1], signs * quaternions[1:]])
 
 
 def _interpolation_error(motion: BodyMotion, rates: FloatArray) -> float:
@@ -256,23 +265,14 @@ def _interpolation_error(motion: BodyMotion, rates: FloatArray) -> float:
         return 0.0
     h = np.diff(motion.times)[:, None, None]
     places, quaternions = motion.positions, motion.quaternions
-    chords = np.zeros((len(h), rates.shape[1], 6))
     size = float(np.ptp(places.reshape(-1, 3), axis=0).max())
-    chords[:, :, :3] = np.diff(places, axis=0) / h
-    chords[:, :, 3:] = _rotation_vectors(quaternions[:-1], quaternions[1:]) / h
+    first, second = (
+        Rotation.from_quat(q.reshape(-1, 4)) for q in (quaternions[:-1], quaternions[1:])
+    )
+    turned = (second * first.inv()).as_rotvec().reshape(len(h), -1, 3)
+    chords = np.concatenate([np.diff(places, axis=0), turned], axis=2) / h
     # A cubic whose slopes at both ends differ from that of the chord by d deviates by h d / 4.
     off = 0.25 * h[:, :, 0, None] * np.maximum(abs(rates[:-1] - chords), abs(rates[1:] - chords))
     distances = np.linalg.norm(off[:, :, :3], axis=2) / (size or 1.0)
     turns = np.linalg.norm(off[:, :, 3:], axis=2)
     return float(np.quantile(np.maximum(distances, turns).max(axis=1), ACCURATE_PART))
-
-
-def _rotation_vectors(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3), rad in the world, from the quaternions ``first`` (..., 4) to
-    ``second``, both (x, y, z, w)."""
-    a, wa, b, wb = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    axis = wa * b - wb * a - np.cross(b, a)
-    w = wa * wb + np.sum(a * b, axis=-1, keepdims=True)
-    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, w)
-    return np.asarray(axis * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0))

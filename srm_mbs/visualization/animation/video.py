@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.errors import InputError
 from srm_mbs.visualization.animation.overlays import OverlayOptions
-from srm_mbs.visualization.animation.page import write_page
+from srm_mbs.visualization.animation.page import write_file
 from srm_mbs.visualization.animation.playback import check_fps, page_of
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
@@ -126,7 +126,8 @@ def photographer(
     own = browser() if chromium is None else nullcontext(chromium)
     with tempfile.TemporaryDirectory() as folder, own as opened:
         file = Path(folder) / "page.html"
-        write_page(page_of(solution, fps, OverlayOptions(**drawn), panel=False, extra=times), file)
+        options = OverlayOptions(**drawn)
+        write_file(file, page_of(solution, fps, options, panel=False, extra=times).encode())
         page = opened.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
@@ -140,16 +141,6 @@ def photographer(
 
         yield photograph
         page.close()
-
-
-def _written(path: Path, content: bytes) -> None:
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
-        ) from error
-    log.info("written: %s", path)
 
 
 def export_image(
@@ -196,7 +187,7 @@ def export_image(
             remedy="Give a time of the run",
         )
     with photographer(solution, size, 60.0, drawn, [t]) as photograph:
-        _written(path, photograph(t))
+        write_file(path, photograph(t))
 
 
 def export_video(
@@ -256,7 +247,7 @@ def export_video(
     with photographer(solution, size, fps / min(speed, 1.0), drawn, times) as photograph:
         pictures = [photograph(t) for t in times]
     if encoder is None:
-        _written(path, _gif(pictures, fps))
+        write_file(path, _gif(pictures, fps))
     else:
         _encode(encoder, pictures, fps, path)
 

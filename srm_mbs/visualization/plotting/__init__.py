@@ -5,16 +5,15 @@ Imported on first use, because Matplotlib is slow to import.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srm_mbs.errors import InputError
 from srm_mbs.visualization.plotting.dae import draw_dae_run, draw_dae_state
 from srm_mbs.visualization.plotting.energy import draw_balance
-from srm_mbs.visualization.plotting.figure import FORMATS, check_suffix, save
+from srm_mbs.visualization.plotting.figure import check_suffix, save
 from srm_mbs.visualization.plotting.joints import draw_phase, draw_state
 from srm_mbs.visualization.plotting.path import draw_path
 from srm_mbs.visualization.plotting.reactions import draw_reactions
@@ -26,43 +25,27 @@ if TYPE_CHECKING:
     from srm_mbs.simulation.dae_result import DaeResult
     from srm_mbs.simulation.result import SimulationResult
 
-__all__ = ["FORMATS", "KINDS", "Kind", "check_options", "plot_dae", "plot_solution"]
+__all__ = ["KINDS", "check_options", "plot_dae", "plot_solution"]
 
+Kinds = Mapping[str, "Callable[..., Figure]"]
+"""Kinds of plot by name: functions of a run and of the options of the plot."""
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of plot.
-
-    Attributes
-    ----------
-    draw
-        Function (solution, **options) -> figure.
-    options
-        Names of its options.
-    """
-
-    draw: Callable[..., Figure]
-    options: tuple[str, ...] = ()
-
-
-KINDS = {
-    "run": Kind(draw_run),
-    "state": Kind(draw_state, ("joints",)),
-    "balance": Kind(draw_balance),
-    "reactions": Kind(draw_reactions, ("loops", "rows")),
-    "sigma": Kind(draw_sigma),
-    "phase": Kind(draw_phase, ("joints",)),
-    "path": Kind(draw_path, ("points",)),
+KINDS: Kinds = {
+    "run": draw_run,
+    "state": draw_state,
+    "balance": draw_balance,
+    "reactions": draw_reactions,
+    "sigma": draw_sigma,
+    "phase": draw_phase,
+    "path": draw_path,
 }
-"""The kinds of plot of a run, by name."""
+"""Those of a run of a mechanism."""
 
-DAE_KINDS = {"run": Kind(draw_dae_run), "state": Kind(draw_dae_state)}
-"""The kinds of plot of a run of a DAE, by name."""
+DAE_KINDS: Kinds = {"run": draw_dae_run, "state": draw_dae_state}
+"""Those of a run of a DAE."""
 
 
-def check_options(
-    kind: str, options: Iterable[str] = (), kinds: Mapping[str, Kind] = KINDS
-) -> None:
+def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) -> None:
     """Refuse an unknown kind of plot, or options that it does not have.
 
     Raises
@@ -76,7 +59,7 @@ def check_options(
             element="kind",
             remedy=f"Known: {', '.join(kinds)}",
         )
-    known = kinds[kind].options
+    _, *known = inspect.signature(kinds[kind]).parameters
     for name in options:
         if name not in known:
             raise InputError(
@@ -90,21 +73,21 @@ def plot_solution(
     solution: SimulationResult, path: str | Path | None = None, kind: str = "run", **options: Any
 ) -> Figure:
     """Plot a run; see :meth:`srm_mbs.Solution.plot`."""
-    check_options(kind, options)
-    return _drawn(partial(KINDS[kind].draw, solution, **options), path)
+    return _plot(KINDS, solution, path, kind, **options)
 
 
 def plot_dae(solution: DaeResult, path: str | Path | None = None, kind: str = "run") -> Figure:
     """Plot a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
-    check_options(kind, kinds=DAE_KINDS)
-    return _drawn(partial(DAE_KINDS[kind].draw, solution), path)
+    return _plot(DAE_KINDS, solution, path, kind)
 
 
-def _drawn(draw: Callable[[], Figure], path: str | Path | None) -> Figure:
-    """The figure, saved if a path is given, whose suffix is checked first."""
-    if path is None:
-        return draw()
-    check_suffix(Path(path))
-    figure = draw()
-    save(figure, Path(path))
+def _plot(
+    kinds: Kinds, solution: Any, path: str | Path | None, kind: str, **options: Any
+) -> Figure:
+    check_options(kind, options, kinds)
+    if path is not None:
+        check_suffix(Path(path))
+    figure = kinds[kind](solution, **options)
+    if path is not None:
+        save(figure, Path(path))
     return figure

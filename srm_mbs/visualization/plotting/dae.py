@@ -11,12 +11,13 @@ from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     FONT_SIZE,
-    LINES,
     Draw,
+    Lines,
+    above_zero,
     curve,
     draw_line,
-    finite,
-    line_styles,
+    draw_lines,
+    in_panels,
     linear_axis,
     log_axis,
     some_of,
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 
     from srm_mbs._typing import FloatArray
 
-MAX_LINES = 4 * len(LINES)
-"""Most lines of states, or of multipliers, on a page."""
+MAX_PANELS = 4
+"""Most panels of states, or of multipliers, on a page."""
 
 
 def draw_dae_run(solution: DaeResult) -> Figure:
@@ -49,27 +50,21 @@ def draw_dae_state(solution: DaeResult) -> Figure:
     draws: list[Draw] = []
     left: list[str] = []
     for letter, values, title in (("x", x, "states"), ("y", y, "multipliers")):
-        names = [f"{letter}[{i}]" for i in range(values.shape[1])]
-        left += names[MAX_LINES:]
-        for first in range(0, min(len(names), MAX_LINES), len(LINES)):
-            own = slice(first, min(first + len(LINES), MAX_LINES))
-            draws.append(partial(_lines, t=t, values=values[:, own], names=names[own], title=title))
+        panels = in_panels({f"{letter}[{i}]": own for i, own in enumerate(values.T)})
+        draws += [partial(_lines, t=t, lines=part, title=title) for part in panels[:MAX_PANELS]]
+        left += [name for part in panels[MAX_PANELS:] for name in part]
     notes = [f"Left out: {some_of(left)}."] if left else []
     return time_panels(solution, draws, notes)
 
 
 def _drift(axes: Axes, solution: DaeResult) -> str:
-    drift = finite(solution.drift)
-    shown = np.maximum(drift, SMALLEST_DRIFT)
-    draw_line(axes, solution.t, shown, color=BLACK, **curve(len(shown)))
+    drift, note = above_zero(solution.drift, SMALLEST_DRIFT)
+    draw_line(axes, solution.t, drift, color=BLACK, **curve(len(drift)))
     log_axis(axes)
     axes.set_ylabel(r"$\Vert g\Vert$", fontsize=FONT_SIZE)
-    floor = bool((drift < SMALLEST_DRIFT).any())
-    return "constraint errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor else "")
+    return f"constraint errors{note}"
 
 
-def _lines(axes: Axes, t: FloatArray, values: FloatArray, names: list[str], title: str) -> str:
-    factor = linear_axis(axes, [values], title, "", size=0.0)
-    for name, own, style in zip(names, values.T, line_styles(len(names))):
-        draw_line(axes, t, own / factor, label=name, **style)
+def _lines(axes: Axes, t: FloatArray, lines: Lines, title: str) -> str:
+    draw_lines(axes, t, lines, linear_axis(axes, [*lines.values()], title, "", size=0.0))
     return title

@@ -12,21 +12,19 @@ from srm_mbs.visualization.plotting.figure import (
     BLACK,
     LINES,
     Draw,
+    Lines,
     curve,
     draw_line,
-    finite,
-    line_styles,
+    draw_lines,
+    largest_size,
     linear_axis,
     mark_times,
     marks_note,
-    plain,
     time_panels,
 )
 from srm_mbs.visualization.plotting.sampling import read_smoothly
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -50,8 +48,8 @@ def draw_balance(solution: SimulationResult) -> Figure:
     balance = read_smoothly(solution, MAX_PIECES).energy_balance
     draws: list[Draw] = [partial(_energies, solution=solution, balance=balance)]
     # Work below the error of the balance is rounding.
-    error = np.nanmax(np.abs(finite(solution.energy_balance.residual)), initial=0.0)
-    sizes = {n: np.nanmax(np.abs(finite(own)), initial=0.0) for n, own in balance.works.items()}
+    error = largest_size(solution.energy_balance.residual)
+    sizes = {name: largest_size(work) for name, work in balance.works.items()}
     works = {name: balance.works[name] for name, size in sizes.items() if size > error}
     less = [name for name, size in sizes.items() if 0.0 < size <= error]
     notes = [f"Work of no more than the residual is left out: {', '.join(less)}."] if less else []
@@ -61,17 +59,9 @@ def draw_balance(solution: SimulationResult) -> Figure:
     return time_panels(solution, draws, [*marks_note(solution), *notes], height=1.9)
 
 
-def _lines(
-    axes: Axes,
-    solution: SimulationResult,
-    t: FloatArray,
-    lines: Mapping[str, FloatArray],
-    name: str,
-) -> None:
+def _lines(axes: Axes, solution: SimulationResult, t: FloatArray, lines: Lines, name: str) -> None:
     mark_times(axes, solution, labelled=False)
-    factor = linear_axis(axes, list(lines.values()), name, "J", size=0.0)
-    for (label, values), style in zip(lines.items(), line_styles(len(lines))):
-        draw_line(axes, t, values / factor, label=plain(label), **style)
+    draw_lines(axes, t, lines, linear_axis(axes, [*lines.values()], name, "J", size=0.0))
 
 
 def _energies(axes: Axes, solution: SimulationResult, balance: EnergyBalance) -> str:
@@ -83,17 +73,13 @@ def _energies(axes: Axes, solution: SimulationResult, balance: EnergyBalance) ->
     return "energies, the potential one from its start"
 
 
-def _works(
-    axes: Axes, solution: SimulationResult, t: FloatArray, works: Mapping[str, FloatArray]
-) -> str:
-    lines = dict(works)
-    if len(lines) > len(LINES):
-        sizes = {name: np.abs(finite(work)) for name, work in works.items()}
-        largest = sorted(sizes, key=lambda name: -np.nanmax(sizes[name], initial=0.0))
-        shown, others = largest[: len(LINES) - 1], largest[len(LINES) - 1 :]
-        lines = {name: works[name] for name in works if name in shown}
-        lines[f"{len(others)} others together"] = np.sum([works[name] for name in others], axis=0)
-    _lines(axes, solution, t, lines, "work ")
+def _works(axes: Axes, solution: SimulationResult, t: FloatArray, works: Lines) -> str:
+    if len(works) > len(LINES):
+        largest = sorted(works, key=lambda name: -largest_size(works[name]))
+        others = [works[name] for name in largest[len(LINES) - 1 :]]
+        shown = {name: works[name] for name in works if name in largest[: len(LINES) - 1]}
+        works = shown | {f"{len(others)} others together": np.sum(others, axis=0)}
+    _lines(axes, solution, t, works, "work ")
     return "work done on the mechanism"
 
 

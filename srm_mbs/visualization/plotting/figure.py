@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import string
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,13 +83,25 @@ NOTE_WIDTH = 122
 """Characters of a line of notes below the panels."""
 MAX_LISTED_NAMES = 6
 """Most names that a note lists of those that are left out."""
-MARKED: tuple[tuple[str, str, float, Any], ...] = (
-    ("singular passages (dashed)", BLACK, 0.5, (0, (4, 3))),
-    ("actions of events (dotted)", GREY, 0.9, (0, (1, 1.5))),
+MARKED: tuple[tuple[Callable[[Run], list[float]], str, str, dict[str, Any]], ...] = (
+    (
+        passages,
+        "singular passage",
+        "singular passages (dashed)",
+        {"color": BLACK, "linewidth": 0.5, "linestyle": (0, (4, 3))},
+    ),
+    (
+        jumps,
+        "action of an event",
+        "actions of events (dotted)",
+        {"color": GREY, "linewidth": 0.9, "linestyle": (0, (1, 1.5))},
+    ),
 )
-"""Vertical lines: their meaning in a note, colour, width and dashes."""
+"""Vertical lines: their times (s), their meaning in a legend and in a note, and their style."""
 Draw = Callable[["Axes"], str]
 """Draws into a panel and returns its title."""
+Lines = Mapping[str, "FloatArray"]
+"""Values (n,) over time, by the name that the legend shows."""
 
 
 def check_suffix(path: Path) -> None:
@@ -141,12 +153,12 @@ def wrapped(name: str, width: int = NAME_WIDTH) -> str:
     return "\n".join([*lines, rest])
 
 
-def fits(axes: Axes, title: str, line: int = TITLE_LINE) -> bool:
-    """Whether the legend fits on the line of the panel's ``title``, of ``line`` characters."""
+def legend_fits(axes: Axes) -> bool:
+    """Whether the legend fits on the line of the panel's title."""
     labels = axes.get_legend_handles_labels()[1]
     # A formula between "$" is shorter than its source.
     seen = sum(5 if "$" in label else len(label) for label in labels)
-    return seen + 5 * len(labels) + len(title) <= line
+    return seen + 5 * len(labels) + len(axes.get_title(loc="left")) <= TITLE_LINE
 
 
 def legend(axes: Axes, *, beside: bool) -> None:
@@ -154,15 +166,15 @@ def legend(axes: Axes, *, beside: bool) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
-    options: dict[str, Any] = {"frameon": False, "fontsize": FONT_SIZE - 0.5}
-    options["borderaxespad"] = 0.0
+    options: dict[str, Any]
     if beside:
         labels = [label if "$" in label else wrapped(label) for label in labels]
-        options |= {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "handlelength": 2.6}
+        options = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "handlelength": 2.6}
     else:
-        options |= {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": len(handles)}
+        options = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": len(handles)}
         options |= {"borderpad": 0.2, "handlelength": 1.9, "columnspacing": 1.2}
-    axes.legend(handles, labels, **options)
+    size = FONT_SIZE - 0.5
+    axes.legend(handles, labels, frameon=False, fontsize=size, borderaxespad=0.0, **options)
 
 
 def line_styles(count: int) -> list[dict[str, Any]]:
@@ -176,10 +188,10 @@ def curve(count: int) -> dict[str, Any]:
     return {"linewidth": 0.9, "marker": "." if count < FEW_POINTS else "", "markersize": 3.0}
 
 
-def dots(count: int) -> dict[str, Any]:
-    """Properties of one marker per step: smaller if there are many."""
+def dots(colour: str, count: int) -> dict[str, Any]:
+    """Properties of one marker for each of ``count`` steps: smaller if there are many."""
     size = 3.5 if count <= LARGE_DOTS else 2.0
-    return {"linestyle": "none", "marker": ".", "markersize": size}
+    return {"color": colour, "linestyle": "none", "marker": ".", "markersize": size}
 
 
 def marks(colour: str, marker: str, size: float = 4.0) -> dict[str, Any]:
@@ -198,13 +210,11 @@ def log_axis(axes: Axes) -> None:
     """A logarithmic axis with labelled ticks for any range of its data."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    if high / low < FEW_DECADES:
-        if high / low < SMALLEST_LOG_RATIO:
-            middle = np.sqrt(low * high)
-            axes.set_ylim(
-                middle / np.sqrt(SMALLEST_LOG_RATIO), middle * np.sqrt(SMALLEST_LOG_RATIO)
-            )
+    if high / low < SMALLEST_LOG_RATIO:
+        middle, half = np.sqrt(low * high), np.sqrt(SMALLEST_LOG_RATIO)
+        axes.set_ylim(middle / half, middle * half)
         low, high = axes.get_ylim()
+    if high / low < FEW_DECADES:
         subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10.0 else (1.0, 2.0, 5.0)
         axes.yaxis.set_major_locator(LogLocator(subs=subs))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
@@ -260,7 +270,7 @@ def linear_axis(
     power = int(np.floor(np.log10(largest))) if largest > 0.0 else 0
     power = 0 if power in PLAIN_POWERS else power
     factor = 10.0**power
-    own = axes.yaxis if axis == "y" else axes.xaxis
+    own = getattr(axes, f"{axis}axis")
     own.set_major_locator(MaxNLocator(ticks, steps=TICK_STEPS))
     formatter = ScalarFormatter(useOffset=False)
     formatter.set_scientific(False)
@@ -269,11 +279,11 @@ def linear_axis(
     measured = f"{prefix}{unit}".rstrip()
     own.set_label_text(f"{name}({measured})" if measured else name, fontsize=FONT_SIZE)
     if high - low <= max(least, SMALLEST_RELATIVE_RANGE * largest):
-        half = max(0.1 * abs(0.5 * (low + high)), 0.0 if largest > size else least)
+        half = max(0.05 * abs(low + high), 0.0 if largest > size else least)
         if max(abs(low), abs(high)) <= least:
             half = size or 1.0
-        ends = (0.5 * (low + high) - half) / factor, (0.5 * (low + high) + half) / factor
-        (axes.set_ylim if axis == "y" else axes.set_xlim)(*ends)
+        middle = 0.5 * (low + high)
+        axes.set(**{f"{axis}lim": ((middle - half) / factor, (middle + half) / factor)})
     return factor
 
 
@@ -285,6 +295,18 @@ def plain(name: str) -> str:
 def finite(values: FloatArray) -> FloatArray:
     """Values with nan where they are not finite: nothing is drawn there."""
     return np.where(np.isfinite(values), values, np.nan)
+
+
+def largest_size(values: FloatArray) -> float:
+    """Largest finite magnitude of ``values``, 0 if there is none."""
+    return float(np.nanmax(np.abs(finite(values)), initial=0.0))
+
+
+def above_zero(values: FloatArray, least: float) -> tuple[FloatArray, str]:
+    """Values >= 0 raised to ``least`` for a logarithmic axis, and a note on that for the title."""
+    values = finite(values)
+    note = f" (zeros drawn at {least:.0e})" if (values < least).any() else ""
+    return np.maximum(values, least), note
 
 
 def time_panels(
@@ -300,7 +322,7 @@ def time_panels(
             title = draw(axes)
             axes.set_title(f"({letter}) {title}", loc="left", fontsize=FONT_SIZE + 0.5)
     # Legends are placed alike: one beside its panel makes all panels narrower.
-    beside = not all(fits(axes, axes.get_title(loc="left")) for axes in panels)
+    beside = not all(legend_fits(axes) for axes in panels)
     for axes in panels:
         legend(axes, beside=beside)
     time_axis(solution, panels)
@@ -360,6 +382,19 @@ def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> No
     axes.plot(t[seen], values[seen], **style)
 
 
+def in_panels(lines: Lines) -> list[Lines]:
+    """``lines`` in parts of as many as a panel can distinguish."""
+    names = list(lines)
+    parts = (names[i : i + len(LINES)] for i in range(0, len(names), len(LINES)))
+    return [{name: lines[name] for name in part} for part in parts]
+
+
+def draw_lines(axes: Axes, t: FloatArray, lines: Lines, factor: float) -> None:
+    """Lines of different styles through the values over ``factor``, named in the legend."""
+    for (name, values), style in zip(lines.items(), line_styles(len(lines))):
+        draw_line(axes, t, values / factor, label=plain(name), **style)
+
+
 def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
     """Mark singular passages and actions of events by vertical lines, or by ticks if they are many.
 
@@ -368,24 +403,14 @@ def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
     labelled
         Whether the legend explains them; otherwise :func:`marks_note` does.
     """
-    for times, label, (_, colour, width, dashes) in zip(
-        (passages(solution), jumps(solution)), ("singular passage", "action of an event"), MARKED
-    ):
-        if times:
-            axes.vlines(
-                times,
-                0.0,
-                1.0 if len(times) <= MAX_FULL_LINES else 0.06,
-                transform=axes.get_xaxis_transform(),
-                color=colour,
-                linewidth=width,
-                linestyle=dashes,
-                label=label if labelled else "",
-            )
+    for times_of, label, _, style in MARKED:
+        if times := times_of(solution):
+            top = 1.0 if len(times) <= MAX_FULL_LINES else 0.06
+            transform, label = axes.get_xaxis_transform(), label if labelled else ""
+            axes.vlines(times, 0.0, top, transform=transform, label=label, **style)
 
 
 def marks_note(solution: Run) -> list[str]:
     """A note below the panels that explains the vertical lines, if there are any."""
-    present = (bool(passages(solution)), bool(jumps(solution)))
-    meanings = [meaning for drawn, (meaning, *_) in zip(present, MARKED) if drawn]
+    meanings = [meaning for times_of, _, meaning, _ in MARKED if times_of(solution)]
     return [f"Vertical lines: {'; '.join(meanings)}."] if meanings else []

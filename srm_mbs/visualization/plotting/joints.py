@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,10 +25,9 @@ from srm_mbs.visualization.plotting.figure import (
     FONT_SIZE,
     VERMILION,
     WIDTH,
-    draw_line,
+    draw_lines,
     finish,
     legend,
-    line_styles,
     linear_axis,
     mark_times,
     marks,
@@ -38,7 +38,7 @@ from srm_mbs.visualization.plotting.figure import (
     time_axis,
     wrapped,
 )
-from srm_mbs.visualization.plotting.sampling import broken, read_smoothly
+from srm_mbs.visualization.plotting.sampling import read_smoothly, with_gaps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,12 +71,12 @@ class Component:
     ----------
     joint
         Its name.
-    what
+    part
         For example ``rotation``; "" if the joint has one component.
     unit
         Unit of the positions; that of the rates is per second.
     names
-        Names of the curves; one "" if there is one only.
+        Names of the curves; a single one is "".
     positions : (n, k), rates : (n, k)
         Unwrapped angles, and rotation vectors; linear or angular rates, in the axes of the moving
         body if there are several.
@@ -85,7 +85,7 @@ class Component:
     """
 
     joint: str
-    what: str
+    part: str
     unit: str
     names: tuple[str, ...]
     positions: FloatArray
@@ -140,12 +140,11 @@ def components(run: SimulationResult, joint: str) -> Iterator[Component]:
     v = run.v[:, data.idx_v : data.idx_v + data.nv]
 
     def component(
-        what: str, own: slice, positions: FloatArray, names: tuple[str, ...], turns: bool
+        part: str, own: slice, positions: FloatArray, names: tuple[str, ...], turns: bool
     ) -> Component:
-        size = 1.0 if turns else units.length
-        unit = "rad" if turns else "m"
+        unit, size = ("rad", 1.0) if turns else ("m", units.length)
         sizes = (size, size * units.rate)
-        return Component(joint, what, unit, names, positions, v[:, own], sizes)
+        return Component(joint, part, unit, names, positions, v[:, own], sizes)
 
     kind = data.shortname().removeprefix("JointModel")
     if data.nv == 1:
@@ -163,8 +162,8 @@ def components(run: SimulationResult, joint: str) -> Iterator[Component]:
     else:
         numbers = tuple(str(i + 1) for i in range(data.nv))
         names = XYZ if kind == "Translation" else numbers
-        same = q if data.nq == data.nv else q[:, : data.nv]
-        yield component("", slice(0, data.nv), same, names, turns=kind != "Translation")
+        whole = slice(0, data.nv)
+        yield component("", whole, q[:, whole], names, turns=kind != "Translation")
 
 
 def noise(run: SimulationResult) -> float:
@@ -218,12 +217,15 @@ def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) 
     figure = Figure(figsize=(WIDTH, 0.9 + 1.2 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
     for row, pair in zip(rows, panels):
-        what = f"{row.what} " if row.what else ""
-        name = f"{plain(wrapped(row.joint, LABEL_WIDTH))}\n{what}"
+        part = f"{row.part} " if row.part else ""
+        name = f"{plain(wrapped(row.joint, LABEL_WIDTH))}\n{part}"
         for axes, values, label, unit, size in zip(
             pair, (row.positions, row.rates), (name, ""), (row.unit, f"{row.unit}/s"), row.sizes
         ):
-            _panel(axes, solution, run.t, values, row.names, size, (label, unit))
+            prepare(axes)
+            mark_times(axes, solution, labelled=False)
+            factor = linear_axis(axes, [values], label, unit, size=size, noise=noise(solution))
+            draw_lines(axes, run.t, dict(zip(row.names, values.T)), factor)
     for axes, title in zip(panels[0], ("position", "rate")):
         axes.set_title(title, loc="left", fontsize=FONT_SIZE + 0.5)
     for axes in panels.flat:
@@ -240,22 +242,6 @@ def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) 
         )
     finish(figure, solution, notes)
     return figure
-
-
-def _panel(
-    axes: Axes,
-    solution: SimulationResult,
-    t: FloatArray,
-    values: FloatArray,
-    names: tuple[str, ...],
-    size: float,
-    label: tuple[str, str],
-) -> None:
-    prepare(axes)
-    mark_times(axes, solution, labelled=False)
-    factor = linear_axis(axes, [values], *label, size=size, noise=noise(solution))
-    for name, own, style in zip(names, np.transpose(values), line_styles(len(names))):
-        draw_line(axes, t, own / factor, label=name or None, **style)
 
 
 def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
@@ -284,16 +270,16 @@ def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) 
                 remedy=f"Known: {', '.join(single)}" if single else 'Draw the kind "state"',
             )
     shown = single if joints is not None else single[:MAX_PORTRAITS]
-    run, passages = read_smoothly(solution), None
-    if solution.crossings:
-        passages = solution.at([crossing.time for crossing in solution.crossings])
+    run = read_smoothly(solution)
+    passages = solution.at([crossing.time for crossing in solution.crossings])
     columns = min(PORTRAIT_COLUMNS, len(shown))
     rows = -(-len(shown) // columns)
     height = 2.1 if columns > 1 else 3.4
     figure = Figure(figsize=(WIDTH, 0.9 + height * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    ticks = 5 if len(shown) == 1 else NARROW_TICKS
     for name, axes in zip(shown, panels):
-        _portrait(axes, solution, run, passages, name, alone=len(shown) == 1)
+        _portrait(axes, solution, run, passages, name, ticks)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     left = [name for name in names if name not in shown]
@@ -308,21 +294,21 @@ def _portrait(
     axes: Axes,
     solution: SimulationResult,
     run: SimulationResult,
-    passages: SimulationResult | None,
+    passages: SimulationResult,
     name: str,
-    alone: bool,
+    ticks: int,
 ) -> None:
+    """Rate over position of the joint ``name``, its start, its end and the singular passages."""
     prepare(axes, "both")
     (component,) = components(run, name)
     position, rate = component.positions[:, 0], component.rates[:, 0]
     unit, sizes = component.unit, component.sizes
-    options: dict[str, Any] = {"noise": noise(solution), "ticks": 5 if alone else NARROW_TICKS}
-    x = linear_axis(axes, [position], "position ", unit, size=sizes[0], axis="x", **options)
-    y = linear_axis(axes, [rate], "rate ", f"{unit}/s", size=sizes[1], **options)
-    _, line = broken(solution, run.t, rate)
-    _, along = broken(solution, run.t, position)
-    axes.plot(along / x, line / y, color=BLUE, linewidth=0.9)
-    if passages is not None:
+    axis = partial(linear_axis, axes, noise=noise(solution), ticks=ticks)
+    x = axis([position], "position ", unit, size=sizes[0], axis="x")
+    y = axis([rate], "rate ", f"{unit}/s", size=sizes[1])
+    path = (with_gaps(solution, run.t, values) for values in (position / x, rate / y))
+    axes.plot(*path, color=BLUE, linewidth=0.9)
+    if len(passages.t):
         at = passages.joint(name)
         axes.plot(at[0] / x, at[1] / y, **marks(VERMILION, "+", 6.0))
     for index, marker in ((0, "o"), (-1, "s")):

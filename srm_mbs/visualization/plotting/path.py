@@ -82,7 +82,7 @@ def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None
     else:
         placed = resolve_moving(mechanism.model, points, "points")
         if not placed:
-            raise InputError("no points are given", element="points", remedy="Leave it away")
+            raise InputError("no points are given", element="points", remedy="Leave the option out")
         paths = _paths(run, {_name(point): place for point, place in zip(points, placed)})
     together = np.concatenate(list(paths.values()))
     extents = np.array([max(np.ptp(path[:, k]) for path in paths.values()) for k in range(3)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,9 +13,11 @@ from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     LINES,
     Draw,
-    draw_line,
+    Lines,
+    draw_lines,
     finite,
-    line_styles,
+    in_panels,
+    largest_size,
     linear_axis,
     mark_times,
     marks_note,
@@ -44,8 +45,8 @@ AXIS_RATIO = 1.6
 """End of an axis with cut peaks, over the percentile."""
 MAX_PANELS = 8
 """Most panels of multipliers that are drawn by default."""
-
-Lines = Mapping[str, "FloatArray"]
+JOINT_FORCES = ((True, "torque ", "N m"), (False, "force ", "N"))
+"""Name and unit of a force on a joint, whose position is an angle or not."""
 
 
 def draw_reactions(
@@ -67,8 +68,9 @@ def draw_reactions(
         If a closure does not exist, nothing has a reaction, or the run was loaded and had a
         controller.
     """
-    found = {loop.name: loop for each in solution.segments for loop in each.mechanism.loops}
-    drives = any(each.mechanism.drives for each in solution.segments)
+    mechanisms = [segment.mechanism for segment in solution.segments]
+    found = {loop.name: loop for mechanism in mechanisms for loop in mechanism.loops}
+    drives = any(mechanism.drives for mechanism in mechanisms)
     if not found and not drives:
         raise InputError(
             f"the mechanism {solution.mechanism.name!r} has neither closures nor drives, and so no "
@@ -76,10 +78,9 @@ def draw_reactions(
             element="kind",
             remedy='Draw another kind, for example "state" or "balance"',
         )
-    names = None
     if loops is not None:
-        names = checked_names(loops, "loops", 'Give for example loops=["pin"]')
-        for name in names:
+        loops = checked_names(loops, "loops", 'Give for example loops=["pin"]')
+        for name in loops:
             if name not in found:
                 raise InputError(
                     f"there is no closure {name!r}",
@@ -87,10 +88,10 @@ def draw_reactions(
                     remedy=f"Known: {', '.join(found) or 'none'}",
                 )
     run = _readable(solution)
-    draws, left = (_by_row if rows else _by_loop)(run, found, names)
+    draws, left = (_by_row if rows else _by_loop)(run, found, loops)
     if drives and loops is None:
         draws += _drives(run)
-    notes = [*marks_note(solution), *_indeterminate(solution, [*(names or found)])]
+    notes = [*marks_note(solution), *_indeterminate(solution, loops or list(found))]
     if left:
         notes.append(
             f"Left out: {some_of(left)}; loops=[...], or --loop, draws those that it names."
@@ -128,35 +129,34 @@ def _by_loop(
 ) -> tuple[list[Draw], list[str]]:
     """Norms of force and moment of closures, couplings by the force on their first joint."""
     tied = [name for name in names or found if found[name].anchors]
-    coupled = [name for name in names or found if not found[name].anchors]
     forces = {name: np.linalg.norm(run.reactions[name][:, :3], axis=1) for name in tied}
-    moments = {name: np.linalg.norm(run.reactions[name][:, 3:], axis=1) for name in tied}
     left: list[str] = []
-    if names is None and len(tied) > len(LINES):
-        large = {name: _percentile([forces[name]]) for name in tied}
-        ordered = sorted(tied, key=lambda name: -large[name])
-        left = [name for name in tied if name in ordered[len(LINES) :]]
-        tied = [name for name in tied if name not in left]
+    if names is None:
+        largest = sorted(tied, key=lambda name: -_percentile([forces[name]]))[: len(LINES)]
+        left = [name for name in tied if name not in largest]
+        forces = {name: own for name, own in forces.items() if name in largest}
+    moments = {
+        name: np.linalg.norm(run.reactions[name][:, 3:], axis=1)
+        for name in forces
+        if _takes_moments(found[name])
+    }
     draws: list[Draw] = []
-    if tied:
-        forces, moments = ({name: all_[name] for name in tied} for all_ in (forces, moments))
+    if forces:
         draws.append(_panel(run, forces, "force ", "N", "forces in the closures"))
-        moments = {name: own for name, own in moments.items() if _takes_moments(found[name])}
-        if moments:
-            title = "moments in the closures, about the origins of their anchors b"
-            draws.append(_panel(run, moments, "moment ", "N m", title))
-    for turning, unit in ((True, "N m"), (False, "N")):
-        lines = {}
-        for name in coupled:
-            first = found[name].rows.joint_rows[0].joints[0]
-            if is_angle(run.mechanism.model, first) == turning:
-                own = found[name].rows.joint_rows[0].coefficients[0]
-                values = -own * run.reaction_multipliers[name][:, 0]
-                lines[f"{name}, on {first}"] = values
-        for first_line in range(0, len(lines), len(LINES)):
-            part = dict(list(lines.items())[first_line : first_line + len(LINES)])
-            what = "torque " if turning else "force "
-            draws.append(_panel(run, part, what, unit, "couplings, on their first joints"))
+    if moments:
+        title = "moments in the closures, about the origins of their anchors b"
+        draws.append(_panel(run, moments, "moment ", "N m", title))
+    coupled = [name for name in names or found if not found[name].anchors]
+    first = {name: found[name].rows.joint_rows[0].joints[0] for name in coupled}
+    couplings = run.coupling_forces
+    for turning, what, unit in JOINT_FORCES:
+        lines = {
+            f"{name}, on {joint}": couplings[name][:, 0]
+            for name, joint in first.items()
+            if is_angle(run.mechanism.model, joint) == turning
+        }
+        title = "couplings, on their first joints"
+        draws += [_panel(run, part, what, unit, title) for part in in_panels(lines)]
     return draws, left
 
 
@@ -178,10 +178,7 @@ def _by_row(
         turning = [is_angle(run.mechanism.model, r.joints[0]) for r in loop.rows.joint_rows]
         numbers = range(loop.rows.count)
         angles = [*numbers[alignments], *(i for i, t in zip(numbers[joints], turning) if t)]
-        for own, unit in (
-            ([i for i in numbers if i not in angles], "N"),
-            (angles, "N m"),
-        ):
+        for own, unit in (([i for i in numbers if i not in angles], "N"), (angles, "N m")):
             lines = {loop.rows.labels[i]: run.reaction_multipliers[name][:, i] for i in own}
             if lines:
                 title = f"multipliers of {plain(name)}"
@@ -201,7 +198,7 @@ def _drives(run: SimulationResult) -> list[Draw]:
         for drive in each.mechanism.drives
     }
     draws = []
-    for turns, unit, what in ((True, "N m", "torque "), (False, "N", "force ")):
+    for turns, what, unit in JOINT_FORCES:
         lines = {n: own for n, own in run.drive_forces.items() if turning[n] == turns}
         if lines:
             draws.append(_panel(run, lines, what, unit, "drives"))
@@ -209,29 +206,28 @@ def _drives(run: SimulationResult) -> list[Draw]:
 
 
 def _panel(run: SimulationResult, lines: Lines, name: str, unit: str, title: str) -> Draw:
-    return partial(_draw, run=run, lines=lines, name=name, unit=unit, title=title)
+    """A panel of ``lines`` in ``unit``, with the label ``name`` of its axis."""
 
-
-def _draw(axes: Axes, run: SimulationResult, lines: Lines, name: str, unit: str, title: str) -> str:
-    mark_times(axes, run, labelled=False)
-    top = AXIS_RATIO * _percentile(list(lines.values()))
-    cut = _largest(lines) > PEAK_RATIO / AXIS_RATIO * top > 0.0
-    shown = [np.clip(values, -top, top) for values in lines.values()] if cut else lines.values()
-    factor = linear_axis(axes, list(shown), name, unit, size=0.0)
-    for (label, values), style in zip(lines.items(), line_styles(len(lines))):
-        draw_line(axes, run.t, values / factor, label=plain(label), **style)
-    if cut:
+    def draw(axes: Axes) -> str:
+        mark_times(axes, run, labelled=False)
+        shown = list(lines.values())
+        top = AXIS_RATIO * _percentile(shown)
+        largest = max(map(largest_size, shown))
+        cut = largest > PEAK_RATIO / AXIS_RATIO * top > 0.0
+        if cut:
+            shown = [np.clip(values, -top, top) for values in shown]
+        factor = linear_axis(axes, shown, name, unit, size=0.0)
+        draw_lines(axes, run.t, lines, factor)
+        if not cut:
+            return title
         low = min(float(np.nanmin(finite(values))) for values in shown)
         axes.set_ylim(min(0.0, 1.05 * low / factor), top / factor)
-        title += f"; peaks to {_largest(lines):.2g} {unit} are cut"
-    return title
+        return f"{title}; peaks to {largest:.2g} {unit} are cut"
+
+    return draw
 
 
 def _percentile(lines: Sequence[FloatArray]) -> float:
     together = np.abs(np.concatenate(lines))
     together = together[np.isfinite(together)]
     return float(np.percentile(together, PERCENTILE)) if len(together) else 0.0
-
-
-def _largest(lines: Lines) -> float:
-    return max(float(np.nanmax(np.abs(finite(v)), initial=0.0)) for v in lines.values())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from srm_mbs.visualization.plotting.figure import (
     PURPLE,
     VERMILION,
     Draw,
+    above_zero,
     curve,
     dots,
     draw_line,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srm_mbs._typing import BoolArray, FloatArray
+    from srm_mbs._typing import FloatArray
 
 SMALLEST_DRIFT = 1e-17
 """Ordinate of a drift of exactly zero on the logarithmic axis."""
@@ -64,7 +65,7 @@ def _drift(axes: Axes, solution: SimulationResult) -> str:
     parts = [part for part in ("m", "rad") if part in found]
     units = (", ".join(parts), ", ".join(f"{part}/s" for part in parts))
     names = (r"$\Vert g\Vert$", r"$\Vert G\,v\Vert$")
-    drift = np.maximum(finite(solution.drift), SMALLEST_DRIFT)
+    drift, note = above_zero(solution.drift, SMALLEST_DRIFT)
     # Positions as dots: at rounding level a line would jump between a few values.
     rate = {"color": VERMILION, **curve(len(solution.t))}
     position = {"color": BLACK, "linestyle": "none", "marker": ".", "markersize": 2.0}
@@ -73,8 +74,7 @@ def _drift(axes: Axes, solution: SimulationResult) -> str:
         draw_line(axes, solution.t, drift[:, column], label=label, **style)
     log_axis(axes)
     axes.set_ylabel("drift", fontsize=FONT_SIZE)
-    floor = finite(solution.drift) < SMALLEST_DRIFT
-    return "closure errors" + (f" (zeros drawn at {SMALLEST_DRIFT:.0e})" if floor.any() else "")
+    return f"closure errors{note}"
 
 
 def _energy(axes: Axes, solution: SimulationResult) -> str:
@@ -82,8 +82,8 @@ def _energy(axes: Axes, solution: SimulationResult) -> str:
     factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
     draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))
     from_start = not len(solution.t) or solution.t[0] == solution.steps.times[0]
-    since = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
-    return f"total energy relative to {since}"
+    reference = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
+    return f"total energy relative to {reference}"
 
 
 def sigma_panel(solution: Run, *, log: bool = False) -> Draw:
@@ -92,13 +92,8 @@ def sigma_panel(solution: Run, *, log: bool = False) -> Draw:
 
 
 def step_panel(solution: Run, *, kinds: bool = False) -> Draw:
-    """Accepted, rejected and redone steps.
-
-    Parameters
-    ----------
-    kinds
-        Whether placed steps, those in the zone and those held on their branch have own markers.
-    """
+    """Accepted, rejected and redone steps; with ``kinds``, also those that were placed, those in
+    the zone, and those held on their branch."""
     return partial(_step_sizes, solution=solution, kinds=kinds)
 
 
@@ -117,88 +112,76 @@ def _sigma(axes: Axes, solution: Run, log: bool) -> str:
     # A line through every stage: stages show the dip of sigma at a passage that steps jump over.
     abscissae = np.append(solution.scheme.c, 1.0)
     times = (steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]).ravel()
-    sigmas = finite(steps.sigmas)
+    sigmas, note = finite(steps.sigmas), ""
     if log:
-        sigmas = np.maximum(sigmas, SMALLEST_SIGMA)
+        sigmas, note = above_zero(steps.sigmas, SMALLEST_SIGMA)
     order = np.argsort(times, kind="stable")
     line = sigmas.ravel()[order]
     draw_line(axes, times[order], line, color=GREY, linewidth=0.8, label="stages")
-    ends = sigmas[:, -1]
-    _dots(axes, steps.times[1:], ends, log, colour=BLUE, label="step ends", count=steps.count)
+    style = dots(BLUE, steps.count)
+    _draw_markers(axes, steps.times[1:], sigmas[:, -1], "step ends", style, log=log)
     if log and steps.count:
         log_axis(axes)
     else:
         axes.set_ylim(bottom=0.0, top=None if steps.count else 1.0)
     axes.set_ylabel(r"$\sigma$ (relative)", fontsize=FONT_SIZE)
-    floor = log and bool((steps.sigmas < SMALLEST_SIGMA).any())
-    return "distance from singular configurations" + (
-        f" (zeros drawn at {SMALLEST_SIGMA:.0e})" if floor else ""
-    )
+    return f"distance from singular configurations{note}"
 
 
-def _dots(
-    axes: Axes, x: FloatArray, y: FloatArray, log: bool, *, colour: str, label: str, count: int
+def _draw_markers(
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    label: str,
+    style: dict[str, Any],
+    *,
+    log: bool = True,
 ) -> None:
+    """Markers that do not overlap; ``log`` if the axis of ``y`` is logarithmic."""
     seen = distinct(x, y, log=log)
-    axes.plot(x[seen], y[seen], color=colour, label=label, **dots(count))
+    axes.plot(x[seen], y[seen], label=label, **style)
 
 
 def _step_sizes(axes: Axes, solution: Run, kinds: bool) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=not kinds)
     starts, lengths = steps.times[:-1], np.diff(steps.times)
-    _dots(axes, starts, lengths, True, colour=BLUE, label="accepted", count=steps.count)
+    _draw_markers(axes, starts, lengths, "accepted", dots(BLUE, steps.count))
     if kinds:
-        for label, chosen, colour, marker, size in _special(solution):
+        in_zone = np.isin(np.arange(steps.count), list(steps.zones))
+        for label, chosen, colour, marker, size in (
+            ("placed", steps.placements > 0.0, GREEN, "o", 5.5),
+            ("in the zone", in_zone, PURPLE, "s", 7.0),
+            ("held on their branch", steps.held > 0.0, BLACK, "D", 6.0),
+        ):
             if chosen.any():
-                seen = distinct(starts[chosen], lengths[chosen], log=True)
-                axes.plot(
-                    starts[chosen][seen],
-                    lengths[chosen][seen],
-                    label=label,
-                    **marks(colour, marker, size if steps.count <= LARGE_DOTS else 0.6 * size),
-                )
-    attempts = (("rejected", solution.rejected, VERMILION, "x"),)
-    for label, pairs, colour, marker in (*attempts, ("redone", solution.replaced, BLACK, "+")):
-        if len(pairs):
-            seen = distinct(pairs[:, 0], pairs[:, 1], log=True)
-            axes.plot(pairs[seen, 0], pairs[seen, 1], label=label, **marks(colour, marker))
+                style = marks(colour, marker, size if steps.count <= LARGE_DOTS else 0.6 * size)
+                _draw_markers(axes, starts[chosen], lengths[chosen], label, style)
+    for label, attempts, colour, marker in (
+        ("rejected", solution.rejected, VERMILION, "x"),
+        ("redone", solution.replaced, BLACK, "+"),
+    ):
+        if len(attempts):
+            _draw_markers(axes, attempts[:, 0], attempts[:, 1], label, marks(colour, marker))
     log_axis(axes)
     axes.set_ylabel(f"step size{seconds(solution)}", fontsize=FONT_SIZE)
     return "steps"
-
-
-def _special(solution: Run) -> list[tuple[str, BoolArray, str, str, float]]:
-    """Placed, zone and held steps: (label, which steps, colour, marker, size)."""
-    steps = solution.steps
-    zone = np.isin(np.arange(steps.count), list(steps.zones))
-    return [
-        ("placed", steps.placements > 0.0, GREEN, "o", 5.5),
-        ("in the zone", zone, PURPLE, "s", 7.0),
-        ("held on their branch", steps.held > 0.0, BLACK, "D", 6.0),
-    ]
 
 
 def _errors(axes: Axes, solution: SimulationResult) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=False)
     axes.axhline(1.0, color=BLACK, linewidth=0.7, linestyle="--")
-    _ratios(axes, steps.times[:-1], steps.error_ratios, "accepted", dots(steps.count), BLUE)
     rejected = solution.attempts[solution.attempts["verdict"] == "rejected"]
-    style = marks(VERMILION, "x")
-    del style["color"]
-    _ratios(axes, rejected["t"], rejected["error_ratio"], "rejected", style, VERMILION)
+    for label, t, ratios, style in (
+        ("accepted", steps.times[:-1], steps.error_ratios, dots(BLUE, steps.count)),
+        ("rejected", rejected["t"], rejected["error_ratio"], marks(VERMILION, "x")),
+    ):
+        # A step without error, or whose evaluation failed, has no marker.
+        known = np.isfinite(ratios) & (ratios > 0.0)
+        if known.any():
+            _draw_markers(axes, t[known], ratios[known], label, style)
     if steps.count:
         log_axis(axes)
     axes.set_ylabel("error over\ntolerance", fontsize=FONT_SIZE)
     return "error estimates, accepted up to 1"
-
-
-def _ratios(
-    axes: Axes, t: FloatArray, ratios: FloatArray, label: str, style: dict[str, object], colour: str
-) -> None:
-    """Markers of positive ratios; a step without error, or whose evaluation failed, has none."""
-    known = np.isfinite(ratios) & (ratios > 0.0)
-    seen = distinct(t[known], ratios[known], log=True)
-    if len(seen):
-        axes.plot(t[known][seen], ratios[known][seen], color=colour, label=label, **style)  # type: ignore[arg-type]

@@ -51,42 +51,33 @@ def read_smoothly(solution: SimulationResult, most: int = MAX_PIECES) -> Simulat
         Number of parts from which steps are divided no further: smaller for quantities that are
         slow to compute.
     """
-    times = _times(solution, most)
+    *_, last = segments = solution.segments
+    parts = []
+    for segment in segments:
+        start, end = segment.span
+        if segment is not last:
+            if not end > start:
+                continue
+            end = np.nextafter(end, start)
+        times = segment.steps.times
+        parts.append(between(np.append(times[times < end], end), solution.steps.count, most))
+    times = np.unique(np.concatenate(parts))
     if np.array_equal(times, solution.t):
         return solution  # keeps quantities that it has computed
     return solution.at(times)
 
 
-def _times(solution: SimulationResult, most: int) -> FloatArray:
-    segments = solution.segments
-    steps = sum(segment.steps.count for segment in segments)
-    parts = []
-    for segment in segments:
-        start, end = segment.span
-        if segment is not segments[-1]:
-            if not end > start:
-                continue
-            end = np.nextafter(end, start)
-        times = segment.steps.times
-        parts.append(between(np.append(times[times < end], end), steps, most))
-    return np.unique(np.concatenate(parts))
-
-
 def between(ends: FloatArray, steps: int, most: int = MAX_PIECES) -> FloatArray:
     """The ``ends`` (n,) of steps with times between them, in a run of ``steps`` steps."""
-    pieces = max(
-        1, min(max(PIECES_PER_STEP, -(-MIN_PIECES // max(1, steps))), most // max(1, steps))
-    )
+    steps = max(1, steps)
+    pieces = max(1, min(max(PIECES_PER_STEP, -(-MIN_PIECES // steps)), most // steps))
     inside = np.arange(pieces) / pieces
     return np.append(ends[:-1, None] + np.diff(ends)[:, None] * inside, ends[-1])
 
 
-def broken(
-    solution: SimulationResult, t: FloatArray, values: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """``t`` (n,) and ``values`` (n, ...) with a gap (nan) at each jump."""
-    at = np.searchsorted(t, jumps(solution))
-    return np.insert(t, at, np.nan), np.insert(values, at, np.nan, axis=0)
+def with_gaps(solution: SimulationResult, t: FloatArray, values: FloatArray) -> FloatArray:
+    """``values`` (n,) at increasing times ``t`` (n,) s, with a nan before each jump."""
+    return np.insert(values, np.searchsorted(t, jumps(solution)), np.nan)
 
 
 def thinned(t: FloatArray, values: FloatArray) -> IndexArray:

@@ -13,7 +13,6 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.mobility import IdleMotion
-from tests.dynamics.constraints.test_structure import bricard
 from tests.model.test_joint_closures import Tree
 from tests.support.mechanisms import floating_ring
 
@@ -60,7 +59,7 @@ def test_a_parallelogram_on_three_cranks_moves_against_both_counts() -> None:
 
 
 def test_bricards_linkage_moves_although_the_count_says_it_cannot() -> None:
-    mechanism = bricard()
+    mechanism = srm.load("bricard")
     assert counts(mechanism) == (0, None, 4, 1)
     found = mechanism.mobility
     assert found.pivoted_redundancy == 1

@@ -15,7 +15,13 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs.dynamics.constraints import row_algebra as ranks
 from srm_mbs.dynamics.constraints import structure
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.constraints.projection import cholesky, pivoted_qr, unwhiten, whiten
+from srm_mbs.dynamics.constraints.projection import (
+    cholesky,
+    pivoted_qr,
+    symmetric,
+    unwhiten,
+    whiten,
+)
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import (
     RowAlgebra,
@@ -25,7 +31,7 @@ from srm_mbs.dynamics.constraints.row_algebra import (
 )
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.errors import EvaluationError
-from srm_mbs.formats import generators
+from srm_mbs.formats.load import n_four_bar_texts
 from srm_mbs.integration.kernel import backend
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring, floating_slider_crank
@@ -56,6 +62,13 @@ class BySingularValues:
         return unwhiten(self.U, self.left[:, used] @ inside)
 
 
+def algebra_by(choice: str, pattern: np.ndarray, model: pin.Model | None = None) -> RowAlgebra:
+    """The algebra of LAPACK or of the kernel, whatever the number of coordinates."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ranks, "KERNEL_ABOVE", 0 if choice == "kernel" else pattern.shape[1])
+        return row_algebra(pattern, model)
+
+
 def rows_of(n: int = 0) -> tuple[pin.Model, np.ndarray, np.ndarray]:
     """Model, M and G of an N-four-bar in an open configuration; of a floating ring for n = 0."""
     mechanism = srm.n_four_bar(n) if n else floating_ring()
@@ -63,12 +76,10 @@ def rows_of(n: int = 0) -> tuple[pin.Model, np.ndarray, np.ndarray]:
     move = 0.3 * np.random.default_rng(1).standard_normal(model.nv)
     q = pin.integrate(model, mechanism.q0, move)
     data = model.createData()
-    pin.crba(model, data, q, pin.Convention.WORLD)
     rows = DrivenKinematics(model, mechanism.loops, ())
-    rows.update(data, q, with_bias=False)
+    rows.evaluate(model, data, q)
     assert not rows.G[~rows.pattern()].any()
-    M = np.triu(data.M)
-    return model, M + np.triu(M, 1).T, rows.G.copy()
+    return model, symmetric(data.M), rows.G.copy()
 
 
 # --- the factorisation --------------------------------------------------------------------------
@@ -78,7 +89,7 @@ def rows_of(n: int = 0) -> tuple[pin.Model, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("n", [0, 3, 12])
 def test_what_the_rows_do_not_see_and_the_shortest_solution(n: int, choice: str) -> None:
     model, M, G = rows_of(n)
-    algebra = row_algebra(G != 0.0, model, choice)
+    algebra = algebra_by(choice, G != 0.0, model)
     algebra.factor(M, G)
     rng = np.random.default_rng(2)
     w, g = rng.standard_normal(model.nv), G @ rng.standard_normal(model.nv)
@@ -95,11 +106,11 @@ def test_what_the_rows_do_not_see_and_the_shortest_solution(n: int, choice: str)
     np.testing.assert_allclose(algebra.row_squares, (white**2).sum(axis=0), atol=1e-12)
 
 
-@choices
+@with_kernel
 @pytest.mark.parametrize("n", [0, 3, 12])
-def test_with_the_metric_one_its_parts_are_orthonormal_and_transposed(n: int, choice: str) -> None:
+def test_with_the_metric_one_its_parts_are_orthonormal_and_transposed(n: int) -> None:
     _, _, G = rows_of(n)
-    algebra = row_algebra(G != 0.0, choice=choice)
+    algebra: Any = algebra_by("kernel", G != 0.0)
     algebra.factor(None, G)
     basis = algebra.complement()
     assert basis.shape == (G.shape[1], G.shape[1] - algebra.rank)
@@ -115,11 +126,9 @@ def test_with_the_metric_one_its_parts_are_orthonormal_and_transposed(n: int, ch
 @pytest.mark.parametrize("n", [3, 12, 40])
 def test_both_choose_the_same_pivots_and_cut_them_alike(n: int, cut: float) -> None:
     model, M, G = rows_of(n)
-    found: list[RowAlgebra] = []
-    for choice in ("dense", "kernel"):
-        found.append(row_algebra(G != 0.0, model, choice))
-        found[-1].factor(M, G, cut)
-    dense, compiled = found
+    dense, compiled = (algebra_by(choice, G != 0.0, model) for choice in ("dense", "kernel"))
+    for algebra in (dense, compiled):
+        algebra.factor(M, G, cut)
     assert compiled.rank == dense.rank
     assert np.abs(compiled.pivots - dense.pivots).max() < 1e-12
     w = np.random.default_rng(4).standard_normal(model.nv)
@@ -134,11 +143,9 @@ def test_both_leave_redundant_rows_of_a_long_chain_out(cut: float) -> None:
     G = G[np.abs(G).max(axis=1) > 0.0]
     again = G[:-1:3] + G[1::3] if len(G) % 3 != 1 else G[:-1:3][: len(G[1::3])] + G[1::3]
     G = np.concatenate([G, G[::4], again])
-    found: list[RowAlgebra] = []
-    for choice in ("dense", "kernel"):
-        found.append(row_algebra(G != 0.0, model, choice))
-        found[-1].factor(M, G, cut)
-    dense, compiled = found
+    dense, compiled = (algebra_by(choice, G != 0.0, model) for choice in ("dense", "kernel"))
+    for algebra in (dense, compiled):
+        algebra.factor(M, G, cut)
     rank = int(np.linalg.matrix_rank(G))
     assert dense.rank == rank
     assert compiled.rank == rank
@@ -151,7 +158,7 @@ def test_both_leave_redundant_rows_of_a_long_chain_out(cut: float) -> None:
 @choices
 def test_what_cannot_be_factorised_is_refused_with_a_reason(choice: str) -> None:
     model, M, G = rows_of(3)
-    algebra = row_algebra(G != 0.0, model, choice)
+    algebra = algebra_by(choice, G != 0.0, model)
     with pytest.raises(EvaluationError, match="mass matrix"):
         algebra.factor(M - 10.0 * np.eye(len(M)), G)
     broken = G.copy()
@@ -165,7 +172,7 @@ def test_what_cannot_be_factorised_is_refused_with_a_reason(choice: str) -> None
 @with_kernel
 def test_arrays_of_another_size_are_refused() -> None:
     _, M, G = rows_of(3)
-    algebra: Any = row_algebra(G != 0.0, choice="kernel")
+    algebra: Any = algebra_by("kernel", G != 0.0)
     with pytest.raises(ValueError, match="rows, nv"):
         algebra.factor(M, G[:-1])
     algebra.factor(M, G)
@@ -192,7 +199,7 @@ def test_the_factors_of_a_chain_grow_with_its_loops(angle: float) -> None:
     for four times the loops."""
     entries = []
     for n in (80, 320):
-        model = pin.buildModelFromXML(generators.n_four_bar(n)[1])
+        model = pin.buildModelFromXML(n_four_bar_texts(n)[1])
         tip = {"xyz": (1.0, 0.0, 0.0)}
         loops = [
             srm.LoopClosure(
@@ -206,8 +213,7 @@ def test_the_factors_of_a_chain_grow_with_its_loops(angle: float) -> None:
         q = np.array([angle if name.startswith("crank") else -angle for name in model.names[1:]])
         rows = LoopKinematics(model, loops, keep=np.tile([True, False, True], n))
         data = workspace(model)
-        pin.crba(model, data, q, pin.Convention.WORLD)
-        rows.update(data, q, with_bias=False)
+        rows.evaluate(model, data, q)
         algebra: Any = row_algebra(rows.pattern(), model)
         algebra.factor(data.M, rows.G)
         assert algebra.rank == 2 * n

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -13,11 +12,20 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure
+from srm_mbs.dynamics.constraints.projection import symmetric
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.constraints.structure import ManifoldSampler, Structure, analyse
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from tests.support.bundled import load
-from tests.support.mechanisms import along_x, floating_ring, rescaled, rod
+from tests.support.mechanisms import (
+    add_link,
+    along_x,
+    floating_ring,
+    rescaled,
+    rod,
+    start_terms,
+    with_slider_mass,
+)
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
@@ -121,7 +129,7 @@ def test_the_structure_is_found_once_and_kept_with_another_state() -> None:
 @pytest.mark.parametrize("name", CLOSED_MODELS)
 def test_sigma_of_the_start_is_about_one_and_its_rank_is_the_structural_one(name: str) -> None:
     mechanism = load(name)
-    terms = make_system(mechanism).evaluate(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
+    terms = start_terms(mechanism)
     assert 0.1 < terms.sigma < 10.0
     assert terms.rank == mechanism.structure.rank
 
@@ -150,8 +158,7 @@ def test_a_singular_start_gives_the_rank_of_a_regular_one(case: str, moving: boo
     assert found.redundant_rows == regular.redundant_rows
     assert found.notes == ()
     assert 0.25 < found.sigma_ref / regular.sigma_ref < 4.0
-    system = make_system(mechanism)
-    assert system.evaluate(0.0, np.concatenate([mechanism.q0, mechanism.v0])).sigma < 1e-14
+    assert start_terms(mechanism).sigma < 1e-14
 
 
 @pytest.mark.parametrize("name", CLOSED_MODELS)
@@ -165,48 +172,9 @@ def test_an_open_start_gives_the_rank_of_a_closed_one(name: str) -> None:
 # --- redundancy ---------------------------------------------------------------------------------
 
 
-BRICARD_RATES = np.array([0.9, -0.9, 0.9, -0.9, 0.9])
-"""Rates (rad/s) of its only motion where it starts."""
-
-
-def bricard() -> srm.Mechanism:
-    """Bricard's 6R loop of unit bars, cut at the last hinge: rank 4 on closed configurations."""
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1.0]])
-    axes = np.eye(3)[[1, 2, 0, 1, 2]]
-    model = pin.Model()
-    parent, previous = 0, np.zeros(3)
-    for i, (start, end) in enumerate(pairwise(corners)):
-        bar = end - start
-        at = pin.SE3(np.eye(3), start - previous)
-        parent = model.addJoint(parent, pin.JointModelRevoluteUnaligned(axes[i]), at, f"hinge_{i}")
-        inertia = (np.eye(3) - 0.99 * np.outer(bar, bar)) / 12.0
-        model.appendBodyToJoint(parent, pin.Inertia(1.0, bar / 2.0, inertia), pin.SE3.Identity())
-        model.addBodyFrame(f"bar_{i}", parent, pin.SE3.Identity(), 0)
-        previous = start
-    end = tuple(corners[5] - corners[4])
-    loop = srm.LoopClosure(
-        "revolute",
-        srm.Anchor("bar_4", xyz=end),
-        srm.Anchor("world", xyz=tuple(corners[5])),
-        (1, 0, 0),
-        name="last",
-    )
-    return srm.Mechanism(model, (loop,))
-
-
-def test_bricards_linkage_moves_and_drops_no_row_statically() -> None:
-    mechanism = bricard()
-    assert mechanism.structure.rank == 4
-    assert mechanism.degrees_of_freedom == 1
-    assert mechanism.redundant_rows == ()
-    assert mechanism.structure.pivoted_redundancy == 1
-    assert mechanism.structure.notes == ()
-
-
 def test_open_configurations_would_give_bricards_linkage_a_wrong_rank() -> None:
     """Why the rank is measured on closed configurations only."""
-    mechanism = bricard()
-    system = ClosedSystem(mechanism)
+    system = ClosedSystem(load("bricard"))
     rng = np.random.default_rng(0)
     for _ in range(5):
         state = np.concatenate([rng.uniform(-1, 1, 5), np.zeros(5)])
@@ -215,8 +183,8 @@ def test_open_configurations_would_give_bricards_linkage_a_wrong_rank() -> None:
 
 
 def test_bricards_linkage_keeps_its_rank_along_its_motion() -> None:
-    mechanism = bricard()
-    run = srm.simulate(mechanism.with_state(mechanism.q0, BRICARD_RATES), 2.0, rtol=1e-8)
+    mechanism = load("bricard")
+    run = srm.simulate(mechanism, 2.0, rtol=1e-8)
     assert run.success
     assert run.drift[:, 0].max() < 1e-9
     assert np.ptp(run.energy) < 1e-5
@@ -232,29 +200,16 @@ def test_duplicated_loops_change_neither_rank_nor_motion(name: str) -> None:
     rank = mechanism.structure.rank
     assert doubled.structure.rank == rank
     assert doubled.structure.pivoted_redundancy == rank
-    state = np.concatenate([mechanism.q0, mechanism.v0])
-    assert_close(
-        make_system(doubled).evaluate(0.0, state).rate(),
-        make_system(mechanism).evaluate(0.0, state).rate(),
-        atol=1e-11,
-    )
+    assert_close(start_terms(doubled).rate(), start_terms(mechanism).rate(), atol=1e-11)
 
 
-def four_bar(
-    loop: srm.LoopClosure, pose: pin.SE3 | None = None, axis: tuple[float, ...] = (0.0, -1.0, 0.0)
-) -> srm.Mechanism:
+def four_bar(loop: srm.LoopClosure, pose: pin.SE3) -> srm.Mechanism:
     """The bundled four_bar's bars in any pose, closed by ``loop`` between coupler and rocker."""
-    pose = pin.SE3.Identity() if pose is None else pose
     model = pin.Model()
-    hinge = pin.JointModelRevoluteUnaligned(np.array(axis))
-    crank = model.addJoint(0, hinge, pose, "crank")
-    coupler = model.addJoint(crank, hinge, along_x(1.0), "coupler")
-    rocker = model.addJoint(0, hinge, pose * along_x(2.2), "rocker")
-    for name, joint, length in (("crank", crank, 1.0), ("coupler", coupler, 2.0)):
-        model.appendBodyToJoint(joint, rod(length, length), pin.SE3.Identity())
-        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
-    model.appendBodyToJoint(rocker, rod(1.5, 1.5), pin.SE3.Identity())
-    model.addBodyFrame("rocker", rocker, pin.SE3.Identity(), 0)
+    hinge = pin.JointModelRevoluteUnaligned(np.array([0.0, -1.0, 0.0]))
+    crank = add_link(model, 0, hinge, "crank", at=pose)
+    add_link(model, crank, hinge, "coupler", rod(2.0, 2.0), along_x(1.0))
+    add_link(model, 0, hinge, "rocker", rod(1.5, 1.5), pose * along_x(2.2))
     return srm.Mechanism(model, (loop,), q0=np.array([1.0, -0.674, 1.413]))
 
 
@@ -316,14 +271,6 @@ def test_a_loop_that_is_always_satisfied_has_rank_zero_and_no_algebra(pose: str,
     assert system.factorisations == 0
 
 
-def posed_rate(mechanism: srm.Mechanism, pose: str, v: np.ndarray) -> np.ndarray:
-    """Joint accelerations at the start's configuration, gravity turned with the mechanism."""
-    model = mechanism.model.copy()
-    model.gravity.linear = POSES[pose].rotation @ np.array([0.0, 0.0, -9.81])
-    turned = srm.Mechanism(model, mechanism.loops, mechanism.q0, v)
-    return make_system(turned).evaluate(0.0, np.concatenate([turned.q0, v])).rate()[model.nv :]
-
-
 @every_pose
 @every_turn
 @pytest.mark.parametrize("kind", ["point", "revolute"])
@@ -333,9 +280,10 @@ def test_a_four_bar_moves_alike_in_every_pose_and_with_every_closure(
     flat = load("four_bar")
     axis = None if kind == "point" else NORMAL
     mechanism = four_bar(tip_loop(kind, TURNS[turn], axis), POSES[pose])
-    closed = srm.Mechanism(mechanism.model, mechanism.loops, flat.q0)
-    expected = make_system(flat).evaluate(0.0, np.concatenate([flat.q0, flat.v0])).rate()[3:]
-    assert_close(posed_rate(closed, pose, flat.v0), expected, atol=1e-9)
+    model = mechanism.model.copy()
+    model.gravity.linear = POSES[pose].rotation @ np.array([0.0, 0.0, -9.81])
+    posed = srm.Mechanism(model, mechanism.loops, flat.q0, flat.v0)
+    assert_close(start_terms(posed).rate()[3:], start_terms(flat).rate()[3:], atol=1e-9)
 
 
 @every_pose
@@ -349,13 +297,10 @@ def test_a_coupler_cut_in_two_and_welded_moves_like_the_whole_one(pose: str, tur
     model = pin.Model()
     model.gravity.linear = POSES[pose].rotation @ np.array([0.0, 0.0, -9.81])
     hinge = pin.JointModelRevoluteUnaligned(np.array([0.0, -1.0, 0.0]))
-    first = model.addJoint(0, hinge, POSES[pose], "crank")
-    first_half = model.addJoint(first, hinge, along_x(1.0), "first_half")
-    second = model.addJoint(0, hinge, POSES[pose] * along_x(2.2), "rocker")
-    second_half = model.addJoint(second, hinge, along_x(1.5), "second_half")
-    for joint, length in ((first, 1.0), (first_half, 1.0), (second, 1.5), (second_half, 1.0)):
-        model.appendBodyToJoint(joint, rod(length, length), pin.SE3.Identity())
-        model.addBodyFrame(model.names[joint], joint, pin.SE3.Identity(), 0)
+    first = add_link(model, 0, hinge, "crank", at=POSES[pose])
+    add_link(model, first, hinge, "first_half", at=along_x(1.0))
+    second = add_link(model, 0, hinge, "rocker", rod(1.5, 1.5), POSES[pose] * along_x(2.2))
+    add_link(model, second, hinge, "second_half", at=along_x(1.5))
     tip = (1.0, 0.0, 0.0)
     a = srm.Anchor("first_half", xyz=tip, rpy=tuple(pin.rpy.matrixToRpy(TURNS[turn])))
     b = srm.Anchor("second_half", xyz=tip, rpy=tuple(pin.rpy.matrixToRpy(half @ TURNS[turn])))
@@ -369,22 +314,19 @@ def test_a_coupler_cut_in_two_and_welded_moves_like_the_whole_one(pose: str, tur
     )
     assert (mechanism.structure.rank, mechanism.degrees_of_freedom) == (3, 1)
     assert mechanism.structure.notes == ()
-    found = make_system(mechanism).evaluate(0.0, np.concatenate([mechanism.q0, v])).rate()[4:]
-    whole = make_system(flat).evaluate(0.0, np.concatenate([flat.q0, flat.v0])).rate()[3:]
-    assert_close(found[:3], whole, atol=1e-9)
+    found, whole = start_terms(mechanism).rate(), start_terms(flat).rate()
+    assert_close(found[4:7], whole[3:], atol=1e-9)
 
 
 @every_pose
 def test_a_point_on_a_hinges_own_axis_is_no_constraint(pose: str) -> None:
     model = pin.Model()
     axis = np.array([0.6, 0.0, 0.8])
-    joint = model.addJoint(0, pin.JointModelRevoluteUnaligned(axis), POSES[pose], "hinge")
-    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
-    model.addBodyFrame("bar", joint, pin.SE3.Identity(), 0)
+    add_link(model, 0, pin.JointModelRevoluteUnaligned(axis), "hinge", at=POSES[pose])
     point = 1.7 * axis
     loop = srm.LoopClosure(
         "point",
-        srm.Anchor("bar", xyz=tuple(point)),
+        srm.Anchor("hinge", xyz=tuple(point)),
         srm.Anchor("world", xyz=tuple(POSES[pose].act(point))),
         name="bearing",
     )
@@ -397,15 +339,12 @@ def test_a_truss_has_no_degree_of_freedom() -> None:
     """Two bars from the ground that meet at their tips."""
     model = pin.Model()
     for name, at in (("left", 0.0), ("right", 1.0)):
-        joint = model.addJoint(0, pin.JointModelRY(), along_x(at), name)
-        model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
-        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+        add_link(model, 0, pin.JointModelRY(), name, at=along_x(at))
     tip = (1.0, 0.0, 0.0)
     loop = srm.LoopClosure("point", srm.Anchor("left", xyz=tip), srm.Anchor("right", xyz=tip))
     mechanism = srm.Mechanism(model, (loop,), q0=np.array([-np.pi / 3, -2 * np.pi / 3]))
     assert (mechanism.structure.rank, mechanism.degrees_of_freedom) == (2, 0)
-    rate = make_system(mechanism).evaluate(0.0, np.concatenate([mechanism.q0, [0.0, 0.0]])).rate()
-    assert_close(rate, 0.0, atol=1e-13)
+    assert_close(start_terms(mechanism).rate(), 0.0, atol=1e-13)
 
 
 def test_loops_that_cannot_close_give_a_note_and_no_exception() -> None:
@@ -431,13 +370,7 @@ def test_a_narrow_gap_between_independent_and_redundant_pivots_is_told(
 
 @pytest.mark.parametrize("mass", [1e-6, 1e-3, 1e3, 1e6])
 def test_a_very_light_or_heavy_body_does_not_change_the_rank(mass: float) -> None:
-    mechanism = load("slider_crank_slider")
-    model = mechanism.model.copy()
-    slider = model.getJointId("slider")
-    inertia = model.inertias[slider]
-    factor = mass / inertia.mass
-    model.inertias[slider] = pin.Inertia(mass, inertia.lever, factor * inertia.inertia)
-    found = srm.Mechanism(model, mechanism.loops, mechanism.q0, mechanism.v0).structure
+    found = with_slider_mass(mass).structure
     assert (found.rank, found.redundant_rows, found.notes) == (2, ("pin.y",), ())
 
 
@@ -457,7 +390,7 @@ def test_units_that_are_powers_of_four_change_no_bit_of_sigma(
     assert scaled.structure.rank == plain.structure.rank
     assert scaled.redundant_rows == plain.redundant_rows
     assert scaled.structure.sigma_ref == plain.structure.sigma_ref
-    assert start_sigma(scaled) == start_sigma(plain)
+    assert start_terms(scaled).sigma == start_terms(plain).sigma
 
 
 @pytest.mark.parametrize("scale", ROUNDED, ids=str)
@@ -471,24 +404,17 @@ def test_other_units_change_sigma_by_rounding_only(name: str, scale: dict[str, f
     # Bricard's five rows are symmetric: rounding decides which of them the pivots leave out.
     rel = 1e-2 if name == "bricard" else 1e-6
     assert scaled.structure.sigma_ref == pytest.approx(plain.structure.sigma_ref, rel=rel)
-    assert start_sigma(scaled) == pytest.approx(start_sigma(plain), rel=rel)
-
-
-def start_sigma(mechanism: srm.Mechanism) -> float:
-    state = np.concatenate([mechanism.q0, mechanism.v0])
-    return make_system(mechanism).evaluate(0.0, state).sigma
+    assert start_terms(scaled).sigma == pytest.approx(start_terms(plain).sigma, rel=rel)
 
 
 @every_pose
 def test_the_pose_of_the_mechanism_changes_sigma_little(pose: str) -> None:
-    upright = four_bar(tip_loop("point", np.eye(3)))
-    posed = four_bar(tip_loop("point", np.eye(3)), POSES[pose])
+    upright, posed = (four_bar(tip_loop("point", np.eye(3)), POSES[at]) for at in ("upright", pose))
     assert posed.structure.sigma_ref == pytest.approx(upright.structure.sigma_ref, rel=1e-6)
 
 
 def test_row_scales_are_the_same_for_all_rows_of_one_kind_in_a_closure() -> None:
-    mechanism = bricard()
-    scale = mechanism.structure.row_scale
+    scale = load("bricard").structure.row_scale
     assert len(set(scale[:3])) == 1
     assert len(set(scale[3:])) == 1
     assert (scale > 0.0).all()
@@ -509,10 +435,9 @@ def test_row_scales_are_the_size_of_the_whitened_rows_over_open_configurations(
     for _ in range(count):
         spread = rng.uniform(-np.pi, np.pi, model.nv) * units.coordinate
         q = pin.integrate(model, mechanism.q0, spread)
-        M = np.triu(pin.crba(model, data, q, pin.Convention.WORLD))
-        M = M + np.triu(M, 1).T
-        rows.update(data, q, with_bias=False)
-        squares += np.einsum("ij,ji->i", rows.G, np.linalg.solve(M, rows.G.T)) / count
+        rows.evaluate(model, data, q)
+        inverse = np.linalg.solve(symmetric(data.M), rows.G.T)
+        squares += np.einsum("ij,ji->i", rows.G, inverse) / count
     # All bundled closures have position rows only: one kind in each.
     start = 0
     for loop in mechanism.loops:
@@ -544,18 +469,17 @@ def test_rows_are_balanced_where_the_last_pivot_would_be_small_everywhere(
 @pytest.mark.parametrize("name", ["bricard", "delta_robot", "squeezing_mechanism", "n_four_bar_40"])
 def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: str) -> None:
     mechanism = load(name)
-    walker = ManifoldSampler(mechanism, mechanism.structure.units)
-    walker.set_scale(mechanism, np.random.default_rng(0))
-    q = next(walker.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
-    found = walker.distances(q)
+    sampler = ManifoldSampler(mechanism, mechanism.structure.units)
+    sampler.set_scale(np.random.default_rng(0))
+    q = next(sampler.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
+    found = sampler.distances(q)
     used = np.flatnonzero(np.isfinite(found))
     assert len(used) == mechanism.structure.rank
     model, data = mechanism.model, mechanism.model.createData()
     rows = LoopKinematics(model, mechanism.loops)
-    M = np.triu(pin.crba(model, data, q, pin.Convention.WORLD))
-    rows.update(data, q, with_bias=False)
-    L = np.linalg.cholesky(M + np.triu(M, 1).T)
-    W = np.linalg.solve(L, (rows.G / walker.scale[:, None]).T)[:, used]
+    rows.evaluate(model, data, q)
+    L = np.linalg.cholesky(symmetric(data.M))
+    W = np.linalg.solve(L, (rows.G / sampler.scale[:, None]).T)[:, used]
     for k, distance in enumerate(found[used]):
         others = np.delete(W, k, axis=1)
         nearest = others @ np.linalg.lstsq(others, W[:, k], rcond=None)[0]

@@ -10,10 +10,9 @@ import pinocchio as pin
 import pytest
 import tomli_w
 
-import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.forces import ForceKinematics
-from srm_mbs.formats.toml.description import parse_description
+from srm_mbs.formats.toml.description import check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.shapes import visuals_of
@@ -26,6 +25,7 @@ from tests.support.mjcf_files import (
     TWO,
     TWO_LOOPS,
     file,
+    loaded,
     model_of,
     translated,
 )
@@ -52,7 +52,7 @@ class Twins:
         self.model.gravity.linear = np.array(made.entries["gravity"])
         keys = {key: value for key, value in made.entries.items() if key != "loop"}
         toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})
-        forces = parse_description(toml, "x.toml").force_elements(None)
+        forces = check_description(parse_toml(toml, ""), "").force_elements(None)
         self.forces = ForceKinematics(self.model, forces)
         self.theirs = mujoco.MjModel.from_xml_string(text)
         self.theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -61,6 +61,7 @@ class Twins:
     def put(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Both in the state (q, v) of ours; returns T (nv, nv): their rates are T times ours, up
         to what :meth:`bias` adds for a free joint."""
+        self.q = q
         model, theirs, state = self.model, self.theirs, self.state
         T = np.zeros((model.nv, model.nv))
         for i in range(theirs.njnt):
@@ -114,8 +115,6 @@ class Twins:
                 out.append(np.array([np.sin(0.5 * angle)]))
         return out
 
-    q: FloatArray
-
 
 def random_states(twins: Twins, count: int = 5) -> list[tuple[FloatArray, FloatArray]]:
     model = twins.model
@@ -160,7 +159,6 @@ def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> Non
     state = twins.state
     for q, v in random_states(twins):
         twins.put(q, v)
-        twins.q = q
         expected = []
         kind = state.efc_type[: state.nefc]
         rows = state.efc_pos[: state.nefc][kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
@@ -180,9 +178,8 @@ def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> Non
 @pytest.mark.parametrize("name", FILES)
 def test_each_file_loads_closes_and_runs_alike_on_both_backends(name: str, tmp_path: Path) -> None:
     """With armatures and dampers, which both must see."""
-    path = tmp_path / "robot.xml"
-    path.write_text(FILES[name].replace('axis="0 1 0"', 'axis="0 1 0" armature="0.2" damping="1"'))
-    mechanism = srm.load(path)
+    acting = 'axis="0 1 0" armature="0.2" damping="1"'
+    mechanism = loaded(tmp_path, FILES[name].replace('axis="0 1 0"', acting))
     assert mechanism.model.armature.any()
     agree(compare(mechanism, 0.5, rtol=1e-10))
 
@@ -213,11 +210,10 @@ def test_one_free_body_is_a_floating_robot_at_its_pose(tmp_path: Path) -> None:
     body = BODY.format("base", "x").replace('<joint name="x"/>', "<freejoint/>")
     body = body.replace('name="base"', 'name="base" pos="1 2 3" euler="10 20 30"')
     arm = BODY.format("arm", "j")
-    path = tmp_path / "robot.xml"
-    path.write_text(file(body.replace("</body>", arm + "</body>")))
-    mechanism = srm.load(path)
+    text = file(body.replace("</body>", arm + "</body>"))
+    mechanism = loaded(tmp_path, text)
     assert mechanism.joint_names == ("root_joint", "j")
-    theirs = mujoco.MjModel.from_xml_string(path.read_text())
+    theirs = mujoco.MjModel.from_xml_string(text)
     state = mujoco.MjData(theirs)
     mujoco.mj_forward(theirs, state)
     data = mechanism.model.createData()
@@ -231,14 +227,13 @@ def test_one_free_body_is_a_floating_robot_at_its_pose(tmp_path: Path) -> None:
 def test_the_inertia_of_an_exact_mesh_is_that_of_mujoco(tmp_path: Path) -> None:
     mesh = cassie("cassie").parents[1] / "meshes" / "knee.stl"
     geom = '<geom type="mesh" mesh="knee" pos="0.1 0 0" euler="30 0 0" density="500"/>'
-    path = tmp_path / "robot.xml"
-    path.write_text(
-        '<mujoco><asset><mesh name="knee" inertia="exact" scale="1 2 1" '
-        f'file="{mesh}"/></asset><worldbody><body name="knee"><joint name="j"/>{geom}</body>'
-        '<body name="wall"><geom type="mesh" mesh="knee"/></body></worldbody></mujoco>'
+    text = file(
+        f'<body name="knee"><joint name="j"/>{geom}</body>'
+        '<body name="wall"><geom type="mesh" mesh="knee"/></body>',
+        f'<asset><mesh name="knee" inertia="exact" scale="1 2 1" file="{mesh}"/></asset>',
     )
-    theirs = mujoco.MjModel.from_xml_path(str(path))
-    inertia = srm.load(path).model.inertias[1]
+    theirs = mujoco.MjModel.from_xml_string(text)
+    inertia = loaded(tmp_path, text).model.inertias[1]
     np.testing.assert_allclose(inertia.mass, theirs.body_mass[1], rtol=1e-12)
     np.testing.assert_allclose(inertia.lever, theirs.body_ipos[1], atol=1e-12)
     np.testing.assert_allclose(
@@ -261,19 +256,18 @@ def test_a_mesh_that_is_moved_first_is_drawn_where_mujoco_has_it(
     sides = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
     (tmp_path / "tetra.obj").write_text(vertices + sides)
-    path = tmp_path / "robot.xml"
-    path.write_text(
-        f'<mujoco><asset><mesh name="t" file="tetra.obj" {moved}/></asset><worldbody>'
+    text = file(
         '<body name="b" pos="0 0 1"><joint name="j"/><inertial pos="0 0 0" mass="1" '
         'diaginertia="1 1 1"/><geom type="mesh" mesh="t" pos="0.1 0.2 0.3" quat="0.8 0 0.6 0"/>'
-        "</body></worldbody></mujoco>"
+        "</body>",
+        f'<asset><mesh name="t" file="tetra.obj" {moved}/></asset>',
     )
-    model = mujoco.MjModel.from_xml_path(str(path))
+    mechanism = loaded(tmp_path, text)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
     state = mujoco.MjData(model)
     mujoco.mj_forward(model, state)
     own = model.mesh_vert.reshape(-1, 3)
     theirs = state.geom_xpos[0] + own @ state.geom_xmat[0].reshape(3, 3).T
-    mechanism = srm.load(path)
     (visual,) = visuals_of(mechanism)
     data = mechanism.model.createData()
     pin.forwardKinematics(mechanism.model, data, mechanism.q0)
@@ -285,12 +279,9 @@ def test_a_mesh_that_is_moved_first_is_drawn_where_mujoco_has_it(
 
 
 def test_what_a_mesh_cannot_be_drawn_with_is_noted(tmp_path: Path) -> None:
-    path = tmp_path / "robot.xml"
-    path.write_text(
-        '<mujoco><asset><mesh name="t" file="t.obj" refquat="1 1 0 0" scale="1 2 1"/></asset>'
-        f"<worldbody>{BODY.format('one', 'j')}</worldbody></mujoco>"
-    )
-    assert any("refquat and an unequal scale" in note for note in srm.load(path).notes)
+    asset = '<asset><mesh name="t" file="t.obj" refquat="1 1 0 0" scale="1 2 1"/></asset>'
+    notes = loaded(tmp_path, file(more=asset)).notes
+    assert any("refquat and an unequal scale" in note for note in notes)
 
 
 @pytest.mark.parametrize("sequence", ["xyz", "XYZ", "zYx", "XyZ", "yXy"])

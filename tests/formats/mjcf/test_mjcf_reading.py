@@ -11,7 +11,7 @@ import pinocchio as pin
 
 import srm_mbs as srm
 from srm_mbs.formats.mjcf import attributes
-from tests.support.mjcf_files import BODY, TWO, file, model_of, translated
+from tests.support.mjcf_files import BODY, TWO, file, loaded, model_of, translated
 from tests.support.snapshots import check_messages, refused
 
 
@@ -29,10 +29,8 @@ def test_an_inactive_constraint_is_left_out_with_a_note() -> None:
 
 
 def test_a_joint_equality_alone_locks_the_joint_where_it_says(tmp_path: Path) -> None:
-    text = file(more='<equality><joint joint1="j" polycoef="0.3 0 0 0 0"/></equality>')
-    path = tmp_path / "robot.xml"
-    path.write_text(text)
-    mechanism = srm.load(path)
+    equality = '<equality><joint joint1="j" polycoef="0.3 0 0 0 0"/></equality>'
+    mechanism = loaded(tmp_path, file(more=equality))
     assert mechanism.joint_names == ("k",)
     model = mechanism.model
     frame = model.frames[model.getFrameId("one", pin.FrameType.BODY)]
@@ -48,9 +46,8 @@ def test_limits_count_from_the_pose_of_the_file() -> None:
 
 def test_included_files_stand_in_the_place_of_the_include(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(f"<mujocoinclude>{BODY.format('one', 'j')}</mujocoinclude>")
-    path = tmp_path / "robot.xml"
-    path.write_text(file('<include file="arm.xml"/>' + BODY.format("two", "k")))
-    assert srm.load(path).joint_names == ("j", "k")
+    text = file('<include file="arm.xml"/>' + BODY.format("two", "k"))
+    assert loaded(tmp_path, text).joint_names == ("j", "k")
 
 
 def test_what_gives_no_force_is_noted() -> None:

@@ -121,7 +121,7 @@ def test_the_page_of_formats_tells_of_every_element_that_is_known() -> None:
         *(sdf_module.WORLD_READ, sdf_module.WORLD_IGNORED),
         *(sdf_links.LINK_READ, sdf_links.LINK_IGNORED, sdf_links.INERTIAL_READ),
         *(joints.JOINT_READ, joints.JOINT_IGNORED, joints.AXIS_READ),
-        *(joints.DYNAMICS_READ, joints.LIMIT_READ, joints.LIMIT_IGNORED),
+        *(joints.DYNAMICS.values(), joints.LIMITS.values(), joints.LIMIT_IGNORED),
     )
     missing = [tag for tags in lists for tag in tags if f"<{tag}" not in page]
     missing += [kind for kind in joints.TYPES if f"`{kind}`" not in page]

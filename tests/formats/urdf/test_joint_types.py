@@ -14,10 +14,11 @@ from scipy.integrate import solve_ivp
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.integration.kernel import backend
-from tests.formats.test_loading import mass_matrix, placement
 from tests.integration.kernel.test_kernel import agree
+from tests.support.dynamics import mass_matrix
 from tests.support.lockstep import compare
 from tests.support.snapshots import check_messages, refused
+from tests.support.urdf_files import LINK, placement, text
 
 PITCH = 0.3  # m per turn
 AXIS, AXIS2 = (2.0, 1.0, 2.0), (0.0, -3.0, 4.0)
@@ -27,10 +28,6 @@ PLACES = {
     "hinge": ((0.3, 0.1, 0.0), (0.0, 0.2, 0.9)),
     "thread": ((0.2, 0.0, -0.1), (-0.5, 0.1, 0.3)),
 }
-LINK = """<link name="{name}"><inertial><origin xyz="0.2 {y} 0.1" rpy="0.3 0 0.1"/>
-  <mass value="{mass}"/><inertia ixx="0.03" iyy="0.05" izz="0.06" ixy="0.002" ixz="0" iyz="0.001"/>
-</inertial></link>
-"""
 MASSES = {"swivel": 1.5, "cardan": 0.8, "hinge": 0.5, "thread": 0.7}
 OWN = {
     "swivel": '<dynamics damping="0.3" friction="0.1"/>',
@@ -41,10 +38,6 @@ OWN = {
     '<dynamics damping="0.4" friction="0.05"/>',
 }
 TYPES = {"swivel": "spherical", "cardan": "universal", "hinge": "revolute", "thread": "screw"}
-
-
-def text(values: Any) -> str:
-    return " ".join(map(str, values))
 
 
 def urdf(own: dict[str, str] = OWN, types: dict[str, str] = TYPES) -> str:
@@ -73,24 +66,24 @@ def load(folder: Path, urdf_text: str, description: str = "") -> srm.Mechanism:
     return srm.load(path)
 
 
-def elementary() -> pin.Model:
-    """The same chain of Pinocchio's elementary joints: two hinges for the universal joint, a hinge
-    and a slide for the screw."""
+def elementary(*names: str) -> pin.Model:
+    """The chain of these joints as Pinocchio's elementary joints: two hinges for the universal
+    joint, a hinge and a slide for the screw."""
     model = pin.Model()
     unit = {axis: np.array(axis) / np.linalg.norm(axis) for axis in (AXIS, AXIS2)}
-    kinds: list[tuple[str, list[Any]]] = [
-        ("swivel", [pin.JointModelSpherical()]),
-        ("cardan", [pin.JointModelRevoluteUnaligned(unit[axis]) for axis in (AXIS, AXIS2)]),
-        ("hinge", [pin.JointModelRY()]),
-        ("thread", [pin.JointModelRZ(), pin.JointModelPZ()]),
-    ]
+    kinds: dict[str, list[Any]] = {
+        "swivel": [pin.JointModelSpherical()],
+        "cardan": [pin.JointModelRevoluteUnaligned(unit[axis]) for axis in (AXIS, AXIS2)],
+        "hinge": [pin.JointModelRY()],
+        "thread": [pin.JointModelRZ(), pin.JointModelPZ()],
+    }
+    tensor = np.array([[0.03, 0.002, 0.0], [0.002, 0.05, 0.001], [0.0, 0.001, 0.06]])
     parent = 0
-    for i, (name, joints) in enumerate(kinds):
+    for i, name in enumerate(names):
         at = placement(*PLACES[name])
-        for k, joint in enumerate(joints):
+        for k, joint in enumerate(kinds[name]):
             parent = model.addJoint(parent, joint, at, f"{name}_{k}")
             at = pin.SE3.Identity()
-        tensor = np.array([[0.03, 0.002, 0.0], [0.002, 0.05, 0.001], [0.0, 0.001, 0.06]])
         centre = placement((0.2, 0.1 * i, 0.1), (0.3, 0.0, 0.1))
         inertia = pin.Inertia(MASSES[name], np.zeros(3), tensor)
         model.appendBodyToJoint(parent, inertia, centre)
@@ -99,37 +92,35 @@ def elementary() -> pin.Model:
     return model
 
 
-def expanded(q: FloatArray) -> FloatArray:
-    """The elementary coordinates: the slide moves with the screw."""
-    return np.append(q, PITCH * q[-1] / (2.0 * np.pi))
+def expansion(nv: int) -> FloatArray:
+    """The elementary coordinates from the nv own ones: the slide moves with the screw, the last."""
+    return np.vstack([np.eye(nv), PITCH / (2.0 * np.pi) * np.eye(nv)[-1]])
 
 
-EXPAND = np.vstack([np.eye(7), [0.0] * 6 + [PITCH / (2.0 * np.pi)]])
+def tip_at(model: pin.Model, q: FloatArray) -> pin.SE3:
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return data.oMf[model.getFrameId("tip")].copy()
 
 
 def test_spherical_universal_and_screw_joints_are_those_of_elementary_joints(
     tmp_path: Path,
 ) -> None:
-    model, reference = load(tmp_path, urdf()).model, elementary()
+    model, reference = load(tmp_path, urdf()).model, elementary(*TYPES)
     assert list(model.names)[1:] == list(TYPES)
     assert (model.nq, model.nv) == (8, 7)
+    E = expansion(7)
     rng = np.random.default_rng(1)
     for _ in range(5):
         q = pin.integrate(model, pin.neutral(model), rng.uniform(-2.0, 2.0, 7))
         v = rng.standard_normal(7)
-        p, w = expanded(q), EXPAND @ v
-        M = EXPAND.T @ mass_matrix(reference, p) @ EXPAND
+        p, w = np.append(q, E[-1, -1] * q[-1]), E @ v
+        M = E.T @ mass_matrix(reference, p) @ E
         np.testing.assert_allclose(mass_matrix(model, q), M, atol=1e-14)
         nle = pin.nonLinearEffects(reference, reference.createData(), p, w)
         ours = pin.nonLinearEffects(model, model.createData(), q, v)
-        np.testing.assert_allclose(ours, EXPAND.T @ nle, atol=1e-13)
-        for frames, x in ((model, q), (reference, p)):
-            data = frames.createData()
-            pin.framesForwardKinematics(frames, data, x)
-            at = data.oMf[frames.getFrameId("tip")]
-            if frames is model:
-                tip = at
-        assert tip.isApprox(at, 1e-13)
+        np.testing.assert_allclose(ours, E.T @ nle, atol=1e-13)
+        assert tip_at(model, q).isApprox(tip_at(reference, p), 1e-13)
 
 
 def test_limits_damping_friction_and_the_other_joints_are_carried_over(tmp_path: Path) -> None:
@@ -150,12 +141,7 @@ def test_a_locked_joint_of_these_types_is_removed(tmp_path: Path) -> None:
     assert list(model.names)[1:] == ["swivel", "hinge"]
     q = pin.neutral(whole)
     q[4:6], q[7] = (0.3, -0.4), 2.0
-    places = []
-    for tree, at in ((whole, q), (model, pin.neutral(model))):
-        data = tree.createData()
-        pin.framesForwardKinematics(tree, data, at)
-        places.append(data.oMf[tree.getFrameId("tip")].copy())
-    assert places[0].isApprox(places[1], 1e-13)
+    assert tip_at(whole, q).isApprox(tip_at(model, pin.neutral(model)), 1e-13)
 
 
 CLOSED = """
@@ -183,23 +169,7 @@ def test_a_universal_joint_and_a_screw_move_as_scipy_says(tmp_path: Path) -> Non
     own = {"cardan": OWN["cardan"], "thread": OWN["thread"].replace('friction="0.05"', "")}
     start = "[initial]\nq = { cardan = [0.5, -0.7] }\nv = { cardan = [1.0, 2.0], thread = -3.0 }\n"
     mechanism = load(tmp_path, urdf(own, types), start)
-    model = pin.Model()
-    joint = 0
-    tensor = np.array([[0.03, 0.002, 0.0], [0.002, 0.05, 0.001], [0.0, 0.001, 0.06]])
-    for i, (name, joints) in enumerate(
-        [
-            ("cardan", [pin.JointModelRevoluteUnaligned(np.array(AXIS) / 3.0),
-                        pin.JointModelRevoluteUnaligned(np.array(AXIS2) / 5.0)]),
-            ("thread", [pin.JointModelRZ(), pin.JointModelPZ()]),
-        ]
-    ):  # fmt: skip
-        at = placement(*PLACES[name])
-        for k, kind in enumerate(joints):
-            joint = model.addJoint(joint, kind, at, f"{name}_{k}")
-            at = pin.SE3.Identity()
-        centre = placement((0.2, 0.1 * i, 0.1), (0.3, 0.0, 0.1))
-        model.appendBodyToJoint(joint, pin.Inertia(MASSES[name], np.zeros(3), tensor), centre)
-    E = np.vstack([np.eye(3), [0.0, 0.0, PITCH / (2.0 * np.pi)]])
+    model, E = elementary("cardan", "thread"), expansion(3)
     damping = np.array([0.2, 0.2, 0.4])
 
     def field(t: float, x: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from tests.formats.test_loading import closure, mass_matrix
+from tests.support.dynamics import closure, mass_matrix
 from tests.support.snapshots import check_messages, refused
 from tests.support.urdf_files import (
     AXIS,
@@ -126,28 +127,46 @@ def measured(mechanism: srm.Mechanism, q: FloatArray) -> tuple[float, float]:
     return float(np.linalg.norm(g[:split])), float(np.linalg.norm(g[split:]))
 
 
+Rows = Callable[[FloatArray], tuple[float, float]]
+"""Norms of the position and of the other rows at q (4,)."""
+
+
+def check_rows(mechanism: srm.Mechanism, expected: Rows) -> None:
+    for q in random_positions():
+        assert measured(mechanism, q) == pytest.approx(expected(q), abs=1e-12)
+
+
+def names_and_types(mechanism: srm.Mechanism) -> list[tuple[str, str]]:
+    return [(loop.name, loop.type) for loop in mechanism.loops]
+
+
+NOWHERE = ((0, 0, 0), (0, 0, 0))
+"""The frame of a link itself."""
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_a_loop_element_is_the_closure_that_it_says(case: str, tmp_path: Path) -> None:
     element, kind = CASES[case]
     mechanism = open_mechanism(write(tmp_path, tree(element)))
-    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("ring", kind)]
+    assert names_and_types(mechanism) == [("ring", kind)]
     # Drake places points, not frames.
-    ends = (
-        ((ON_SHIN[0], (0, 0, 0)), (ON_RIM[0], (0, 0, 0))) if "Drake" in case else (ON_SHIN, ON_RIM)
-    )
-    for q in random_positions():
-        assert measured(mechanism, q) == pytest.approx(gaps(kind, relative(q, *ends)), abs=1e-12)
+    ends = (ON_SHIN, ON_RIM)
+    if "Drake" in case:
+        ends = ((ON_SHIN[0], (0, 0, 0)), (ON_RIM[0], (0, 0, 0)))
+    check_rows(mechanism, lambda q: gaps(kind, relative(q, *ends)))
 
 
 def test_axes_that_differ_in_the_two_frames_are_brought_into_line(tmp_path: Path) -> None:
     """A hinge about x of one frame and y of the other; of a slider the same is an error."""
     axes = '<parent_axis xyz="1 0 0"/><child_axis xyz="0 1 0"/>'
     mechanism = open_mechanism(write(tmp_path, tree(urdfdom("revolute", axes))))
-    for q in random_positions():
+
+    def rows(q: FloatArray) -> tuple[float, float]:
         between = relative(q)
         tilt = np.linalg.norm(np.cross([1.0, 0.0, 0.0], between.rotation @ [0.0, 1.0, 0.0]))
-        expected = (np.linalg.norm(between.translation), tilt)
-        assert measured(mechanism, q) == pytest.approx(expected, abs=1e-12)
+        return np.linalg.norm(between.translation), tilt
+
+    check_rows(mechanism, rows)
     with pytest.raises(srm.InputError, match=r"'ring'.*axes.*differ"):
         srm.load(write(tmp_path, tree(urdfdom("prismatic", axes))))
 
@@ -155,11 +174,12 @@ def test_axes_that_differ_in_the_two_frames_are_brought_into_line(tmp_path: Path
 def test_the_cross_of_a_universal_closure_has_an_axis_on_either_side(tmp_path: Path) -> None:
     axes = '<parent_axis xyz="1 0 0"/><child_axis xyz="0 3 4"/>'
     mechanism = open_mechanism(write(tmp_path, tree(urdfdom("universal", axes))))
-    for q in random_positions():
+
+    def rows(q: FloatArray) -> tuple[float, float]:
         between = relative(q)
-        cross = abs(between.rotation[0] @ [0.0, 0.6, 0.8])
-        expected = (np.linalg.norm(between.translation), cross)
-        assert measured(mechanism, q) == pytest.approx(expected, abs=1e-12)
+        return np.linalg.norm(between.translation), abs(between.rotation[0] @ [0.0, 0.6, 0.8])
+
+    check_rows(mechanism, rows)
 
 
 # --- a child of two parents, and joints inside <gazebo> ----------------------------------------
@@ -187,11 +207,9 @@ def test_the_second_joint_of_a_child_becomes_a_closure(
 ) -> None:
     """Its frame on the child is the child's own: the closure is closed at the joint's zero."""
     mechanism = open_mechanism(write(tmp_path, tree(second(kind))))
-    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("second", closed)]
+    assert names_and_types(mechanism) == [("second", closed)]
     assert "second" not in mechanism.joint_names
-    for q in random_positions():
-        between = relative(q, ON_SHIN, ((0, 0, 0), (0, 0, 0)))
-        assert measured(mechanism, q) == pytest.approx(gaps(closed, between), abs=1e-12)
+    check_rows(mechanism, lambda q: gaps(closed, relative(q, ON_SHIN, NOWHERE)))
 
 
 def test_a_second_joint_that_restrains_nothing_is_left_out(tmp_path: Path) -> None:
@@ -222,11 +240,9 @@ def test_a_joint_inside_gazebo_is_closed_where_it_stands_at_zero(
     closed, inside = GAZEBO[kind]
     mechanism = open_mechanism(write(tmp_path, tree(gazebo(kind, pose + inside))))
     assert mechanism.loops[0].type == closed
-    on_rim = ON_RIM if pose else ((0, 0, 0), (0, 0, 0))
-    at_zero = relative(np.zeros(4), ((0, 0, 0), (0, 0, 0)), on_rim)
-    for q in random_positions():
-        between = at_zero.actInv(relative(q, ((0, 0, 0), (0, 0, 0)), on_rim))
-        assert measured(mechanism, q) == pytest.approx(gaps(closed, between), abs=1e-12)
+    on_rim = ON_RIM if pose else NOWHERE
+    at_zero = relative(np.zeros(4), NOWHERE, on_rim)
+    check_rows(mechanism, lambda q: gaps(closed, at_zero.actInv(relative(q, NOWHERE, on_rim))))
     assert measured(mechanism, np.zeros(4)) == pytest.approx((0.0, 0.0), abs=1e-14)
 
 
@@ -248,13 +264,17 @@ def relation(mechanism: srm.Mechanism, q: FloatArray) -> float:
     return float(closure(mechanism, configuration(model, q), np.zeros(model.nv))[0])
 
 
+def check_relation(mechanism: srm.Mechanism, expected: Callable[[FloatArray], float]) -> None:
+    """The row, up to its sign."""
+    for q in random_positions():
+        assert abs(relation(mechanism, q)) == pytest.approx(abs(expected(q)), abs=1e-13)
+
+
 def test_a_mimic_joint_is_a_coupling(tmp_path: Path) -> None:
     mimic = '<mimic joint="hip" multiplier="-2.5" offset="0.3"/>'
     mechanism = open_mechanism(write(tmp_path, tree(joints={"wheel": mimic})))
-    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("mimic_wheel", "coupling")]
-    values = [relation(mechanism, q) for q in random_positions()]
-    expected = [q[3] + 2.5 * q[0] - 0.3 for q in random_positions()]
-    np.testing.assert_allclose(np.abs(values), np.abs(expected), atol=1e-13)
+    assert names_and_types(mechanism) == [("mimic_wheel", "coupling")]
+    check_relation(mechanism, lambda q: q[3] + 2.5 * q[0] - 0.3)
     loaded = srm.load(tmp_path / "robot.urdf")
     assert loaded.degrees_of_freedom == 3
     assert closure(loaded, loaded.q0, loaded.v0)[0] == pytest.approx(0.0, abs=1e-12)
@@ -281,9 +301,7 @@ def test_a_coupling_sums_the_joints_of_both_branches(kind: str, tmp_path: Path) 
         '<ratio value="3"/></coupling>'
     )
     mechanism = open_mechanism(write(tmp_path, tree(element)))
-    values = [relation(mechanism, q) for q in random_positions()]
-    expected = [q[2] - 3.0 * (q[0] + q[1]) for q in random_positions()]
-    np.testing.assert_allclose(np.abs(values), np.abs(expected), atol=1e-13)
+    check_relation(mechanism, lambda q: q[2] - 3.0 * (q[0] + q[1]))
 
 
 # --- springs of Drake ----------------------------------------------------------------------------
@@ -338,12 +356,10 @@ def slider_crank(on_pin: str = "", on_guide: str = "") -> str:
     return "\n".join(['<robot name="slider_crank">', links, *joints, "</robot>"])
 
 
-def described(folder: Path, urdf: str, entries: str = "", cut: str = "") -> srm.Mechanism:
-    write(folder, urdf, f"slider_crank{cut}.urdf")
-    path = folder / f"slider_crank{cut}.toml"
-    line = f'cut = ["{cut}"]\n' if cut else ""
-    path.write_text(f'format = 1\nurdf = "slider_crank{cut}.urdf"\n{line}{entries}')
-    return srm.load(path)
+def described(folder: Path, urdf: str, entries: str = "") -> Path:
+    """A description with these entries of a URDF that is written beside it."""
+    write(folder, urdf)
+    return write(folder, f'format = 1\nurdf = "robot.urdf"\n{entries}', "robot.toml")
 
 
 def end_of(mechanism: srm.Mechanism, link: str, q: FloatArray) -> FloatArray:
@@ -361,8 +377,8 @@ def test_the_motion_does_not_depend_on_where_the_loop_is_cut(tmp_path: Path) -> 
     """Nor on whether a damped joint is the one: it then becomes a bushing."""
     damped = '<dynamics damping="0.6"/>'
     ends = []
-    for cut, name in (("", "guide"), ("pin", "pin")):
-        mechanism = described(tmp_path, slider_crank(damped, damped), START, cut)
+    for cut, name in (("", "guide"), ('cut = ["pin"]\n', "pin")):
+        mechanism = srm.load(described(tmp_path, slider_crank(damped, damped), cut + START))
         assert [loop.name for loop in mechanism.loops] == [name]
         assert [force.name for force in mechanism.forces] == [f"{name}::damping"]
         assert mechanism.degrees_of_freedom == 1
@@ -384,8 +400,8 @@ def test_a_description_adds_its_loops_to_those_of_the_file(tmp_path: Path) -> No
         'b = { link = "rod" }\n'
     )
     with pytest.raises(srm.InputError, match="'own'"):  # on one joint: both anchors are the same
-        described(tmp_path, slider_crank(), own.replace('"rod"', '"crank"'))
-    mechanism = described(tmp_path, slider_crank(), own + START)
+        srm.load(described(tmp_path, slider_crank(), own.replace('"rod"', '"crank"')))
+    mechanism = srm.load(described(tmp_path, slider_crank(), own + START))
     assert [loop.name for loop in mechanism.loops] == ["own", "guide"]
 
 
@@ -396,7 +412,7 @@ def test_names_that_are_missing_are_made(tmp_path: Path) -> None:
 
 
 def test_a_saved_run_of_a_file_with_loops_is_read_again(tmp_path: Path) -> None:
-    mechanism = described(tmp_path, slider_crank(), START)
+    mechanism = srm.load(described(tmp_path, slider_crank(), START))
     solution = srm.simulate(mechanism, 0.2)
     solution.save(tmp_path / "run.npz")
     for file in tmp_path.glob("*.urdf"):
@@ -411,7 +427,7 @@ def test_what_a_robot_is_drawn_with_survives(tmp_path: Path) -> None:
 
     box = '<visual><geometry><box size="1 2 3"/></geometry></visual></link>'
     urdf = slider_crank().replace("</link>", box, 1)
-    (visual,) = visuals_of(described(tmp_path, urdf, START))
+    (visual,) = visuals_of(srm.load(described(tmp_path, urdf, START)))
     assert isinstance(visual.shape, Box)
     assert visual.shape.size == (1.0, 2.0, 3.0)
 
@@ -443,30 +459,28 @@ HINGED = frame("closing_ring_1_z", "shin", ON_SHIN, 0.1) + frame(
 
 def test_a_pair_of_closing_frames_joins_their_origins(tmp_path: Path) -> None:
     mechanism = open_mechanism(write(tmp_path, tree(PAIR)))
-    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("closing_ring", "point")]
+    assert names_and_types(mechanism) == [("closing_ring", "point")]
     assert any("closing_ring" in note and "type of this mate" in note for note in mechanism.notes)
-    for q in random_positions():
-        assert measured(mechanism, q) == pytest.approx(gaps("point", relative(q)), abs=1e-12)
+    check_rows(mechanism, lambda q: gaps("point", relative(q)))
 
 
 def test_with_two_more_frames_along_z_it_is_a_hinge(tmp_path: Path) -> None:
     mechanism = open_mechanism(write(tmp_path, tree(PAIR + HINGED)))
-    assert [(loop.name, loop.type) for loop in mechanism.loops] == [("closing_ring", "revolute")]
-    for q in random_positions():
+    assert names_and_types(mechanism) == [("closing_ring", "revolute")]
+
+    def rows(q: FloatArray) -> tuple[float, float]:
         between = relative(q)
-        tilt = np.linalg.norm(between.rotation[:2, 2])
-        expected = (np.linalg.norm(between.translation), tilt)
-        assert measured(mechanism, q) == pytest.approx(expected, abs=1e-12)
+        return np.linalg.norm(between.translation), np.linalg.norm(between.rotation[:2, 2])
+
+    check_rows(mechanism, rows)
 
 
 def test_a_closure_of_the_description_replaces_the_pair(tmp_path: Path) -> None:
-    write(tmp_path, tree(PAIR))
-    path = tmp_path / "own.toml"
-    path.write_text(
-        'format = 1\nurdf = "robot.urdf"\n[[loop]]\nname = "weld"\ntype = "frame"\n'
-        'a = { link = "closing_ring_2" }\nb = { frame = "closing_ring_1" }\n'
+    own = (
+        '[[loop]]\nname = "weld"\ntype = "frame"\na = { link = "closing_ring_2" }\n'
+        'b = { frame = "closing_ring_1" }\n'
     )
-    mechanism = open_mechanism(path)
+    mechanism = open_mechanism(described(tmp_path, tree(PAIR), own))
     assert [loop.name for loop in mechanism.loops] == ["weld"]
 
 
@@ -524,6 +538,9 @@ FAULTS = {
     ),
     "gazebo pose of five numbers": gazebo("ball", "<pose>0 0 0 0 0</pose>"),
     "gazebo axis without direction": gazebo("revolute", "<axis/>"),
+    "gazebo axis in another frame": gazebo(
+        "revolute", "<axis><xyz expressed_in='__model__'>1 0 0</xyz></axis>"
+    ),
     "gazebo joint with friction": gazebo(
         "revolute", "<axis><xyz>1 0 0</xyz><dynamics><friction>2</friction></dynamics></axis>"
     ),
@@ -557,13 +574,10 @@ def test_a_faulty_loop_or_mimic_is_one_clear_error(tmp_path: Path) -> None:
 
 
 def test_a_mimic_of_a_locked_joint_is_refused_and_a_locked_mimic_is_ignored(tmp_path: Path) -> None:
-    write(tmp_path, tree(joints={"wheel": '<mimic joint="hip"/>'}))
-    path = tmp_path / "robot.toml"
-    path.write_text('format = 1\nurdf = "robot.urdf"\nlock = ["hip"]\n')
+    urdf = tree(joints={"wheel": '<mimic joint="hip"/>'})
     with pytest.raises(srm.InputError, match="'hip' is locked"):
-        srm.load(path)
-    path.write_text('format = 1\nurdf = "robot.urdf"\nlock = ["wheel"]\n')
-    mechanism = srm.load(path)
+        srm.load(described(tmp_path, urdf, 'lock = ["hip"]\n'))
+    mechanism = srm.load(described(tmp_path, urdf, 'lock = ["wheel"]\n'))
     assert not mechanism.loops
     assert any("<mimic> is ignored" in note for note in mechanism.notes)
 

@@ -118,15 +118,3 @@ def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) ->
     assert (found.history.known_until, found.history.known_below) == (2.5, 1e-3)
     assert (found.sigma, found.sigma_slope, found.steps) == (0.5, 0.25, 7)
     np.testing.assert_array_equal(found.rate, given.rate)
-
-
-def test_a_run_is_restored_from_its_snapshot() -> None:
-    """The next steps after a snapshot are those of a run that goes on, bit by bit."""
-    mechanism = load("slider_crank_whirl")
-    runs = [srm.Simulator(mechanism, backend="kernel") for _ in range(2)]
-    for run in runs:
-        run.step(0.3)
-    again = runs[0].clone()
-    for run in (*runs, again):
-        run.step(0.4)
-    np.testing.assert_array_equal(again.q, runs[1].q)

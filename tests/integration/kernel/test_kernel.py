@@ -202,14 +202,6 @@ def test_events_end_runs_alike() -> None:
     assert compiled.t[-1] == compiled.t_events[0][-1]
 
 
-def test_ticks_tell_every_step() -> None:
-    seen: list[float] = []
-    solution = srm.simulate(
-        load("four_bar"), 1.0, backend="kernel", progress=lambda t, h, x: seen.append(t)
-    )
-    assert seen == solution.steps.times[1:].tolist()
-
-
 NUMBER = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
 
 

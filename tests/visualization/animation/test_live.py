@@ -9,19 +9,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from typer.testing import CliRunner
 
 import srm_mbs as srm
-from srm_mbs.cli.app import app
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.visualization.animation.live import SHARE
 from srm_mbs.visualization.animation.playback import serve
 from srm_mbs.visualization.animation.server import start_server
-from tests.support.browsing import opened
+from tests.support.browsing import bodies_in, opened, placements
 from tests.support.bundled import load
+from tests.support.commands import run
 
 
 @pytest.fixture(autouse=True)
@@ -30,23 +28,10 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("srm_mbs.visualization.animation.live.PATIENCE", 60.0)
 
 
-BODY = """name => {
-  viewer.scene.updateMatrixWorld(true);
-  const root = viewer.scene_tree.find(["mechanism"]);
-  const body = viewer.scene_tree.find(["mechanism", name]).object.matrixWorld;
-  return root.object.matrixWorld.clone().invert().multiply(body).toArray();
-}"""
-SETTLE = """async () => {
-  const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
-  for (let i = 0; i < 5; i++) await frame();
-}"""
-
-
 @pytest.mark.browser
 def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
     mechanism = load("four_bar")
     solution = srm.simulate(mechanism, 1.5)
-    data = mechanism.model.createData()
     with (
         srm.LiveView(mechanism, open_browser=False) as view,
         opened(browser, view.visualizer.url()) as page,
@@ -55,10 +40,9 @@ def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
         for t in (0.4, 1.1):
             view.send(t, np.concatenate(solution(t)))
             page.wait_for_function(f"element('panel').innerText.includes('{t:.3f}')")
-            pin.forwardKinematics(mechanism.model, data, solution(t)[0])
+            found, expected = bodies_in(page), placements(mechanism, solution(t)[0])
             for joint, name in enumerate(mechanism.joint_names, 1):
-                found = np.array(page.evaluate(BODY, name)).reshape(4, 4).T
-                assert np.abs(found - data.oMi[joint].homogeneous).max() < 1e-9
+                assert np.abs(found[name] - expected[joint].homogeneous).max() < 1e-9
         view.play(solution, reactions=True)
         page.wait_for_function("animator.playing && animator.time > 0.1")
         assert page.evaluate("animator.duration") == pytest.approx(1.5, rel=1e-6)
@@ -165,11 +149,10 @@ def test_the_command_line_shows_a_run_while_it_is_computed_and_then_plays_it(
 
     monkeypatch.setattr("webbrowser.open", lambda address, new=0: served.append(address) or True)
     monkeypatch.setattr("srm_mbs.visualization.animation.playback.time.sleep", interrupt)
-    done = CliRunner().invoke(app, ["simulate", "four_bar", "--t-end", "0.2", "--live"])
-    assert done.exit_code == 0, done.output
+    said = run("simulate", "four_bar", "--t-end", "0.2", "--live")
     assert len(served) == 1
-    assert served[0] in done.output
-    assert "Ctrl-C" in done.output
+    assert served[0] in said
+    assert "Ctrl-C" in said
 
 
 def test_a_server_that_dies_ends_the_view_and_not_the_run(

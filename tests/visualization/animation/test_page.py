@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import io
+import math
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from typer.testing import CliRunner
+from PIL import Image
 
 import srm_mbs as srm
-from srm_mbs.cli.app import app
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.visualization.animation import overlays
-from srm_mbs.visualization.animation import overlays as closure_overlays
 from srm_mbs.visualization.animation.overlays import (
     OverlayOptions,
     gaps_of,
@@ -25,21 +27,21 @@ from srm_mbs.visualization.animation.overlays import (
 )
 from srm_mbs.visualization.animation.page import make_page, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
-from tests.support.browsing import opened
+from srm_mbs.visualization.animation.snapshot import draw_snapshot
+from tests.support.browsing import exported, opened, placements
 from tests.support.bundled import load
+from tests.support.commands import run
 from tests.support.mechanisms import floating_ring
 from tests.support.pacing import assert_pace
+from tests.support.snapshots import check_messages, refused
 
 ROD = srm.Anchor("rod", xyz=(0.5, 0.0, 0.2))
 
 
 def place(solution: srm.Solution, t: float, anchor: srm.Anchor) -> Any:
     """Where an anchor is at t, by forward kinematics of the dense output."""
-    model = solution.mechanism.model
-    data = model.createData()
-    pin.forwardKinematics(model, data, solution(t)[0])
-    joint, placement = anchor.resolve(model)
-    return (data.oMi[joint] * placement).translation
+    joint, placement = anchor.resolve(solution.mechanism.model)
+    return (placements(solution.mechanism, solution(t)[0])[joint] * placement).translation
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +56,8 @@ def page(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Any]:
     """The slider-crank with the path of a point of its rod, at whole 1/64 s."""
-    path = tmp_path_factory.mktemp("page") / "page.html"
-    slider_crank.export_html(path, fps=64.0, trace=[ROD])
-    with opened(browser, path.as_uri(), (660, 400)) as shown:
+    folder, options = tmp_path_factory.mktemp("page"), {"fps": 64.0, "trace": [ROD]}
+    with exported(browser, folder, slider_crank, (660, 400), **options) as shown:
         yield shown
 
 
@@ -258,8 +259,7 @@ def test_panel_and_slider_tell_the_time_of_the_run_with_the_digits_that_it_needs
     browser: Any, tmp_path: Path, span: tuple[float, float], panel: str, clock: str
 ) -> None:
     solution = srm.simulate(load("slider_crank"), span[1], t0=span[0])
-    solution.export_html(tmp_path / "page.html")
-    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+    with exported(browser, tmp_path, solution) as page:
         page.evaluate("seek(0.25 * viewer.animator.duration)")
         page.wait_for_function(
             "words => document.querySelector('output').value === words", arg=clock
@@ -323,13 +323,10 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
     tmp_path: Path,
 ) -> None:
     solution = srm.simulate(load("stewart_platform"), 1.0)
-    solution.export_html(tmp_path / "page.html", fps=64.0, reactions=True)
-    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+    springs = [spring for spring, _ in overlays.active_springs(solution)]
+    with exported(browser, tmp_path, solution, fps=64.0, reactions=True) as page:
         for t in (0.0, 0.515625, 1.0):
-            springs, ends = (
-                [s for s, _ in overlays.active_springs(solution)],
-                ends_in(page, "spring_", t),
-            )
+            ends = ends_in(page, "spring_", t)
             assert len(ends) == len(springs) == 6
             for spring, (a, b) in zip(springs, ends):
                 assert np.abs(a - place(solution, t, spring.a)).max() < 1e-6
@@ -341,7 +338,7 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
         np.linalg.norm(wrench[:, :3], axis=1)
         for wrench in solution.at(np.arange(65) / 64.0).reactions.values()
     ]
-    top = np.percentile(np.concatenate(sizes), closure_overlays.FORCE_PERCENTILE)
+    top = np.percentile(np.concatenate(sizes), overlays.FORCE_PERCENTILE)
     assert float(re.findall(r"([\d.]+) N", legend)[0]) == pytest.approx(top, rel=6e-3)
     expected = ramp_colours(sizes[3][-1:] / top)[0]
     assert np.abs(np.array(colour) - expected).max() < 1e-6
@@ -353,8 +350,7 @@ def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
     tmp_path: Path,
 ) -> None:
     solution = srm.simulate(load("spatial_four_bar"), 1.0, rtol=1e-4)
-    solution.export_html(tmp_path / "page.html", fps=64.0, gaps=True)
-    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+    with exported(browser, tmp_path, solution, fps=64.0, gaps=True) as page:
         words = page.locator("#notes").inner_text()
         ((start, end),) = ends_in(page, "gap_", 0.75)
     power = words.split("10")[-1].split()[0].translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
@@ -372,10 +368,8 @@ def let_go_and_tied() -> srm.Solution:
     post, end = srm.Anchor("world", xyz=(0.0, 0.0, -5.0)), srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
 
     def tie(t: float, q: Any, v: Any) -> srm.Switch:
-        data = freed.model.createData()
-        pin.forwardKinematics(freed.model, data, q)
         joint, placement = end.resolve(freed.model)
-        way = (data.oMi[joint] * placement).translation - np.array(post.xyz)
+        way = (placements(freed, q)[joint] * placement).translation - np.array(post.xyz)
         length = float(np.linalg.norm(way))
         return srm.Switch(
             freed.with_loop(srm.LoopClosure("distance", end, post, name="rope", length=length))
@@ -402,8 +396,8 @@ SEEN = """t => {
 def test_closures_are_drawn_while_they_are_there_and_not_before_or_after(
     browser: Any, tmp_path: Path, let_go_and_tied: srm.Solution
 ) -> None:
-    let_go_and_tied.export_html(tmp_path / "page.html", fps=10.0, reactions=True, gaps=True)
-    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+    options = {"fps": 10.0, "reactions": True, "gaps": True}
+    with exported(browser, tmp_path, let_go_and_tied, **options) as page:
         # Between the key frames at 0.4, 0.5, ...: to the very time.
         for t, pinned, tied in [
             (0.0, True, False),
@@ -449,9 +443,9 @@ def test_a_motion_that_was_not_simulated_has_its_time_only(
     tmp_path: Path,
 ) -> None:
     mechanism = load("four_bar")
-    run = srm.simulate(mechanism, 1.0)
-    srm.JointMotion(mechanism, run.t, run.q).export_html(tmp_path / "page.html", fps=20.0)
-    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+    simulated = srm.simulate(mechanism, 1.0)
+    motion = srm.JointMotion(mechanism, simulated.t, simulated.q)
+    with exported(browser, tmp_path, motion, fps=20.0) as page:
         assert panel(page, 0.5) == {"t": (0.5, "s")}
         assert page.locator("#marks button").count() == 0
 
@@ -485,33 +479,47 @@ def test_quaternions_along_a_turning_direction_turn_z_to_it_without_twist() -> N
     assert np.all(np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.9)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"trace": ["rod"]}, "'rod' is not a point of a link"),
-        ({"trace": ROD}, "trace is one anchor"),
-        ({"trace": [srm.Anchor("nothing")]}, "no link 'nothing'"),
-        ({"trace": [srm.Anchor("world", xyz=(1.0, 0.0, 0.0))]}, "lies on the ground"),
-    ],
-)
-def test_what_cannot_be_traced_is_an_input_error(
-    tmp_path: Path, slider_crank: srm.Solution, options: dict[str, Any], words: str
+def test_animations_that_cannot_be_made_are_refused(
+    slider_crank: srm.Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(srm.InputError, match=words):
-        slider_crank.export_html(tmp_path / "page.html", **options)
-    assert not list(tmp_path.iterdir())
-
-
-def test_reactions_and_gaps_of_an_open_chain_and_reactions_of_a_prescribed_motion_are_refused(
-    tmp_path: Path, slider_crank: srm.Solution
-) -> None:
-    pendulum = srm.simulate(load("simple_pendulum"), 0.1)
-    for what in ("reactions", "gaps"):
-        with pytest.raises(srm.InputError, match=f"no closures with {what}"):
-            pendulum.export_html(tmp_path / "page.html", **{what: True})
+    pendulum = srm.simulate(load("simple_pendulum"), 1.5)
     motion = srm.JointMotion(slider_crank.mechanism, slider_crank.t, slider_crank.q)
-    with pytest.raises(srm.InputError, match="not simulated has no reactions"):
-        motion.export_html(tmp_path / "page.html", reactions=True)
+    ground = srm.Anchor("world", xyz=(1.0, 0.0, 0.0))
+    page = partial(slider_crank.export_html, tmp_path / "page.html")
+    frame = slider_crank.show
+    image, film = pendulum.export_image, pendulum.export_video
+    cases: dict[str, Callable[[], object]] = {
+        "a trace of no point": partial(page, trace=["rod"]),
+        "one trace": partial(page, trace=ROD),
+        "a trace of an unknown link": partial(page, trace=[srm.Anchor("nothing")]),
+        "a trace on the ground": partial(page, trace=[ground]),
+        "reactions of an open chain": partial(pendulum.show, reactions=True),
+        "gaps of an open chain": partial(pendulum.show, gaps=True),
+        "reactions of a prescribed motion": partial(motion.show, reactions=True),
+        **{f"{fps} frames": partial(page, fps=fps) for fps in (0.0, -1.0, math.nan, math.inf)},
+        **{f"{fps} frames": partial(page, fps=fps) for fps in ("fast", None)},
+        "no frames of playback": partial(slider_crank.play, fps=0.0),
+        **{f"height {height}": partial(frame, height=height) for height in (0, -9, 42.5, "tall")},
+        "an image after the end": partial(image, "a.png", t=1.6),
+        "an image at no time": partial(image, "a.png", t=math.nan),
+        "an image without width": partial(image, "a.png", size=(0, 10)),
+        "a film without frames": partial(film, "film.gif", fps=0.0),
+        "a film without speed": partial(film, "film.gif", speed=0.0),
+        "a film of infinite speed": partial(film, "film.gif", speed=math.inf),
+    }
+    messages = {case: refused(call) for case, call in cases.items()}
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    files = {
+        "a page in no folder": (slider_crank.export_html, "nowhere/page.html"),
+        "an image of another format": (image, "a.jpg"),
+        "a film of another format": (film, "film.avi"),
+        "a film without its encoder": (film, "film.mp4"),
+    }
+    for case, (export, name) in files.items():
+        messages[case] = refused(partial(export, tmp_path / name), tmp_path)
+    check_messages("animation", messages)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Solution) -> None:
@@ -543,6 +551,17 @@ def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.So
     assert re.fullmatch(r"the picture goes along with .* which travels \d+ m", note["text"])
 
 
+@pytest.mark.parametrize("t", [0.05, 2.0])
+def test_the_snapshot_of_a_mechanism_that_travels_far_shows_it_at_any_time(
+    flight: srm.Solution, t: float
+) -> None:
+    with Image.open(io.BytesIO(draw_snapshot(flight, t))) as picture:
+        drawn = (np.asarray(picture.convert("RGB")) < 250).any(axis=2)
+    rows, columns = np.nonzero(drawn)
+    assert max(np.ptp(columns) / 900.0, np.ptp(rows) / 600.0) > 0.3
+    assert 0 < columns.min() < columns.max() < 899
+
+
 def test_the_picture_stands_still_where_a_joint_holds_to_the_ground_or_little_is_gained(
     slider_crank: srm.Solution,
 ) -> None:
@@ -555,8 +574,7 @@ def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera
     browser: Any, flight: srm.Solution, tmp_path: Path
 ) -> None:
     point = srm.Anchor("d", xyz=(1.0, 0.0, 0.0))
-    flight.export_html(tmp_path / "page.html", trace=[point])
-    with opened(browser, (tmp_path / "page.html").as_uri()) as page:
+    with exported(browser, tmp_path, flight, trace=[point]) as page:
         for t in (0.0, 1.0, 2.5, 4.0):
             middles, ball = page.evaluate(
                 """t => {
@@ -591,10 +609,8 @@ def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
 
 
 def test_names_do_not_end_the_script_of_a_page() -> None:
-    from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
-
     about = {"notes": [{"text": "</script><script>alert(1)</script>"}]}
-    page = make_page(import_meshcat(), "a</title>b", about, [])
+    page = make_page("a</title>b", about, [])
     assert "</script><script>alert(1)" not in page
     assert "a</title>b" not in page
 
@@ -611,8 +627,7 @@ def test_the_command_line_draws_the_path_of_a_point_of_a_link(
 ) -> None:
     path = tmp_path / "page.html"
     options = ["--t-end", "8", "--html", str(path), "--trace", "rod:0.5,0,0.2"]
-    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
-    assert done.exit_code == 0, done.output
+    run("simulate", "slider_crank", *options)
     with opened(browser, path.as_uri()) as page:
         ball = ends_in(page, "point_", 2.5)[0, 0]
     assert np.abs(ball - place(slider_crank, 2.5, ROD)).max() < 1e-6
@@ -631,17 +646,14 @@ def test_the_command_line_draws_the_path_of_a_point_of_a_link(
 def test_what_cannot_be_drawn_is_refused_before_the_run(
     model: str, options: list[str], words: str, tmp_path: Path
 ) -> None:
-    page = ["--html", str(tmp_path / "page.html")]
-    done = CliRunner().invoke(app, ["simulate", model, *page, *options])
-    assert done.exit_code == 2
-    assert words in done.output
-    assert "steps" not in done.output
+    said = run("simulate", model, "--html", tmp_path / "page.html", *options, status=2)
+    assert words in said
+    assert "steps" not in said
 
 
 @pytest.mark.parametrize("options", [["--trace", "rod:1,0,0"], ["--gaps"], ["--reactions"]])
 def test_what_would_be_drawn_nowhere_is_refused_before_the_run(options: list[str]) -> None:
-    done = CliRunner().invoke(app, ["simulate", "slider_crank", *options])
-    assert done.exit_code == 2
-    assert f"error: {options[0]}: it is drawn in the animation" in done.output
-    assert "--html" in done.output
-    assert "steps" not in done.output
+    said = run("simulate", "slider_crank", *options, status=2)
+    assert f"error: {options[0]}: it is drawn in the animation" in said
+    assert "--html" in said
+    assert "steps" not in said

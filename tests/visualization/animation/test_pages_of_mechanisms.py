@@ -14,7 +14,7 @@ from srm_mbs.formats.load import bundled_models
 from srm_mbs.visualization.animation.meshcat_scene import node_names
 from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
 from srm_mbs.visualization.animation.trajectory import MAX_BODY_FRAMES
-from tests.support.browsing import bodies_in, opened, placements
+from tests.support.browsing import assert_in_place, opened
 from tests.support.bundled import load, problem
 
 FPS = 32.0
@@ -70,21 +70,16 @@ def test_the_page_is_small_needs_no_network_and_shows_every_body_in_its_place(
     browser: Any, tmp_path: Path, name: str
 ) -> None:
     solution = run(name)
-    mechanism = solution.mechanism
     end = solution.span[1]
     path = tmp_path / "page.html"
     solution.export_html(path, fps=FPS)
     assert path.stat().st_size < 5e6
-    names = node_names(mechanism)
-    drawn = {visual.joint for visual in visuals_of(mechanism)} | {0}
+    names = node_names(solution.mechanism)
+    drawn = {names[visual.joint] for visual in visuals_of(solution.mechanism)}
     with opened(browser, path.as_uri()) as page:
         # On key frames: single precision; between them the browser goes straight.
         for t in {0.0, end, round(0.4 * end * FPS) / FPS}:
-            found = bodies_in(page, t)
-            expected = placements(mechanism, solution(t)[0])
-            for joint in drawn - {0}:
-                apart = found[names[joint]] - expected[joint].homogeneous
-                assert np.abs(apart).max() < 1e-6, (names[joint], t)
+            assert drawn <= assert_in_place(page, solution, t)
         reach = np.array(page.evaluate(REACH, np.linspace(0.0, end, 7).tolist()))
         assert reach.shape == (7, 3)
         assert reach.max() < 1.0
@@ -115,7 +110,5 @@ def test_a_thousand_seconds_are_a_light_page(browser: Any, tmp_path: Path) -> No
             "Math.max(...animator.actions.flatMap(a => a._clip.tracks.map(t => t.times.length)))"
         )
         assert frames == 1 + MAX_BODY_FRAMES // 2
-        t = 1000.0 * 7503 / 15000
-        found, expected = bodies_in(page, t), placements(solution.mechanism, solution(t)[0])
         # The page counts the time in single precision: 3e-5 s here, at up to 3 rad/s and 4 m.
-        assert np.abs(found["rod"] - expected[2].homogeneous).max() < 5e-4
+        assert_in_place(page, solution, 1000.0 * 7503 / 15000, within=5e-4)

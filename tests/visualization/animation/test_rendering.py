@@ -13,21 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import srm_mbs as srm
-from srm_mbs.cli.app import app
 from srm_mbs.visualization.animation import video as rendering
 from srm_mbs.visualization.animation.overlays import OverlayOptions
-from srm_mbs.visualization.animation.scene import (
-    FIELD_OF_VIEW,
-    View,
-    choose_view,
-    make_picture,
-    points_in_view,
-)
-from srm_mbs.visualization.animation.shapes import visuals_of
-from srm_mbs.visualization.animation.trajectory import sample_motion
+from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
+from tests.support.commands import run as run_command
+from tests.support.commands import run_apart
+from tests.support.screenshots import pixels
 
 ORANGE = np.array([0.902, 0.624, 0.0])
 
@@ -60,12 +53,6 @@ def one_browser(browser: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("playwright.sync_api.sync_playwright", lambda: playwright)
 
 
-def pixels(path: Path) -> Any:
-    from matplotlib.image import imread
-
-    return imread(path)[:, :, :3]
-
-
 def orange_at(image: Any) -> np.ndarray:
     """Mean column and row of the orange pixels."""
     lengths = np.linalg.norm(image, axis=2)
@@ -73,10 +60,25 @@ def orange_at(image: Any) -> np.ndarray:
     return np.argwhere(hue & (lengths > 0.3)).mean(axis=0)[::-1]
 
 
-def view_of(solution: srm.Solution, fps: float) -> View:
-    visuals = visuals_of(solution.mechanism)
-    motion = sample_motion(solution, (1,), fps)
-    return choose_view(solution.mechanism, points_in_view(visuals, motion))
+def picture_of(solution: srm.Solution, path: Path, **options: Any) -> Any:
+    """Red, green and blue (height, width, 3), 0 to 1, of an image that is written to ``path``."""
+    solution.export_image(path, **options)
+    return pixels(path.read_bytes())
+
+
+def seen_at(solution: srm.Solution, place: Any, fps: float, size: tuple[int, int]) -> np.ndarray:
+    """Column and row of a point (3,) m in a picture of ``size``."""
+    view = make_picture(solution, fps, OverlayOptions()).view
+    x, y, depth = view.axes @ (np.asarray(place) - view.target)
+    half = 0.5 * np.array(size)
+    scale = half[1] / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)
+    return half + scale * np.array([x, -y])
+
+
+def bob(solution: srm.Solution, t: float) -> tuple[float, float, float]:
+    """The place (m) of the bob at t."""
+    angle = solution(t)[0][0]
+    return math.cos(angle), 0.0, math.sin(angle)
 
 
 @pytest.mark.browser
@@ -84,26 +86,16 @@ def view_of(solution: srm.Solution, fps: float) -> View:
     "t", [0.4, 1.5, *(pytest.param(t, marks=pytest.mark.stress) for t in (0.0, 0.9))]
 )
 def test_the_bob_is_where_forward_kinematics_puts_it(tmp_path: Path, t: float) -> None:
-    solution = run()
-    path = tmp_path / "picture.png"
-    solution.export_image(path, t=t)
-    image = pixels(path)
+    image = picture_of(run(), tmp_path / "picture.png", t=t)
     assert image.shape == (600, 900, 3)
-    angle = solution(t)[0][0]
-    place = np.array([math.cos(angle), 0.0, math.sin(angle)])
-    view = view_of(solution, 60.0)
-    x, y, depth = view.axes @ (place - view.target)
-    scale = 300.0 / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)
-    expected = np.array([450.0 + scale * x, 300.0 - scale * y])
+    expected = seen_at(run(), bob(run(), t), 60.0, (900, 600))
     np.testing.assert_allclose(orange_at(image), expected, atol=2.5)
 
 
 @pytest.mark.browser
 def test_a_picture_shows_the_end_by_default_and_no_controls(tmp_path: Path) -> None:
-    solution = run()
-    solution.export_image(tmp_path / "a.png", size=(450, 300))
-    solution.export_image(tmp_path / "b.png", t=1.5, size=(450, 300))
-    a, b = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
+    a = picture_of(run(), tmp_path / "a.png", size=(450, 300))
+    b = picture_of(run(), tmp_path / "b.png", size=(450, 300), t=1.5)
     np.testing.assert_allclose(a, b, atol=0.02)
     assert np.ptp(a[-40:], axis=(0, 1)).max() < 0.1, "the background only"
 
@@ -131,16 +123,6 @@ def test_an_mp4_is_written_by_ffmpeg(tmp_path: Path) -> None:
     assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
 
 
-def test_an_mp4_without_ffmpeg_says_what_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rendering.shutil, "which", lambda name: None)
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(srm.InputError, match=r"ffmpeg, which is not installed.*write a \.gif"):
-        run().export_video(tmp_path / "film.mp4")
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_film_without_its_encoder_and_a_time_without_its_picture_are_refused_before_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,18 +132,16 @@ def test_a_film_without_its_encoder_and_a_time_without_its_picture_are_refused_b
         (["--video", str(tmp_path / "film.mp4")], "ffmpeg, which is not installed"),
         (["--at", "0.4"], "--at: it is the time of a picture, and none is asked for"),
     ):
-        done = CliRunner().invoke(app, ["simulate", "simple_pendulum", *options])
-        assert done.exit_code == 2
-        assert words in done.output
-        assert "steps" not in done.output
+        said = run_command("simulate", "simple_pendulum", *options, status=2)
+        assert words in said
+        assert "steps" not in said
 
 
 def test_a_picture_of_a_time_outside_a_saved_run_is_refused_by_its_option(tmp_path: Path) -> None:
     srm.simulate(srm.load("simple_pendulum"), 2.0, t0=1.0).save(tmp_path / "run.npz")
     options = ["--image", str(tmp_path / "image.png"), "--at", "0.5"]
-    done = CliRunner().invoke(app, ["play", str(tmp_path / "run.npz"), *options])
-    assert done.exit_code == 2
-    assert "error: --at: 0.5 s lies outside the run, from 1 to 2 s" in done.output
+    said = run_command("play", tmp_path / "run.npz", *options, status=2)
+    assert "error: --at: 0.5 s lies outside the run, from 1 to 2 s" in said
 
 
 @pytest.mark.browser
@@ -172,8 +152,7 @@ def test_the_frames_of_a_film_from_the_command_line_show_the_bob_where_it_is(
     saved, film = tmp_path / "run.npz", tmp_path / f"film{suffix}"
     solution = srm.simulate(srm.load("simple_pendulum"), 0.5)
     solution.save(saved)
-    done = CliRunner().invoke(app, ["play", str(saved), "--video", str(film)])
-    assert done.exit_code == 0, done.output
+    run_command("play", saved, "--video", film)
     width, height = 720, 480
     decoder = [str(rendering.encoder_of(Path("any.mp4"))), "-loglevel", "error", "-i", str(film)]
     raw = subprocess.run(
@@ -181,37 +160,9 @@ def test_the_frames_of_a_film_from_the_command_line_show_the_bob_where_it_is(
     )
     frames = np.frombuffer(raw.stdout, np.uint8).reshape(-1, height, width, 3) / 255.0
     assert len(frames) == 13  # 25 per second, and the one at the start
-    view = view_of(solution, 25.0)
     for t in (0.0, 0.2, 0.48):
-        angle = solution(t)[0][0]
-        place = np.array([math.cos(angle), 0.0, math.sin(angle)])
-        x, y, depth = view.axes @ (place - view.target)
-        half = 0.5 * height
-        scale = half / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)
-        expected = np.array([0.5 * width + scale * x, half - scale * y])
+        expected = seen_at(solution, bob(solution, t), 25.0, (width, height))
         np.testing.assert_allclose(orange_at(frames[round(t * 25.0)]), expected, atol=3.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "words"),
-    [
-        ("a.jpg", {}, "pictures are PNG files"),
-        ("a.png", {"t": 1.6}, "outside the run, from 0 to 1.5 s"),
-        ("a.png", {"t": math.nan}, "outside the run"),
-        ("a.png", {"size": (0, 10)}, "not a width and a height"),
-    ],
-)
-def test_a_picture_that_cannot_be_taken_is_an_input_error(
-    tmp_path: Path, name: str, options: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(srm.InputError, match=words):
-        run().export_image(tmp_path / name, **options)
-
-
-@pytest.mark.parametrize("options", [{"fps": 0.0}, {"speed": 0.0}, {"speed": math.inf}])
-def test_a_film_of_no_length_is_an_input_error(tmp_path: Path, options: dict[str, Any]) -> None:
-    with pytest.raises(srm.InputError, match="not a positive number"):
-        run().export_video(tmp_path / "film.gif", **options)
 
 
 @pytest.mark.browser
@@ -219,20 +170,16 @@ def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: 
     saved, first, second = (str(tmp_path / name) for name in ("run.npz", "a.png", "b.png"))
     options = ["--t-end", "1.5", "--out", saved, "--image", first, "--at", "0.4"]
     # In a process of its own, which launches its browser.
-    command = [sys.executable, "-m", "srm_mbs", "simulate", "simple_pendulum", *options]
-    alone = subprocess.run(command, capture_output=True, text=True, check=False)
+    alone = run_apart("simulate", "simple_pendulum", *options)
     assert alone.returncode == 0, alone.stderr
-    done = CliRunner().invoke(app, ["play", saved, "--image", second, "--at", "0.4"])
-    assert done.exit_code == 0, done.output
-    a, b = (pixels(Path(name)) for name in (first, second))
+    run_command("play", saved, "--image", second, "--at", "0.4")
+    a, b = (pixels(Path(name).read_bytes()) for name in (first, second))
     np.testing.assert_allclose(orange_at(a), orange_at(b), atol=0.5)
 
 
 def test_an_unknown_kind_of_film_is_refused_before_the_run(tmp_path: Path) -> None:
-    film = str(tmp_path / "film.avi")
-    done = CliRunner().invoke(app, ["simulate", "simple_pendulum", "--video", film])
-    assert done.exit_code == 2
-    assert "--video" in done.output
+    film = tmp_path / "film.avi"
+    assert "--video" in run_command("simulate", "simple_pendulum", "--video", film, status=2)
 
 
 def test_without_playwright_it_says_what_to_install(
@@ -251,15 +198,12 @@ def test_a_folder_that_is_not_there_is_an_input_error(tmp_path: Path) -> None:
 @pytest.mark.browser
 def test_the_colour_of_a_closure_is_seen_although_it_lies_within_a_body(tmp_path: Path) -> None:
     solution = srm.simulate(srm.load("slider_crank"), 3.0)
-    pictures = []
-    for name, reactions in (("with.png", True), ("without.png", False)):
-        solution.export_image(tmp_path / name, t=2.4, reactions=reactions)
-        pictures.append(pixels(tmp_path / name))
-    view = make_picture(solution, 60.0, OverlayOptions(reactions=True)).view
+    pictures = [
+        picture_of(solution, tmp_path / "picture.png", t=2.4, reactions=reactions)
+        for reactions in (True, False)
+    ]
     crank = solution(2.4)[0][0]  # two bars of 2 m, their end on the x axis
-    place = np.array([4.0 * math.cos(crank), 0.0, 0.0])
-    x, y, depth = view.axes @ (place - view.target)
-    scale = 300.0 / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)
-    column, row = round(450.0 + scale * x), round(300.0 - scale * y)
+    place = (4.0 * math.cos(crank), 0.0, 0.0)
+    column, row = seen_at(solution, place, 60.0, (900, 600)).round().astype(int)
     here = (slice(row - 3, row + 4), slice(column - 3, column + 4))
     assert np.abs(pictures[0][here] - pictures[1][here]).max(axis=2).min() > 0.1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -211,17 +210,6 @@ def test_suffix_decides_the_format_of_the_file(
     assert path.stat().st_size > 5000
 
 
-@pytest.mark.parametrize("name", ["run.xyz", "run"])
-def test_unknown_suffix_is_refused_with_the_known_ones(
-    pendulum_chain: Solution, tmp_path: Path, name: str
-) -> None:
-    path = tmp_path / name
-    with pytest.raises(srm.InputError, match=r"\.png, \.pdf, \.svg") as caught:
-        pendulum_chain.plot(path)
-    assert caught.value.file == str(path)
-    assert not path.exists()
-
-
 def fails_at(time: float) -> Any:
     """A controller that gives up at ``time`` (s)."""
 
@@ -244,14 +232,6 @@ def test_unfinished_runs_are_drawn_as_far_as_they_went(
     figure = solution.plot(path)
     assert f"failed at t = {solution.t[-1]:.6g} s" in figure.get_suptitle()
     assert path.stat().st_size > 5000
-
-
-def test_runaway_states_are_drawn_without_warnings(tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the run's own, of overflow
-        solution = srm.simulate(load("four_bar"), 100.0, step=0.3)
-    assert not solution.success
-    solution.plot(tmp_path / "run.png")
 
 
 def test_names_with_dollars_and_braces_are_no_formulas(four_bar: Solution, tmp_path: Path) -> None:

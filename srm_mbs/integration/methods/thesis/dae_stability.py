@@ -11,15 +11,13 @@ function R of the scheme.  With T = (GB)^-1 all mu are 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.driver import RunRecord
-from srm_mbs.integration.methods.base import StepResult
+from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.thesis.regularisation import (
     real_stability_limit,
@@ -33,25 +31,14 @@ EIGENVALUE_ROUNDING = 1e-9
 """Rounding of an eigenvalue, over the largest."""
 
 
-class DampedSystem(Protocol):
-    """A system whose sweeps damp their constraint errors at known rates."""
-
-    def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:
-        """Eigenvalues of G B T at a state: the rates at which sweeps reduce g, times eps."""
-
-
-def _sweeps_of(result: StepResult) -> Sequence[SweepNode]:
-    return result.sweeps if isinstance(result, SweepResult) else ()
-
-
 def instability(
-    system: DampedSystem,
+    system: DaeSystem,
     scheme: ButcherTableau,
     record: RunRecord,
     start: Sequence[SweepNode],
     eps: Callable[[float], float] | None,
-) -> str:
-    """A sentence that says why the sweeps of a failed run are unstable; empty if they are not.
+) -> RunFailure | None:
+    """Why the sweeps of a failed run are unstable; None if they are not.
 
     Parameters
     ----------
@@ -65,12 +52,13 @@ def instability(
     cases: list[tuple[float, float, float, SweepNode]] = []
     nodes, t = start, record.t0
     for result in record.steps[-EXAMINED_STEPS:]:
-        nodes, t = _sweeps_of(result), result.t + result.h
+        nodes = result.sweeps if isinstance(result, SweepResult) else ()
+        t = result.t + result.h
         cases += [(t, result.h, node.eps, node) for node in nodes if node.eps > 0.0]
     if record.attempts and record.attempts[-1].t == t and eps is not None:
         h = record.attempts[-1].h
         cases += [(t, h, eps(h), node) for node in nodes]
-    worst, sentence = 1.0 + EIGENVALUE_ROUNDING, ""
+    worst, failure = 1.0 + EIGENVALUE_ROUNDING, None
     for t, h, size, node in reversed(cases):
         try:
             damped = system.damping(t, node.state)
@@ -79,17 +67,19 @@ def instability(
         largest = float(np.abs(damped).max())
         lowest = float(damped.real.min())
         if lowest < -EIGENVALUE_ROUNDING * largest:
-            return (
-                f" At t = {t:.6g} G B has an eigenvalue of {lowest:.3g} (real part), and T = I "
+            return RunFailure(
+                StopReason.UNSTABLE_SWEEPS,
+                f"At t = {t:.6g} G B has an eigenvalue of {lowest:.3g} (real part), and T = I "
                 'drives sweeps away from the constraints along it: use T = "transpose" or '
-                '"inverse".'
+                '"inverse".',
             )
         growth = max(abs(stability_function(scheme, -h * mu / size)) for mu in damped.tolist())
         if growth > worst:
             worst, radius = growth, h * largest / size
-            sentence = (
-                f" The sweeps are unstable: at t = {t:.6g} h |G B T|/eps = {radius:.3g} "
+            failure = RunFailure(
+                StopReason.UNSTABLE_SWEEPS,
+                f"The sweeps are unstable: at t = {t:.6g} h |G B T|/eps = {radius:.3g} "
                 f"(spectral radius), and {scheme.name} is stable up to "
-                f'{real_stability_limit(scheme):.3g}: use T = "inverse", or a larger eps.'
+                f'{real_stability_limit(scheme):.3g}: use T = "inverse", or a larger eps.',
             )
-    return sentence
+    return failure

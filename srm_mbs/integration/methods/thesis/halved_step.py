@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from srm_mbs.integration.control.placement import TOO_CLOSE, SlopeOfSigma, sigma_slope
-from srm_mbs.integration.control.step_size import Grid, Proposal, StepDecision, StepSizeControl
+from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -31,8 +31,7 @@ class HalvedStep(SlopeOfSigma):
     """
 
     def __init__(self, inner: StepSizeControl, scheme: ButcherTableau, t_end: float) -> None:
-        super().__init__(inner, scheme)
-        self._t_end = t_end
+        super().__init__(inner, scheme, t_end)
         inside = (scheme.c > 0.0) & (scheme.c < 1.0)
         self._fraction = 0.25 if inside.any() else 0.5
         # The steps that the rule still prescribes: (part, whole), then (whole,).
@@ -60,11 +59,6 @@ class HalvedStep(SlopeOfSigma):
         decision = super().decide(proposal, result)
         self._plan = self._plan[1:] if decision is StepDecision.ACCEPTED else ()
         return decision
-
-    def set_target_time(self, end: float, grid: Grid | None = None) -> None:
-        """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
-        self._t_end = end
-        super().set_target_time(end, grid)
 
     def _ends_on_a_singular_point(self, h: float, result: StepResult) -> bool:
         sigmas = result.sigmas

@@ -19,7 +19,7 @@ Next to a singular configuration the algebra of all sweeps is evaluated on the b
 from the closures to determine the branch are restarted from the accepted state.
 
 The zone serves the exact prediction only.  Multipliers of sweeps carry their initial layers and
-errors of order eps; extrapolated, they stalled runs that pass without (measured).
+errors of order eps; runs that extrapolate them stall where others pass (measured).
 
 **Split takeover.**  Sweeps take short steps: their error is a power of eps, which is about as long
 as a step.  Next to a singular configuration rounding of the positions, u, changes h times the
@@ -55,24 +55,19 @@ from srm_mbs.integration.methods.near_singular import (
     UNCERTAINTY_SIGMA_CHANGE,
     WATCHED_SIGMA,
 )
-from srm_mbs.integration.methods.split_step import history_after, split_step
-from srm_mbs.integration.methods.thesis.regularisation import (
-    Regularisation,
-    parse_eps,
-    real_stability_limit,
-)
+from srm_mbs.integration.methods.split_step import SplitStep, history_after
+from srm_mbs.integration.methods.thesis.regularisation import Regularisation, real_stability_limit
 from srm_mbs.integration.methods.thesis.sweep import (
     Answer,
     OnBranch,
     Start,
     Sweep,
+    SweepEquation,
     SweepNode,
     SweepResult,
     SweepStages,
     SweepState,
-    multipliers_between,
     nodes_of,
-    sweep_over,
 )
 
 PLACED_STAGE_SIGMA = 0.25
@@ -143,7 +138,7 @@ def split_takeover(
         history = first_history(terms, t, node)
         memory = replace(memory, rate=terms.rate().copy(), sigma=terms.sigma)
     inner = replace(memory, history=history, sweeps=())
-    result = split_step(system, scheme, t, h, state, inner, norm, 1.0)
+    result = SplitStep(scheme).step(system, t, h, state, inner, norm)
     near = float(result.sigmas[-1]) < WATCHED_SIGMA
     multiplier = node.multiplier if result.multiplier is None else result.multiplier
     kept: MultiplierHistory | None = history_after(history, result)
@@ -188,6 +183,10 @@ def _corrector(previous: FloatArray, eps: float) -> Answer:
 def _on_branch(stages: SweepStages, eps: float | None) -> OnBranch | None:
     """None where sweeps carry y, which need not stay bounded next to a singular configuration."""
     return OnBranch(stages, eps) if stages.system.carries_yhat else None
+
+
+def _fused(eps: float) -> Answer:
+    return lambda terms, _: terms.sweep(terms.prediction(), eps)
 
 
 def _predictor(terms: Terms, j: int) -> tuple[FloatArray, FloatArray]:
@@ -256,7 +255,7 @@ class IteratedSweeps:
         if not (math.isfinite(eps) and eps > 0.0):
             raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
         change = h * memory.sigma_slope
-        gathered, restarted = self._gathered(system, memory, change)
+        gathered = self._gathered(system, memory, change)
         kept = memory.sweeps[-1].history
         weights = norm.weights(memory.state_scale)
         stages = SweepStages(system, gathered, norm, weights, h, change, kept, t + h, eps)
@@ -264,18 +263,14 @@ class IteratedSweeps:
             memory.sweeps[-1].taken_over or unresolved(stages)
         ):
             return split_takeover(system, self.scheme, t, h, state, memory, norm, self._exact)
-        memory = gathered
-        make = self._own_sweeps if self.own_history else self._restarted_sweeps
-        runs = make(system, t, h, eps, memory, stages)
+        runs = (self._own_sweeps if self.own_history else self._restarted_sweeps)(t, stages)
         last = runs[-1]
-        self._check_closures(system, t + h, last.state, h, eps)
+        self._check_closures(stages, last.state)
 
         state_scale = system.state_scale(last.state)
-        error_ratio, drift_ratio = self._estimate(t, h, eps, state_scale, stages, last)
+        error_ratio, drift_ratio = self._estimate(t, stages, state_scale, last)
         ends = runs if self.own_history else runs[-1:]
-        sweeps = tuple(
-            self._end(system, node, run, t + h, eps) for node, run in zip(memory.sweeps, ends)
-        )
+        sweeps = tuple(self._end(stages, node, run) for node, run in zip(gathered.sweeps, ends))
         weak = any(run.rank_deficient for run in runs)
         return SweepResult(
             t=t,
@@ -287,39 +282,32 @@ class IteratedSweeps:
             error_ratio=error_ratio,
             sigmas=np.min([run.sigmas for run in runs], axis=0),
             rank=min(run.rank for run in runs),
+            state_scale=state_scale,
             zone=stages.zone if weak else None,
             history=kept if weak else None,
-            multiplier=None,
-            state_scale=state_scale,
             sweeps=sweeps,
             drift_ratio=drift_ratio,
             closure_distance=max(node.closure_distance for node in sweeps),
-            restarted=restarted,
+            restarted=gathered is not memory,
         )
 
     def _estimate(
-        self,
-        t: float,
-        h: float,
-        eps: float,
-        state_scale: FloatArray,
-        stages: SweepStages,
-        last: Sweep,
+        self, t: float, stages: SweepStages, state_scale: FloatArray, last: Sweep
     ) -> tuple[float, float]:
         """Error estimate of the ``last`` sweep, and its constraint error, over tolerance."""
         scheme, s = self.scheme, self.scheme.n_stages
         if scheme.error is None:
             return 0.0, 0.0
-        system, norm, memory, history = stages.system, stages.norm, stages.memory, stages.history
-        weights = norm.weights(np.maximum(memory.state_scale, state_scale))
+        system, norm, h, eps = stages.system, stages.norm, stages.h, stages.eps
+        history = stages.history
+        weights = norm.weights(np.maximum(stages.memory.state_scale, state_scale))
         weights = stages.widened(weights, scheme, last.sigmas)
         error = h * np.abs(scheme.error @ last.rates[: s + 1])
         if history is not None and stages.sigma_change > UNCERTAINTY_SIGMA_CHANGE:
             for j in last.rank_deficient:
                 if j < s:
                     uncertainty = history.uncertainty(t + scheme.c[j] * h)
-                    part = system.multiplier_part
-                    error[part] += h * abs(scheme.b[j]) * uncertainty
+                    error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
         if last.off is None:
             return norm(error, weights), 0.0
         settled = 0.0
@@ -356,71 +344,37 @@ class IteratedSweeps:
             fresh.sweeps = tuple(replace(node, rate=None, history=first) for node in memory.sweeps)
         return fresh
 
-    def _own_sweeps(
-        self,
-        system: System,
-        t: float,
-        h: float,
-        eps: float,
-        memory: SweepState,
-        stages: SweepStages,
-    ) -> list[Sweep]:
+    def _own_sweeps(self, t: float, stages: SweepStages) -> list[Sweep]:
         """Every sweep from its own state; the fused form is its one sweep with another equation."""
+        system, memory, eps, zone = stages.system, stages.memory, stages.eps, stages.zone
         fused = self.first is First.FUSED
         constant = memory.sweeps[0].first_multiplier
         first = np.zeros(system.multiplier_size) if constant is None else constant
         previous = np.tile(first, (len(nodes_of(self.scheme).c), 1))
-        near, zone = _on_branch(stages, eps), stages.zone
+        near = _on_branch(stages, eps)
         runs: list[Sweep] = []
-        for k, node in enumerate(memory.sweeps):
-            answer = _corrector(previous, eps)
-            if fused:
-
-                def answer(terms: Terms, j: int) -> tuple[FloatArray, FloatArray]:
-                    return terms.sweep(terms.prediction(), eps)
-
+        equation: SweepEquation | None = None
+        for node in memory.sweeps:
+            if equation is not None:
+                previous = equation.multipliers_at_nodes(runs[-1], self.interpolant)
+            answer = _fused(eps) if fused else _corrector(previous, eps)
+            equation = SweepEquation(system, self.scheme, t, stages.h, answer, zone, near)
             if node.rate is not None and math.isclose(eps, node.eps, rel_tol=1e-12):
                 start = Start(node.rate, node.multiplier, memory.sigma, _NO_RANK)
             else:
                 terms = system.evaluate(t, node.state, zone)
                 rate = answer(terms, 0)[0]
                 if near is not None:
+                    # With c = 1 it moves to the branch as the end of a step does.
                     terms, rate, *_ = near(terms, t, 1.0, node.state, 0, answer)
-                start = Start(
-                    rate.copy(), node.multiplier, terms.sigma, terms.rank, terms.rank_deficient
-                )
-            final = k + 1 == len(memory.sweeps)
-            run = sweep_over(
-                system,
-                self.scheme,
-                t,
-                h,
-                node.state,
-                answer,
-                start,
-                zone,
-                near,
-                exact=fused,
-                off=True,
-            )
-            runs.append(run)
-            if not final:
-                previous = multipliers_between(
-                    system, self.scheme, self.interpolant, t, h, run, answer, zone, near
-                )
+                start = Start.of(terms, rate, node.multiplier)
+            runs.append(equation.integrate(node.state, start, exact=fused, off=True))
         return runs
 
-    def _restarted_sweeps(
-        self,
-        system: System,
-        t: float,
-        h: float,
-        eps: float,
-        memory: SweepState,
-        stages: SweepStages,
-    ) -> list[Sweep]:
+    def _restarted_sweeps(self, t: float, stages: SweepStages) -> list[Sweep]:
         """All sweeps from the accepted state, whose evaluation they share."""
-        node, zone = memory.sweeps[-1], stages.zone
+        system, eps, zone = stages.system, stages.eps, stages.zone
+        node = stages.memory.sweeps[-1]
         terms, moved = system.evaluate(t, node.state, zone), None
         if _on_branch(stages, eps) is not None:
             terms, _, moved = stages(terms, t, 1.0, node.state)
@@ -431,46 +385,29 @@ class IteratedSweeps:
         exact = self.first is First.EXACT
         if exact:
             multiplier = terms.prediction().copy()
-            starts.append(
-                Start(
-                    terms.rate().copy(), multiplier, terms.sigma, terms.rank, terms.rank_deficient
-                )
-            )
+            starts.append(Start.of(terms, terms.rate(), multiplier))
         off_before = terms.correction() + (0.0 if moved is None else moved)
         previous = np.tile(multiplier, (len(nodes_of(self.scheme).c), 1))
         for _ in range(self.iterations):
             rate, multiplier = (part.copy() for part in terms.sweep(multiplier, eps))
             rate, multiplier = OnBranch(stages, eps).with_own_terms(rate, multiplier, moved)
-            starts.append(Start(rate, multiplier, terms.sigma, terms.rank, terms.rank_deficient))
+            starts.append(Start.of(terms, rate, multiplier))
         runs: list[Sweep] = []
-        for k, start in enumerate(starts):
-            predictor, final = exact and k == 0, k + 1 == len(starts)
+        equation: SweepEquation | None = None
+        for start in starts:
+            if equation is not None:
+                previous = equation.multipliers_at_nodes(runs[-1], self.interpolant)
+            predictor = exact and not runs
             answer = _predictor if predictor else _corrector(previous, eps)
             near = _on_branch(stages, None if predictor else eps)
-            run = sweep_over(
-                system,
-                self.scheme,
-                t,
-                h,
-                node.state,
-                answer,
-                start,
-                zone,
-                near,
-                exact=exact,
-                off=final,
-            )
-            runs.append(run if run.off is None else replace(run, off_before=off_before))
-            if not final:
-                previous = multipliers_between(
-                    system, self.scheme, self.interpolant, t, h, run, answer, zone, near
-                )
+            equation = SweepEquation(system, self.scheme, t, stages.h, answer, zone, near)
+            last = start is starts[-1]
+            runs.append(equation.integrate(node.state, start, exact=exact, off=last))
+        runs[-1] = replace(runs[-1], off_before=off_before)
         return runs
 
-    def _gathered(
-        self, system: System, memory: SweepState, change: float
-    ) -> tuple[SweepState, bool]:
-        """``memory`` with own histories restarted where they could change the branch, and whether.
+    def _gathered(self, system: System, memory: SweepState, change: float) -> SweepState:
+        """``memory`` with own histories restarted where they could change the branch.
 
         The distance of the first sweeps from the closures is eps (yhat - y_0), a part of sigma next
         to a singular configuration: there they follow a neighbouring level of g, which bends away.
@@ -478,106 +415,75 @@ class IteratedSweeps:
         initial layer, and their distance is eps times the change of yhat since.
         """
         if not (self.own_history and self.first is First.ZERO and system.carries_yhat):
-            return memory, False
+            return memory
         off = max(node.closure_distance for node in memory.sweeps)
         if not off > AMBIGUOUS_DISTANCE * max(0.0, memory.sigma - NEAR_STEPS * change):
-            return memory, False
+            return memory
         last = memory.sweeps[-1]
         node = replace(last, rate=None, first_multiplier=last.multiplier)
-        return replace(memory, sweeps=(node,) * len(memory.sweeps)), True
+        return replace(memory, sweeps=(node,) * len(memory.sweeps))
 
-    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
-        """Sentences about restarts, split takeovers and drift in a run with ``steps``."""
-        made = [step for step in steps if isinstance(step, SweepResult)]
-        return restarts(made) + takeovers(made) + drift(made, norm)
-
-    def _end(self, system: System, node: SweepNode, run: Sweep, t: float, eps: float) -> SweepNode:
+    def _end(self, stages: SweepStages, node: SweepNode, run: Sweep) -> SweepNode:
+        """``node`` at the end of the step."""
         multiplier = run.multipliers[self.scheme.n_stages]
         history = node.history
         if history is not None and run.exact is not None:
-            history = history.extended(t, run.exact)
-        off = 0.0 if run.off is None else system.position_norm(run.off)
+            history = history.extended(stages.end, run.exact)
+        off = 0.0 if run.off is None else stages.system.position_norm(run.off)
         rate = run.end_rate if self.own_history else None
-        return SweepNode(run.state, multiplier, rate, eps, history, off, node.first_multiplier)
+        return SweepNode(
+            run.state, multiplier, rate, stages.eps, history, off, node.first_multiplier
+        )
 
-    def _check_closures(
-        self, system: System, t: float, state: FloatArray, h: float, eps: float
-    ) -> None:
-        """Refuse a step whose sweeps came apart.
+    def _check_closures(self, stages: SweepStages, state: FloatArray) -> None:
+        """Refuse a step to ``state`` whose sweeps came apart.
 
         Raises
         ------
         EvaluationError
             Names the stability limit, where the ratio h/eps is beyond it.
         """
+        system = stages.system
         if not system.has_constraints:
             return
-        if np.isfinite(state).all() and system.constraint_residual(t, state) < LARGEST_RESIDUAL:
+        if np.isfinite(state).all() and (
+            system.constraint_residual(stages.end, state) < LARGEST_RESIDUAL
+        ):
             return
-        limit = real_stability_limit(self.scheme)
+        limit, ratio = real_stability_limit(self.scheme), stages.h / stages.eps
         reason = (
-            f"; h/eps = {h / eps:.3g} is beyond {limit:.3g}, up to which {self.scheme.name} is "
+            f"; h/eps = {ratio:.3g} is beyond {limit:.3g}, up to which {self.scheme.name} is "
             "stable: use a larger eps or a smaller step"
-            if h / eps > limit
-            else f" with h/eps = {h / eps:.3g}; use a larger eps, fewer sweeps or a smaller step"
+            if ratio > limit
+            else f" with h/eps = {ratio:.3g}; use a larger eps, fewer sweeps or a smaller step"
         )
         raise EvaluationError(f"the sweeps leave the constraints{reason}")
 
-
-def drift(steps: Sequence[SweepResult], norm: ErrorNorm) -> str:
-    """A sentence about a last sweep whose constraint error exceeds the tolerance."""
-    worst = max(steps, key=lambda step: step.drift_ratio, default=None)
-    if norm.negligible == 0.0 or worst is None or not worst.drift_ratio > REPORTED_DRIFT:
-        return ""
-    return (
-        f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times the "
-        f"tolerance (at t = {worst.t + worst.h:.6g} s), which no step-size control mends: sweeps "
-        "are accurate to a power of eps. Use restarted sweeps (restart=True, carry=True), a "
-        "smaller eps, or PSRM."
-    )
-
-
-def takeovers(steps: Sequence[SweepResult]) -> str:
-    """A sentence about the steps that the split form made (split takeover)."""
-    times = [step.t for step in steps if step.taken_over]
-    if not times:
-        return ""
-    return (
-        f" {len(times)} steps next to singular configurations, the first at t = {times[0]:.6g} s, "
-        "are of the split PSRM: rounding would have exceeded the tolerance in sweeps."
-    )
-
-
-def restarts(steps: Sequence[SweepResult]) -> str:
-    """A sentence about sweeps with own histories that were restarted."""
-    times = [step.t for step in steps if step.restarted]
-    if not times:
-        return ""
-    return (
-        f" The sweeps gave up their own histories in {len(times)} steps, first at "
-        f"t = {times[0]:.6g} s: sigma was falling, they were too far off the constraints to tell "
-        "the branch if a singular configuration came, and started again from the accepted state."
-    )
-
-
-def psrm_sweeps(
-    scheme: ButcherTableau,
-    prediction: str,
-    correction: str,
-    eps: Regularisation,
-    how: DenseExtension | str,
-) -> IteratedSweeps:
-    """The forms of PSRM with a corrector sweep; parameters as for
-    :class:`~srm_mbs.integration.methods.psrm.PSRM`, and ``how`` from
-    :func:`~srm_mbs.integration.methods.thesis.sweep.interpolant`."""
-    fused = correction == "fused"
-    exact = First.FUSED if fused else First.EXACT
-    first = First.HELD if prediction == "simple" else exact
-    return IteratedSweeps(scheme, first, 1, fused, eps, how)
-
-
-def psrm_eps(prediction: str, order: int) -> Regularisation:
-    """The default regularisation of those forms, for a tableau of that ``order``."""
-    if prediction == "simple":
-        return parse_eps("h")
-    return parse_eps("h^(1/3)" if order >= 5 else "h^(2/3)")
+    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
+        """Sentences about restarts, split takeovers and drift in a run with ``steps``."""
+        made = [step for step in steps if isinstance(step, SweepResult)]
+        restarted = [step.t for step in made if step.restarted]
+        taken_over = [step.t for step in made if step.taken_over]
+        text = ""
+        if restarted:
+            text += (
+                f" The sweeps gave up their own histories in {len(restarted)} steps, first at "
+                f"t = {restarted[0]:.6g} s: sigma was falling, they were too far off the "
+                "constraints to tell the branch if a singular configuration came, and started "
+                "again from the accepted state."
+            )
+        if taken_over:
+            text += (
+                f" {len(taken_over)} steps next to singular configurations, the first at "
+                f"t = {taken_over[0]:.6g} s, are of the split PSRM: rounding would have exceeded "
+                "the tolerance in sweeps."
+            )
+        worst = max(made, key=lambda step: step.drift_ratio, default=None)
+        if norm.negligible > 0.0 and worst is not None and worst.drift_ratio > REPORTED_DRIFT:
+            text += (
+                f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times "
+                f"the tolerance (at t = {worst.t + worst.h:.6g} s), which no step-size control "
+                "mends: sweeps are accurate to a power of eps. Use restarted sweeps "
+                "(restart=True, carry=True), a smaller eps, or PSRM."
+            )
+        return text

@@ -9,42 +9,34 @@ DAEs, (2.2) or (2.4) (:class:`srm_mbs.SemiExplicitDAE`).  The result is sweep m.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import System
 from srm_mbs.errors import InputError
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
+from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
-from srm_mbs.integration.methods.thesis.sweep import (
-    SweepResult,
-    SweepState,
-    checked_regulariser,
-    interpolant,
-)
+from srm_mbs.integration.methods.thesis.sweep import checked_regulariser, interpolant
 
 LARGEST_CARRIED = 3
 """Number of sweeps up to which restarting with the carried multiplier is stable (measured)."""
 
 
 @dataclass(frozen=True)
-class SRM:
+class SRM(DelegatingMethod):
     r"""SRM with m sweeps.
 
-    Theory: O(eps^m) + O(h^p), so min(m, p) with eps = h.  Observed (``tests/test_methods.py``):
-    2 for mechanisms with tvd32 and erk4, whose linear interpolation of the multiplier is of second
-    order; about 3 with dopr54 and m = 5, because with eps = h an explicit scheme has stage order 1
-    on the terms in 1/eps; 1 when restarted from multiplier 0, and 2 with ``carry``, whose first
-    multiplier is constant over the step, whatever m.  The higher orders of the thesis show on its
-    problem 1, which has no error but these.
+    Theory: O(eps^m) + O(h^p), so min(m, p) with eps = h.  Observed
+    (``tests/integration/methods/thesis/test_sweeps.py``): 2 for mechanisms with tvd32 and erk4,
+    whose linear interpolation of the multiplier is of second order; about 3 with dopr54 and m = 5,
+    because with eps = h an explicit scheme has stage order 1 on the terms in 1/eps; 1 when
+    restarted from multiplier 0, and 2 with ``carry``, whose first multiplier is constant over the
+    step, whatever m.  The higher orders of the thesis show on its problem 1, which has no error but
+    these.
 
     With step-size control, singular configurations that rounding keeps such short steps from
     passing within the tolerance are passed by the split form of the same tableau
@@ -100,14 +92,12 @@ class SRM:
     interpolation: str = "auto"
 
     def __post_init__(self) -> None:
-        scheme = get_tableau(self.tableau)
-        m = self.iterations
+        order, m = self.scheme.order, self.iterations
         if m is None:
-            m = min(scheme.order, LARGEST_CARRIED) if self.carry else scheme.order
-            object.__setattr__(self, "iterations", m)
+            m = min(order, LARGEST_CARRIED) if self.carry else order
         if isinstance(m, np.integer):
             m = int(m)
-            object.__setattr__(self, "iterations", m)
+        object.__setattr__(self, "iterations", m)
         if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise InputError(
                 f"iterations = {m!r} is not a number of sweeps",
@@ -134,12 +124,7 @@ class SRM:
                 remedy=f"Use at most {LARGEST_CARRIED} sweeps, or carry=False",
             )
         checked_regulariser(self.T)
-        self.sweeps  # noqa: B018 - bad eps or interpolation is refused now
-
-    @property
-    def scheme(self) -> ButcherTableau:
-        """The Runge-Kutta data."""
-        return get_tableau(self.tableau)
+        self.stepper  # noqa: B018 - bad eps or interpolation is refused now
 
     @cached_property
     def regularisation(self) -> Regularisation:
@@ -147,9 +132,9 @@ class SRM:
         return parse_eps(self.eps)
 
     @cached_property
-    def sweeps(self) -> IteratedSweeps:
+    def stepper(self) -> Method:
         """The sweeps of a step."""
-        return IteratedSweeps(
+        sweeps = IteratedSweeps(
             self.scheme,
             First.HELD if self.carry else First.ZERO,
             self.iterations or 1,
@@ -157,35 +142,4 @@ class SRM:
             self.regularisation,
             interpolant(self.scheme, self.interpolation),
         )
-
-    def start(
-        self, system: System, t: float, state: FloatArray, norm: ErrorNorm
-    ) -> IntegratorState:
-        """All sweeps at the initial state."""
-        return self.sweeps.start(system, t, state, norm)
-
-    def step(
-        self,
-        system: System,
-        t: float,
-        h: float,
-        state: FloatArray,
-        memory: IntegratorState,
-        norm: ErrorNorm,
-    ) -> StepResult:
-        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        return self.sweeps.step(system, t, h, state, cast(SweepState, memory), norm)
-
-    def accept(self, memory: IntegratorState, result: StepResult) -> None:
-        """Move ``memory`` to the end of an accepted step."""
-        self.sweeps.accept(cast(SweepState, memory), cast(SweepResult, result))
-
-    def resume(
-        self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
-    ) -> IntegratorState:
-        """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
-        return self.sweeps.resume(system, t, state, cast(SweepState, memory), norm)
-
-    def run_messages(self, steps: Sequence[StepResult], norm: ErrorNorm) -> str:
-        """Sentences about sweeps in the message of a run."""
-        return self.sweeps.run_messages(steps, norm)
+        return cast(Method, sweeps)  # its memory is its own, a SweepState

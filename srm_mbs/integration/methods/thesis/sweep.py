@@ -158,11 +158,12 @@ class SweepStages(BranchStages):
 
     Parameters
     ----------
-    memory_span
-        How long a sweep keeps a constraint error, eps (s).
+    eps
+        Regularisation (s); a sweep keeps a constraint error for about as long.
     """
 
-    memory_span: float = 0.0
+    memory: SweepState
+    eps: float = 0.0
 
     def reach(self) -> float:
         """sigma below which the step is next to a singular configuration.
@@ -170,7 +171,7 @@ class SweepStages(BranchStages):
         By time, not by steps alone: errors kept over many short steps grow like 1/sigma^2 in the
         multiplier, and with h ~ sigma^1.5, which keeps that small, no run arrives.
         """
-        spans = max(1.0, self.memory_span / self.h)
+        spans = max(1.0, self.eps / self.h)
         return NEAR_STEPS * spans * self.sigma_change if self.sigma_change > 0.0 else WATCHED_SIGMA
 
     def rotation_drift(self, off: FloatArray, sigma: float) -> FloatArray:
@@ -258,6 +259,11 @@ class Start:
     rank: int
     rank_deficient: bool = False
 
+    @classmethod
+    def of(cls, terms: Terms, rate: FloatArray, multiplier: FloatArray) -> Start:
+        """With the ``rate`` and the ``multiplier`` that follow from ``terms``."""
+        return cls(rate.copy(), multiplier, terms.sigma, terms.rank, terms.rank_deficient)
+
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
@@ -340,128 +346,132 @@ class OnBranch:
         return rate, multiplier + moved[system.multiplier_part] / self.eps
 
 
-def sweep_over(
-    system: System,
-    scheme: ButcherTableau,
-    t: float,
-    h: float,
-    state: FloatArray,
-    answer: Answer,
-    start: Start | None = None,
-    zone: Zone | None = None,
-    near: OnBranch | None = None,
-    *,
-    exact: bool = False,
-    off: bool = False,
-) -> Sweep:
-    """Integrate one sweep's equation from ``state`` at ``t`` over ``h``.
+@dataclass(frozen=True, eq=False)
+class SweepEquation:
+    """The equation of one sweep over the step from ``t`` to ``t + h``.
 
     Parameters
     ----------
     answer
         The equation.
-    start
-        The first stage, if it is known; evaluated otherwise.
+    zone
+        The zone of the step.
     near
         How stages next to a singular configuration are evaluated; by default like all others.
-    exact
-        Keep yhat by the exact prediction at the end point.
-    off
-        Keep how far the end point lies off the closures.
-
-    Raises
-    ------
-    EvaluationError
-        If a stage cannot be evaluated.
     """
-    nodes, s = nodes_of(scheme), scheme.n_stages
-    n = len(nodes.c)
-    if start is None:
-        terms = system.evaluate(t, state, zone)
-        rate, multiplier = answer(terms, 0)
-        start = Start(rate, multiplier, terms.sigma, terms.rank, terms.rank_deficient)
-    rates = np.empty((n, system.tangent_size))
-    multipliers = np.empty((n, start.multiplier.size))
-    sigmas = np.empty(s + 1)
-    rates[0], multipliers[0], sigmas[0] = start.rate, start.multiplier, start.sigma
-    rank = start.rank
-    weak = [0] if start.rank_deficient else []
-    end_state, end_rate = state, start.rate
-    end_exact: FloatArray | None = None
-    end_off: FloatArray | None = None
-    for j in range(1, n):
-        delta = (h * nodes.A[j, :j]) @ rates[:j]
-        x = system.retract(state, delta)
-        c = float(nodes.c[j])
-        terms = system.evaluate(t + c * h, x, zone)
-        if j <= s:
-            sigmas[j] = terms.sigma
-        moved: FloatArray | None = None
-        if near is not None and c > 0.0:
-            terms, rate, multipliers[j], moved = near(terms, t + c * h, c, x, j, answer)
-        else:
-            rate, multipliers[j] = answer(terms, j)
-        rates[j] = system.chart_rate(delta, rate)
-        rank = min(rank, terms.rank)
-        if terms.rank_deficient:
-            weak.append(j)
-        if j == s:
-            end_state, end_rate = x, rate.copy()
-            if exact and not terms.rank_deficient:
-                end_exact = terms.multiplier().copy()
-            if off:
-                end_off = terms.correction() + (0.0 if moved is None else moved)
-    return Sweep(
-        state,
-        end_state,
-        rates,
-        multipliers,
-        end_rate,
-        sigmas,
-        rank,
-        tuple(weak),
-        end_exact,
-        end_off,
-    )
 
+    system: System
+    scheme: ButcherTableau
+    t: float
+    h: float
+    answer: Answer
+    zone: Zone | None = None
+    near: OnBranch | None = None
 
-def multipliers_between(
-    system: System,
-    scheme: ButcherTableau,
-    how: DenseExtension | str,
-    t: float,
-    h: float,
-    sweep: Sweep,
-    answer: Answer,
-    zone: Zone | None = None,
-    near: OnBranch | None = None,
-) -> FloatArray:
-    """The multiplier of ``sweep`` at all nodes (s + 1 + e, k), for the next sweep.
+    def evaluate(self, c: float, x: FloatArray) -> Terms:
+        """Terms of the state ``x`` at the abscissa ``c``.
 
-    An extension gives the state there, at which ``answer`` gives the multiplier; the ends of the
-    step keep the values that the sweep has there.
-    """
-    if how == "stages":
-        return sweep.multipliers
-    c, end = nodes_of(scheme).c, scheme.n_stages
-    first, last = sweep.multipliers[0], sweep.multipliers[end]
-    if isinstance(how, str):
-        line: FloatArray = first + c[:, None] * (last - first)
-        return line
-    out = np.empty_like(sweep.multipliers)
-    done: dict[float, int] = {0.0: 0, 1.0: end}
-    out[0], out[end] = first, last
-    for j, theta in enumerate(c.tolist()):
-        if theta in done:
-            out[j] = out[done[theta]]
-            continue
-        weights = how.weights(theta)[0]
-        delta = (h * weights) @ sweep.rates[: how.n_rates]
-        x = system.retract(sweep.start, delta)
-        terms = system.evaluate(t + theta * h, x, zone)
-        if near is not None:
-            out[j] = near(terms, t + theta * h, theta, x, j, answer)[2]
-        else:
-            out[j] = answer(terms, j)[1]
-        done[theta] = j
-    return out
+        Raises
+        ------
+        EvaluationError
+            If it cannot be evaluated.
+        """
+        return self.system.evaluate(self.t + c * self.h, x, self.zone)
+
+    def at(
+        self, terms: Terms, c: float, x: FloatArray, j: int
+    ) -> tuple[Terms, FloatArray, FloatArray, FloatArray | None]:
+        """As :class:`OnBranch`, for the node ``j`` with ``terms`` at ``x``."""
+        if self.near is None:
+            return terms, *self.answer(terms, j), None
+        return self.near(terms, self.t + c * self.h, c, x, j, self.answer)
+
+    def integrate(
+        self, state: FloatArray, start: Start, *, exact: bool = False, off: bool = False
+    ) -> Sweep:
+        """The sweep from ``state``, where it is at ``start``.
+
+        Parameters
+        ----------
+        exact
+            Keep yhat by the exact prediction at the end point.
+        off
+            Keep how far the end point lies off the closures.
+
+        Raises
+        ------
+        EvaluationError
+            If a stage cannot be evaluated.
+        """
+        system, h = self.system, self.h
+        nodes, s = nodes_of(self.scheme), self.scheme.n_stages
+        n = len(nodes.c)
+        rates = np.empty((n, system.tangent_size))
+        multipliers = np.empty((n, start.multiplier.size))
+        sigmas = np.empty(s + 1)
+        rates[0], multipliers[0], sigmas[0] = start.rate, start.multiplier, start.sigma
+        rank = start.rank
+        weak = [0] if start.rank_deficient else []
+        end_exact: FloatArray | None = None
+        end_off: FloatArray | None = None
+        for j in range(1, n):
+            delta = (h * nodes.A[j, :j]) @ rates[:j]
+            x = system.retract(state, delta)
+            c = float(nodes.c[j])
+            terms = self.evaluate(c, x)
+            if j <= s:
+                sigmas[j] = terms.sigma
+            terms, rate, multipliers[j], moved = self.at(terms, c, x, j)
+            rates[j] = system.chart_rate(delta, rate)
+            rank = min(rank, terms.rank)
+            if terms.rank_deficient:
+                weak.append(j)
+            if j == s:
+                end_state, end_rate = x, rate.copy()
+                if exact and not terms.rank_deficient:
+                    end_exact = terms.multiplier().copy()
+                if off:
+                    end_off = terms.correction() + (0.0 if moved is None else moved)
+        return Sweep(
+            state,
+            end_state,
+            rates,
+            multipliers,
+            end_rate,
+            sigmas,
+            rank,
+            tuple(weak),
+            end_exact,
+            end_off,
+        )
+
+    def multipliers_at_nodes(self, sweep: Sweep, how: DenseExtension | str) -> FloatArray:
+        """The multiplier of ``sweep`` at all nodes (s + 1 + e, k), for the next sweep.
+
+        An extension gives the state there, at which the equation gives the multiplier; the ends of
+        the step keep the values that the sweep has there.
+
+        Parameters
+        ----------
+        how
+            From :func:`interpolant`.
+        """
+        if how == "stages":
+            return sweep.multipliers
+        c, end = nodes_of(self.scheme).c, self.scheme.n_stages
+        first, last = sweep.multipliers[0], sweep.multipliers[end]
+        if isinstance(how, str):
+            line: FloatArray = first + c[:, None] * (last - first)
+            return line
+        out = np.empty_like(sweep.multipliers)
+        done: dict[float, int] = {0.0: 0, 1.0: end}
+        out[0], out[end] = first, last
+        for j, theta in enumerate(c.tolist()):
+            if theta in done:
+                out[j] = out[done[theta]]
+                continue
+            delta = (self.h * how.weights(theta)[0]) @ sweep.rates[: how.n_rates]
+            x = self.system.retract(sweep.start, delta)
+            out[j] = self.at(self.evaluate(theta, x), theta, x, j)[2]
+            done[theta] = j
+        return out

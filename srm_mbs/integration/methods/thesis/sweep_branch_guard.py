@@ -21,6 +21,7 @@ from srm_mbs.integration.control.branch_guard import (
 from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
 from srm_mbs.integration.methods.base import Method, StepResult
 from srm_mbs.integration.methods.near_singular import AMBIGUOUS_DISTANCE
+from srm_mbs.integration.methods.thesis.iterated_sweeps import IteratedSweeps
 from srm_mbs.integration.methods.thesis.sweep import SweepResult
 
 DEPARTED = 10.0
@@ -150,6 +151,6 @@ def branch_guard(control: StepSizeControl, system: System, method: Method) -> Br
     """The branch guard of a run around ``control``: of a mechanism, or of a DAE, whose states are
     of first order, and with or without sweeps."""
     first_order = system.multiplier_part.start == 0
-    if getattr(method, "sweeps", None) is None:
-        return (RateBranchGuard if first_order else BranchGuard)(control, system)
-    return (SweepRateBranchGuard if first_order else SweepBranchGuard)(control, system)
+    if isinstance(getattr(method, "stepper", None), IteratedSweeps):
+        return (SweepRateBranchGuard if first_order else SweepBranchGuard)(control, system)
+    return (RateBranchGuard if first_order else BranchGuard)(control, system)

@@ -23,6 +23,8 @@ else for (const text of scene) {
 }
 
 const element = (id) => document.getElementById(id);
+const add = (parent, tag, properties) =>
+  Object.assign(parent.appendChild(document.createElement(tag)), properties);
 const animator = viewer.animator, slider = element("time"), clock = document.querySelector("output");
 
 // The picture is made for one shape of window: step back in a narrower one.
@@ -50,20 +52,18 @@ function add_row(label, unit) {
 function fill_panel() {
   cells = [];
   document.querySelector("#panel table").replaceChildren();
-  element("notes").replaceChildren();
+  const notes = element("notes");
+  notes.replaceChildren();
   element("name").textContent = document.title;
   if (about.panel) add_row("t", "s");
   for (const value of about.values) add_row(value.label, value.unit);
   for (const note of about.notes) {
-    const text = element("notes").appendChild(document.createElement("div"));
-    text.textContent = note.text;
+    add(notes, "div", { textContent: note.text });
     if (!note.ramp) continue;
-    const ramp = element("notes").appendChild(document.createElement("div"));
-    ramp.className = "ramp";
-    ramp.style.background = `linear-gradient(to right, ${note.ramp.join(", ")})`;
-    const ends = element("notes").appendChild(document.createElement("div"));
-    ends.className = "ends";
-    for (const end of note.ends) ends.appendChild(document.createElement("span")).textContent = end;
+    const background = `linear-gradient(to right, ${note.ramp.join(", ")})`;
+    add(notes, "div", { className: "ramp" }).style.background = background;
+    const ends = add(notes, "div", { className: "ends" });
+    for (const end of note.ends) add(ends, "span", { textContent: end });
   }
   element("panel").hidden = !about.panel && !about.notes.length;
 }
@@ -104,10 +104,8 @@ function fixed(time, digits) {
 
 // Bar: meshcat's own controls remain under "Open Controls".
 for (const speed of SPEEDS) {
-  const option = element("speed").appendChild(document.createElement("option"));
-  option.value = speed;
-  option.textContent = `${speed}\u00d7`;
-  option.selected = speed === 1;
+  const textContent = `${speed}\u00d7`;
+  add(element("speed"), "option", { value: speed, textContent, selected: speed === 1 });
 }
 function seek(time) {
   animator.pause();
@@ -165,19 +163,19 @@ function lay_out() {
   if (scene === null) away = 1;  // the camera's place has come with the animation
 }
 
-// A page that follows a run is told by the server what there is to say about it in the end.
-let told;
-function listen() {
-  const news = viewer.scene_tree.find(["about"]).object.about;
-  if (news === undefined || news === told) return;
-  told = news;
-  about = { ...JSON.parse(news), live: [] };
+// At the end of a run that the page follows, the server sends its values, passages and notes.
+let received;
+function receive() {
+  const sent = viewer.scene_tree.find(["about"]).object.about;
+  if (sent === undefined || sent === received) return;
+  received = sent;
+  about = { ...JSON.parse(sent), live: [] };
   fill_panel();
   laid_out = null;
 }
 
 (function show() {
-  if (about.live) listen();
+  if (about.live) receive();
   if (laid_out !== animator.actions) lay_out();
   slider.value = animator.time;
   element("toggle").textContent = animator.playing ? "Pause" : "Play";

@@ -1,34 +1,38 @@
-"""SRM and the forms of PSRM: orders beside theory, singular passages, tolerances, bad input.
+"""SRM and the forms of PSRM with sweeps: orders beside theory, singular passages, tolerances.
 
-The split form, the default, has its own tests (``test_orders.py``, ``test_singular_passages.py``).
+The split form has its own tests (``test_orders.py``, ``test_singular_passages.py``).
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.methods.thesis.regularisation import parse_eps, real_stability_limit
-from tests.support import reduced
+from tests.support import slider_crank
 from tests.support.bundled import load
-from tests.support.convergence import observed_order, turning
+from tests.support.convergence import fitted_order, observed_order, turning
+from tests.support.references import error_across
+from tests.support.snapshots import check_refusals
 
 COARSE = (2e-2, 1e-2, 5e-3)
 FINE = (1e-2, 5e-3, 2.5e-3)
+RESTARTED = {"restart": True, "carry": True}
 
 
 @pytest.mark.parametrize(
     ("method", "steps", "theory", "tolerance"),
     [
-        # eps = h: min(m, p), as far as stage order and linear interpolation allow
+        # eps = h: min(m, p), as far as stage order and linear interpolation (order 2) allow
         (srm.SRM("fe", 1), COARSE, 1.0, 0.1),
         (srm.SRM("trap", 2), FINE, 2.0, 0.1),
         (srm.SRM("tvd32", 2), COARSE, 2.0, 0.1),
+        (srm.SRM("erk4", 4), COARSE, 2.0, 0.1),
         (srm.SRM("dopr54", 5), COARSE, 3.0, 0.15),
-        (srm.SRM("erk4", 3, restart=True, carry=True), COARSE, 2.0, 0.1),
+        (srm.SRM("erk4", 3, **RESTARTED), COARSE, 2.0, 0.1),
         (srm.SRM("tvd32", 3, restart=True), COARSE, 1.0, 0.1),
         (srm.PSRM("erk4", "simple"), FINE, 2.0, 0.1),
         (srm.PSRM("trap", "simple"), FINE, 2.0, 0.1),
@@ -49,15 +53,18 @@ def test_observed_orders_on_a_mechanism(
     assert order == pytest.approx(theory, abs=tolerance)
 
 
-def test_more_sweeps_than_two_do_not_raise_the_order_with_linear_interpolation() -> None:
-    """The docstring of SRM says so: erk4 with m = 4 is of order 2 on mechanisms, not 4."""
-    order = observed_order(turning("slider_crank_regular", 2.0), srm.SRM("erk4", 4), COARSE)
-    assert order == pytest.approx(2.0, abs=0.1)
-
-
-def crank_error(solution: srm.Solution, t_end: float) -> float:
-    theta, omega = reduced.integrate(reduced.slider_crank(), [7 * np.pi / 4, 0.0], t_end)
-    return max(abs(solution.q[-1, 0] - theta), abs(solution.v[-1, 0] - omega))
+def runs_within(
+    method: Any, t_end: float, tolerances: dict[float, float], passages: int | None = None
+) -> list[srm.Solution]:
+    """Runs of slider_crank whose errors are within the bound of each tolerance; the number of
+    their ``passages``, where it is given, is checked as well."""
+    runs = []
+    for tol, bound in tolerances.items():
+        run = srm.simulate(load("slider_crank"), t_end, method=method, rtol=tol, atol=tol)
+        assert slider_crank.error(run) < bound
+        assert passages is None or len(run.crossings) == passages
+        runs.append(run)
+    return runs
 
 
 @pytest.mark.parametrize(
@@ -75,25 +82,15 @@ def crank_error(solution: srm.Solution, t_end: float) -> float:
 def test_exact_sweeps_pass_singular_configurations_and_follow_the_tolerance(
     method: srm.PSRM, bounds: tuple[float, float]
 ) -> None:
-    for tol, bound in zip((1e-5, 1e-7), bounds):
-        solution = srm.simulate(load("slider_crank"), 5.0, method=method, rtol=tol, atol=tol)
-        assert solution.success, solution.message
-        assert len(solution.crossings) == 2
-        assert crank_error(solution, 5.0) < bound
+    runs_within(method, 5.0, dict(zip((1e-5, 1e-7), bounds)), passages=2)
 
 
-@pytest.mark.parametrize(
-    "method", [srm.SRM("tvd32", 3), srm.SRM("tvd32", 3, restart=True, carry=True)], ids=str
-)
+@pytest.mark.parametrize("method", [srm.SRM("tvd32", 3), srm.SRM("tvd32", 3, **RESTARTED)], ids=str)
 def test_srm_passes_singular_configurations_with_the_step_of_the_thesis(method: srm.SRM) -> None:
     solution = srm.simulate(load("slider_crank"), 2.0, method=method, step=5e-3)
-    assert solution.success
-    assert crank_error(solution, 2.0) < 1e-3
-    assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < 1e-3
+    assert slider_crank.error(solution) < 1e-3
+    assert slider_crank.off_branch(solution.q) < 1e-3
     assert solution.drift[:, 0].max() < 1e-4
-
-
-RESTARTED = {"restart": True, "carry": True}
 
 
 @pytest.mark.parametrize(
@@ -109,12 +106,8 @@ RESTARTED = {"restart": True, "carry": True}
 def test_adaptive_sweeps_pass_a_singular_configuration_and_follow_the_tolerance(
     method: Any, bounds: tuple[float, float]
 ) -> None:
-    """Nothing is singular about the step size there: at 1e-5 SRM used to stall at the passage."""
-    for tol, bound in zip((1e-4, 1e-5), bounds):
-        solution = srm.simulate(load("slider_crank"), 1.6, method=method, rtol=tol, atol=tol)
-        assert solution.success, solution.message
-        assert len(solution.crossings) == 1
-        assert crank_error(solution, 1.6) < bound
+    """The steps do not become short there."""
+    for solution in runs_within(method, 1.6, dict(zip((1e-4, 1e-5), bounds)), passages=1):
         assert solution.stats.rejected < 0.2 * solution.stats.steps
 
 
@@ -135,12 +128,9 @@ def test_adaptive_sweeps_pass_a_singular_configuration_and_follow_the_tolerance(
 def test_adaptive_sweeps_meet_no_impasse_where_the_thesis_control_does(
     method: Any, bounds: tuple[float, float]
 ) -> None:
-    """Its estimate compared two sweeps' trajectories and stalled near t = 34.5."""
-    for tol, bound in zip((1e-4, 1e-5), bounds):
-        solution = srm.simulate(load("slider_crank"), 40.0, method=method, rtol=tol, atol=tol)
-        assert solution.success, solution.message
-        assert crank_error(solution, 40.0) < bound
-        assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < bound
+    """The thesis' estimate compares two sweeps' trajectories and stalls near t = 34.5."""
+    for solution, bound in zip(runs_within(method, 40.0, dict(zip((1e-4, 1e-5), bounds))), bounds):
+        assert slider_crank.off_branch(solution.q) < bound
 
 
 @pytest.mark.parametrize(
@@ -169,7 +159,7 @@ def test_orders_hold_through_spatial_dead_points(
     for h in steps:
         solution = srm.simulate(mechanism, 1.5, method=method, step=h)
         errors.append(np.abs(solution.q[-1] - reference.q[-1]).max())
-    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] > order - 0.3
+    assert fitted_order(steps, errors) > order - 0.3
 
 
 @pytest.mark.stress
@@ -186,7 +176,7 @@ def test_a_mechanism_that_turns_in_many_short_steps_is_reported(
     )
     method = srm.PSRM("dopr54", correction="sweep", interpolation="linear")
     solution = srm.simulate(load("slider_crank"), 1.5, method=method, rtol=1e-4, atol=1e-4)
-    assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() > 0.1
+    assert slider_crank.off_branch(solution.q) > 0.1
     assert "the velocity turned" in solution.message
 
 
@@ -195,8 +185,8 @@ LINEAR = srm.PSRM("dopr54", correction="sweep", interpolation="linear")
 
 @pytest.mark.parametrize("tol", [1e-4, pytest.param(1e-5, marks=pytest.mark.stress)])
 def test_constraint_errors_of_restarted_sweeps_stay_near_the_tolerance(tol: float) -> None:
-    """They last for about eps, many steps: what a step adds says little about what is left.
-    Counted as it is, it left closure rates of 90 and 123 tolerances; some 7 remain."""
+    """They last for about eps, many steps: what a step adds says little about what is left.  The
+    estimate counts them as they settle."""
     solution = srm.simulate(load("slider_crank_regular"), 3.0, method=LINEAR, rtol=tol, atol=tol)
     assert solution.success
     assert solution.drift[:, 1].max() < 12.0 * tol
@@ -207,14 +197,14 @@ def test_constraint_errors_of_restarted_sweeps_stay_near_the_tolerance(tol: floa
 def test_two_sweeps_with_linear_interpolation_pass_singular_configurations(
     tol: float, error: float
 ) -> None:
-    """To t = 70, 33 passages: they stopped in the 24th with steps of 1e-11 s."""
+    """To t = 70, 33 of them, with steps that do not become short."""
     solution = srm.simulate(load("slider_crank"), 70.0, method=LINEAR, rtol=tol)
     reference = srm.simulate(load("slider_crank"), 70.0, rtol=1e-11)
     assert solution.success
     assert "turned" not in solution.message
     assert len(solution.crossings) == len(reference.crossings)
     assert np.abs(solution.q[-1] - reference.q[-1]).max() < error
-    assert np.abs(solution.q[:, 1] + 2.0 * solution.q[:, 0]).max() < 10.0 * tol
+    assert slider_crank.off_branch(solution.q) < 10.0 * tol
     assert np.diff(solution.steps.times).min() > 1e-3
 
 
@@ -257,7 +247,7 @@ def test_the_error_estimate_vanishes_with_the_step() -> None:
     """No impasse: neither the gap between sweeps nor eps = h leaves a floor."""
     mechanism = turning("slider_crank_regular", 2.0)
     solution = srm.simulate(
-        mechanism, 0.5, method=srm.SRM("tvd32", 3, restart=True, carry=True), rtol=1e-5, atol=1e-5
+        mechanism, 0.5, method=srm.SRM("tvd32", 3, **RESTARTED), rtol=1e-5, atol=1e-5
     )
     small = np.diff(solution.steps.times) < 0.2 * np.diff(solution.steps.times).max()
     assert solution.success
@@ -309,56 +299,22 @@ def test_beyond_the_stability_limit_the_run_ends_and_says_so() -> None:
     assert 1 <= len(solution.t) < 100
 
 
-@pytest.mark.parametrize(
-    ("name", "limit"),
-    [("fe", 2.0), ("trap", 2.0), ("tvd32", 2.51), ("erk4", 2.79), ("dopr54", 3.31)],
-)
-def test_real_stability_limits_are_the_known_ones(name: str, limit: float) -> None:
-    assert real_stability_limit(srm.TABLEAUS[name]) == pytest.approx(limit, abs=6e-3)
+REFUSED: dict[str, dict[str, Any]] = {
+    "unknown tableau": {"tableau": "nonsense"},
+    "no sweeps": {"iterations": 0},
+    "number of sweeps as a float": {"iterations": 2.0},
+    "number of sweeps as a bool": {"iterations": True},
+    "eps as a word": {"eps": "fast"},
+    "carry without restart": {"carry": True},
+    "restart as a word": {"restart": "yes"},
+    "carry with many sweeps": {"restart": True, "carry": True, "iterations": 4},
+    "unknown T": {"T": "both"},
+    "interpolation of PSRM": {"interpolation": "stages"},
+}
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        (0.3, 0.3),
-        ("h", 0.01),
-        ("5h", 0.05),
-        ("0.5 * h", 0.005),
-        ("h^0.5", 0.1),
-        ("h^(2/3)", 0.01 ** (2 / 3)),
-        ("2h**2", 2e-4),
-    ],
-)
-def test_eps_is_a_time_a_multiple_or_a_power_of_the_step(text: Any, value: float) -> None:
-    assert parse_eps(text)(0.01) == pytest.approx(value, rel=1e-14)
-
-
-@pytest.mark.parametrize(
-    "eps", [0.0, -1.0, float("nan"), "-h", "0h", "k", "h^", "h^(1/0)", "h+1", "", None, True, [1]]
-)
-def test_any_other_eps_is_refused(eps: Any) -> None:
-    with pytest.raises(srm.InputError, match="eps"):
-        parse_eps(eps)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"tableau": "nonsense"}, "there is no tableau"),
-        ({"iterations": 0}, "iterations"),
-        ({"iterations": 2.0}, "iterations"),
-        ({"iterations": True}, "iterations"),
-        ({"eps": "fast"}, "eps"),
-        ({"carry": True}, "restart=True"),
-        ({"restart": "yes"}, "neither True nor False"),
-        ({"restart": True, "carry": True, "iterations": 4}, "unstable"),
-        ({"T": "both"}, "'identity', 'transpose', 'inverse'"),
-        ({"interpolation": "stages"}, "'auto', 'linear'"),
-    ],
-)
-def test_srm_refuses_what_makes_no_sense(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(srm.InputError, match=words):
-        srm.SRM(**options)
+def test_srm_refuses_what_makes_no_sense() -> None:
+    check_refusals("srm", {case: partial(srm.SRM, **given) for case, given in REFUSED.items()})
 
 
 def test_open_chains_run_with_any_method() -> None:
@@ -373,7 +329,7 @@ def test_open_chains_run_with_any_method() -> None:
     ("method", "rtol", "bound"),
     [
         ("srm", 1e-8, 5e-9),
-        (srm.SRM("dopr54", restart=True, carry=True), 1e-8, 1e-10),
+        (srm.SRM("dopr54", **RESTARTED), 1e-8, 1e-10),
         (srm.PSRM("tvd32", prediction="simple"), 1e-8, 5e-9),
         (srm.PSRM("tvd32", correction="sweep"), 1e-11, 5e-11),
         (srm.PSRM("tvd32", correction="fused"), 1e-11, 5e-11),
@@ -386,14 +342,6 @@ def test_passages_that_rounding_closes_to_sweeps_are_made_by_the_split_form(
     method: Any, rtol: float, bound: float, name: str
 ) -> None:
     """The error of sweeps is a power of eps, about a step: their steps are too short to cross."""
-    t = {"slider_crank": 1.0741, "n_four_bar_2": 0.7143}[name]
-    mechanism = load(name)
-    before = srm.simulate(mechanism, t - 0.03, rtol=1e-12)
-    start = mechanism.with_state(before.q[-1], before.v[-1])
-    times = {"t0": t - 0.03, "t_eval": [t + 0.03]}
-    exact = srm.simulate(start, t + 0.03, rtol=1e-12, **times)
-    solution = srm.simulate(start, t + 0.03, method=method, rtol=rtol, **times)
-    assert solution.success, solution.message
-    assert len(solution.crossings) == 1
-    assert np.abs(solution.q[-1] - exact.q[-1]).max() < bound
+    error, solution = error_across(name, 0.03, method=method, rtol=rtol)
+    assert error < bound
     assert "are of the split PSRM" in solution.message

@@ -1,0 +1,55 @@
+"""Mass matrices, forces and closures of models, for comparison at random states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
+
+
+def states(model: pin.Model, count: int = 4, seed: int = 0) -> Iterator[tuple[FloatArray, ...]]:
+    """``count`` random q (nq,) and v (nv,)."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.5, 1.5, model.nv))
+        yield q, rng.standard_normal(model.nv)
+
+
+def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
+    """M (nv, nv), both triangles."""
+    M = pin.crba(model, model.createData(), q)
+    return np.triu(M) + np.triu(M, 1).T
+
+
+def nonlinear_effects(model: pin.Model, q: FloatArray, v: FloatArray) -> FloatArray:
+    """Gravity, Coriolis and centrifugal forces (nv,)."""
+    return pin.nonLinearEffects(model, model.createData(), q, v)
+
+
+def assert_same_dynamics(
+    ours: pin.Model, theirs: pin.Model, count: int = 4, atol: float = 1e-12, rtol: float = 1e-7
+) -> None:
+    """Equal nonlinear effects at random states, and mass matrices, to a hundredth of ``atol``."""
+    for q, v in states(theirs, count):
+        np.testing.assert_allclose(
+            mass_matrix(ours, q), mass_matrix(theirs, q), rtol=rtol, atol=0.01 * atol
+        )
+        np.testing.assert_allclose(
+            nonlinear_effects(ours, q, v), nonlinear_effects(theirs, q, v), rtol=rtol, atol=atol
+        )
+
+
+def closure(mechanism: srm.Mechanism, q: FloatArray, v: FloatArray) -> FloatArray:
+    """[g, G v, Gdot v] of all rows."""
+    model = mechanism.model
+    data = model.createData()
+    rows = LoopKinematics(model, mechanism.loops)
+    pin.crba(model, data, q, pin.Convention.WORLD)
+    pin.nonLinearEffects(model, data, q, v)
+    rows.update(data, q)
+    return np.concatenate([rows.g, rows.G @ v, rows.bias])

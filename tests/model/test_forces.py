@@ -21,7 +21,8 @@ from srm_mbs.cli.tables import equilibrium_rows
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.formats.build import friction_time
 from tests.support.bundled import finished
-from tests.support.mechanisms import add_link, mass_matrix, random_state, rod
+from tests.support.dynamics import mass_matrix
+from tests.support.mechanisms import add_link, random_state, rod
 from tests.support.snapshots import check_messages, check_refusals, refused
 
 Coordinates = Callable[[FloatArray], FloatArray]

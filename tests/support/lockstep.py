@@ -25,7 +25,7 @@ from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.runner import absolute_tolerance, placed_control
-from tests.support.mechanisms import mass_matrix
+from tests.support.dynamics import mass_matrix
 
 
 def control_state(control: Any) -> Any:

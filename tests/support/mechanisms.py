@@ -60,12 +60,6 @@ def random_state(
     return q, rng.uniform(-1.0, 1.0, model.nv)
 
 
-def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
-    """M (nv, nv) at q (nq,)."""
-    upper = np.triu(pin.crba(model, model.createData(), q))
-    return upper + np.triu(upper, 1).T  # type: ignore[no-any-return]
-
-
 def along_x(distance: float) -> pin.SE3:
     return pin.SE3(np.eye(3), np.array([distance, 0.0, 0.0]))
 

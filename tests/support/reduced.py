@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
-from tests.support.mechanisms import mass_matrix
+from tests.support.dynamics import mass_matrix
 
 G = 9.81
 Field = Callable[[float, Any], Any]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import whole_file
 from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.sweeps.cases import Case
 from srm_mbs.sweeps.tasks import Outcome
@@ -119,7 +120,9 @@ class Sweep:
             If the file cannot be written.
         """
         table = _optional("pyarrow").table(self.table)
-        _optional("pyarrow.parquet").write_table(table, str(path))
+        parquet = _optional("pyarrow.parquet")
+        with whole_file(path) as temporary:
+            parquet.write_table(table, str(temporary))
         log.info("written: %s", path)
 
     def to_csv(self, path: str | Path) -> None:
@@ -130,7 +133,7 @@ class Sweep:
         OSError
             If the file cannot be written.
         """
-        write_table(self.table, Path(path))
+        write_table(self.table, path)
 
     def __repr__(self) -> str:
         ended = sum(outcome.success for outcome in self._outcomes)

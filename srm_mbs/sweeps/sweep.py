@@ -143,7 +143,7 @@ def sweep(
         journal = None
         outcomes: dict[int, Outcome] = {}
         if resume is not None:
-            journal = stack.enter_context(closing(Journal(Path(resume), task, given)))
+            journal = stack.enter_context(closing(Journal(resume, task, given)))
             outcomes |= journal.known
         resumed = len(outcomes)
         log.info("sweep of %d cases, %d of them known", len(given), resumed)

@@ -30,6 +30,7 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import InputError
 from srm_mbs.formats.build import rebuild
+from srm_mbs.formats.files import write_bytes, writing
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import acting
@@ -154,7 +155,7 @@ def save_solution(solution: SimulationResult, path: Path) -> None:
     OSError
         If the file cannot be written.
     """
-    path.write_bytes(_archive(solution, path))
+    write_bytes(path, _archive(solution, path))
     log.info("written: %s", path)
 
 
@@ -175,7 +176,7 @@ def save_segments(solution: SegmentedResult, path: Path) -> None:
         "t_eval": None if solution.t_eval is None else solution.t_eval.tolist(),
     }
     segments = [_archive(segment, path) for segment in solution.segments]
-    with zipfile.ZipFile(path, "w") as archive:
+    with writing(path) as file, zipfile.ZipFile(file, "w") as archive:
         archive.writestr(CONTENTS, json.dumps(contents))
         for k, segment in enumerate(segments):
             archive.writestr(f"{k}.npz", segment)

@@ -26,6 +26,7 @@ from matplotlib.ticker import (
 )
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import writing
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinned
 
@@ -128,7 +129,8 @@ def save(figure: Figure, path: Path) -> None:
     OSError
         If the file cannot be written.
     """
-    figure.savefig(path, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    with writing(path) as file:
+        figure.savefig(file, format=path.suffix.lower()[1:], dpi=RESOLUTION)
     log.info("written: %s", path)
 
 

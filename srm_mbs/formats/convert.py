@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -14,12 +13,12 @@ from xml.etree.ElementTree import Element
 
 import tomli_w
 
-from srm_mbs.errors import CHECK_WRITING, InputError, naming
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
 from srm_mbs.formats.build import unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 
 def convert(

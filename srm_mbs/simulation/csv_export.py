@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import csv
 import io
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,10 +27,11 @@ from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
+from srm_mbs.errors import get_logger
 from srm_mbs.formats.files import writing
 from srm_mbs.simulation.result import SimulationResult
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 _LENGTHS, _QUATERNION = ("x (m)", "y (m)", "z (m)"), ("qx", "qy", "qz", "qw")
 _LINEAR, _ANGULAR = ("vx (m/s)", "vy (m/s)", "vz (m/s)"), ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)")

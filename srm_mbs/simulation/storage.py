@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import logging
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,7 +27,7 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.scaling import Units
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.formats.build import rebuild
 from srm_mbs.formats.files import write_bytes, writing
 from srm_mbs.integration.dense_output import StepData
@@ -50,7 +49,7 @@ from srm_mbs.simulation.options import REPEATED, RunOptions
 from srm_mbs.simulation.result import ATTEMPT, Settings, SimulationResult, Statistics
 from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 FORMAT = 4
 SEGMENTS_FORMAT = 1

@@ -72,7 +72,7 @@ class Journal:
             # Unbuffered, so that a line is written at once or refused at once.
             self._file = path.open("ab", buffering=0)
         except OSError as error:
-            raise self._unusable(error) from error
+            raise self._open_error(error) from error
         try:
             self._lock()
             whole = self._read(head)  # nobody else writes from here on
@@ -82,12 +82,12 @@ class Journal:
                 self._write(head)
         except OSError as error:
             self._file.close()
-            raise self._unusable(error) from error
+            raise self._open_error(error) from error
         except BaseException:
             self._file.close()
             raise
 
-    def _unusable(self, error: OSError) -> InputError:
+    def _open_error(self, error: OSError) -> InputError:
         return InputError(
             f"it cannot be used: {error.strerror}",
             file=str(self._path),
@@ -106,7 +106,7 @@ class Journal:
                 "another sweep is writing to it",
                 file=str(self._path),
                 element="resume",
-                remedy="Wait until it has ended, or give another file",
+                remedy="Give another file, or wait until it has ended",
             ) from error
         except OSError:
             return  # a file system without locks

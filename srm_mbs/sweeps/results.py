@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.formats.files import whole_file
 from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.sweeps.cases import Case
@@ -22,7 +21,7 @@ from srm_mbs.sweeps.tasks import Outcome
 if TYPE_CHECKING:
     import pandas
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from srm_mbs.dynamics.controllers import Controller
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.formats.files import checked_path
 from srm_mbs.integration.driver import Tick
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -54,7 +55,7 @@ class Solution(AnimationMixin, SimulationResult):
         """
         from srm_mbs.simulation.csv_export import write_csv
 
-        write_csv(self if t is None else self.at(t), Path(path))
+        write_csv(self if t is None else self.at(t), checked_path(path))
 
     def save(self, path: str | Path) -> None:
         """Write everything needed to replay and interpolate the run, description included.
@@ -66,7 +67,7 @@ class Solution(AnimationMixin, SimulationResult):
         """
         from srm_mbs.simulation.storage import save_solution
 
-        save_solution(self, Path(path))
+        save_solution(self, checked_path(path))
 
     def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
         """A picture of the run; docs/plots.md shows each kind.
@@ -110,7 +111,7 @@ class Solution(AnimationMixin, SimulationResult):
         """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`."""
         from srm_mbs.analysis.report.report import write_report
 
-        write_report(self, Path(path), **options)
+        write_report(self, path, **options)
 
 
 class SegmentedSolution(SegmentedResult, Solution):
@@ -125,7 +126,7 @@ class SegmentedSolution(SegmentedResult, Solution):
         """Write all segments into one file; see :meth:`Solution.save`."""
         from srm_mbs.simulation.storage import save_segments
 
-        save_segments(self, Path(path))
+        save_segments(self, checked_path(path))
 
 
 class DaeSolution(DaeResult):
@@ -369,4 +370,4 @@ def load_solution(path: str | Path) -> Solution:
     """
     from srm_mbs.simulation.storage import load_result
 
-    return load_result(Path(path), SOLUTIONS)
+    return load_result(checked_path(path), SOLUTIONS)

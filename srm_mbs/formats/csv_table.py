@@ -12,6 +12,19 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+"""Beginnings of cells that a spreadsheet computes or takes apart, full-width signs included."""
+
+
+def text_cell(text: str) -> str:
+    """``text`` as a cell that spreadsheets take as text: a formula begins with an apostrophe."""
+    return f"'{text}" if text.startswith(FORMULA) else text
+
+
+def cell_text(cell: str) -> str:
+    """The text that :func:`text_cell` wrote as ``cell``."""
+    return cell[1:] if cell.startswith("'") and cell[1:].startswith(FORMULA) else cell
+
 
 @dataclass(frozen=True)
 class CsvTable:
@@ -82,7 +95,7 @@ def read_csv(path: Path) -> CsvTable:
             remedy="Give a CSV file of numbers",
         ) from error
     header, *rows = cells or [()]
-    return CsvTable(str(path), tuple(cell.strip() for cell in header), tuple(rows))
+    return CsvTable(str(path), tuple(cell_text(cell.strip()) for cell in header), tuple(rows))
 
 
 class CsvFolder:

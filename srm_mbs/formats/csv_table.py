@@ -17,7 +17,11 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "
 
 
 def text_cell(text: str) -> str:
-    """``text`` as a cell that spreadsheets take as text: a formula begins with an apostrophe."""
+    """``text`` as a cell that spreadsheets take as text: a formula begins with an apostrophe.
+
+    A carriage return, which the csv module leaves unquoted, is escaped.
+    """
+    text = text.replace("\r", r"\r")
     return f"'{text}" if text.startswith(FORMULA) else text
 
 

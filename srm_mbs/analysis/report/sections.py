@@ -122,7 +122,7 @@ def _file_name(path: str) -> str:
     return re.split(r"[\\/]", path)[-1]
 
 
-def shown(text: object, mechanism: Mechanism, full_paths: bool) -> str:
+def without_folders(text: object, mechanism: Mechanism, full_paths: bool) -> str:
     """``text`` about ``mechanism``, without the folders of its files unless ``full_paths``."""
     words = str(text)
     source = mechanism.source
@@ -160,7 +160,7 @@ def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict
             f"The mechanism at the start of the run, t = {start:.6g} s.",
         )
     except InputError as error:
-        problem = shown(error, mechanism, full_paths)
+        problem = without_folders(error, mechanism, full_paths)
     return {
         "properties": rows,
         "snapshot": snapshot,
@@ -173,7 +173,7 @@ def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict
         "forces": list(force_rows(mechanism)),
         "drives": list(drive_rows(mechanism)),
         "notes": [
-            shown(note, mechanism, full_paths)
+            without_folders(note, mechanism, full_paths)
             for note in (*mechanism.notes, *mechanism.structure.notes)
         ],
     }
@@ -292,7 +292,7 @@ def pictures_data(
         try:
             figure = plot_solution(solution, kind=kind)
         except InputError as error:
-            problem = shown(error, solution.mechanism, full_paths)
+            problem = without_folders(error, solution.mechanism, full_paths)
             missing.append(f"{PICTURES[kind]} Not drawn: {problem}")
             continue
         images.append(_plot_image(figure, f"Plot: {PICTURES[kind]}", PICTURES[kind]))

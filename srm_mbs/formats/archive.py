@@ -169,7 +169,8 @@ def array_from(content: bytes, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} has the shape {shape}, which its {there} bytes do not fill")
     fortran = found["fortran"] == "True"
     flat = np.frombuffer(content, dtype, math.prod(shape), start)
-    array = flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    array = flat.reshape(shape, order="F" if fortran else "C")
+    array = array.astype(dtype.newbyteorder("="), order="K")  # a copy, which may be written to
     _check_items(array, name)
     return array
 

@@ -46,6 +46,10 @@ LONGEST_NAME = 1000
 """Characters of a name."""
 LONGEST_SENTENCE = 100_000
 """Characters of a message or a note."""
+MOST_ELEMENTS = 10_000
+"""Closures, forces or drives of a mechanism."""
+LARGEST_NUMBER = 1e100
+"""Of an array of a run: where runs end because products of larger ones overflow."""
 UNIT_LENGTH = 1e-6
 """Deviation of quaternions and (cos, sin) pairs of a run from unit length."""
 VERDICTS = ("rejected", "replaced")
@@ -58,7 +62,7 @@ Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 Sentence = Annotated[str, Field(max_length=LONGEST_SENTENCE)]
 Number = Annotated[float, Field(ge=-LARGEST_MAGNITUDE, le=LARGEST_MAGNITUDE, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST_MAGNITUDE, allow_inf_nan=False)]
-Elements = list[dict[str, Any]]
+Elements = Annotated[list[dict[str, Any]], Field(max_length=MOST_ELEMENTS)]
 
 
 class _Entry(BaseModel):
@@ -298,7 +302,7 @@ def _array(
 ) -> NDArray[Any]:
     """The array ``name``, of that shape, with items of one of the ``kinds`` of dtypes.
 
-    Numbers are finite and at most LARGEST_MAGNITUDE, unless they may be ``infinite``; none is NaN.
+    Numbers are finite and at most LARGEST_NUMBER, unless they may be ``infinite``; none is NaN.
     """
     if name not in arrays:
         raise ValueError(f"it has no {name}")
@@ -314,7 +318,7 @@ def _array(
     if kinds == "f":
         if array.dtype.itemsize != 8:
             raise ValueError(f"{name} has items of the type {array.dtype}")
-        largest = np.inf if infinite else LARGEST_MAGNITUDE
+        largest = np.inf if infinite else LARGEST_NUMBER
         if not (np.abs(array) <= largest).all():
             raise ValueError(f"{name} has numbers that are not finite, or too large")
     return array
@@ -528,5 +532,5 @@ def output_times_from(arrays: Arrays, start: float) -> FloatArray | None:
     if "t_eval" not in arrays:
         return None
     times = _array(arrays, "t_eval", (None,))
-    _within("t_eval", times, start, LARGEST_MAGNITUDE)
+    _within("t_eval", times, start, LARGEST_NUMBER)
     return times

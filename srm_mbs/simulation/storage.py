@@ -174,7 +174,7 @@ def save_segments(solution: SegmentedResult, path: Path, full_paths: bool = Fals
         [_run_arrays(segment, path, full_paths) for segment in solution.segments], path
     )
     with writing(path) as file, zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(CONTENTS, json.dumps(contents))
+        archive.writestr(CONTENTS, json.dumps(contents, default=float))
         for k, segment in enumerate(segments):
             archive.writestr(f"{k}.npz", segment)
     log.info("written: %s", path)
@@ -300,7 +300,7 @@ def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dic
         "eliminations": np.array(structure.eliminations, dtype=float).reshape(-1, 3),
         "coordinate_unit": structure.units.coordinate,
     }
-    return {"meta": np.array(json.dumps(meta)), **arrays}
+    return {"meta": np.array(json.dumps(meta, default=float)), **arrays}
 
 
 def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import errno
 import json
 import os
 import pickle
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
@@ -555,3 +557,35 @@ def test_the_parts_of_a_run_of_segments_belong_together(tmp_path: Path) -> None:
                 file.writestr(name, content)
         with pytest.raises(srm.InputError, match=says):
             srm.load_solution(tmp_path / "changed.npz")
+
+
+def test_a_run_of_format_4_with_indices_of_another_model_is_refused(tmp_path: Path) -> None:
+    with np.load(DATA / "ring_format_4.npz") as file:
+        arrays = dict(file)
+    meta = json.loads(str(arrays["meta"]))
+    model = pin.Model()
+    model.loadFromString(meta["mechanism"]["model"])
+    model.idx_vs[3] = 10**6
+    meta["mechanism"]["model"] = model.saveToString()
+    np.savez(tmp_path / "changed.npz", **arrays | {"meta": np.array(json.dumps(meta))})
+
+    with pytest.raises(srm.InputError, match="the archive of its model is damaged") as caught:
+        srm.load_solution(tmp_path / "changed.npz")
+    assert caught.value.file == str(tmp_path / "changed.npz")
+
+
+def test_a_save_that_fails_leaves_the_file_that_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solution = srm.simulate(srm.load("four_bar"), 0.2)
+    solution.save(tmp_path / "run.npz")
+    before = (tmp_path / "run.npz").read_bytes()
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        srm.simulate(srm.load("four_bar"), 0.3).save(tmp_path / "run.npz")
+    assert (tmp_path / "run.npz").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]

@@ -56,17 +56,27 @@ class Solution(AnimationMixin, SimulationResult):
 
         write_csv(self if t is None else self.at(t), Path(path))
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, full_paths: bool = False) -> None:
         """Write everything needed to replay and interpolate the run, description included.
 
         Parameters
         ----------
         path
             File name; ``.npz`` is usual and is not added.
+        full_paths
+            Whether the file names the folders in which the files of the mechanism lay; by default
+            it holds their names alone, and names of meshes relative to the model.
+
+        Raises
+        ------
+        InputError
+            If a tableau or closure type is not the package's, or the run is too large to be read.
+        OSError
+            If the file cannot be written; a file that was there is then as it was.
         """
         from srm_mbs.simulation.storage import save_solution
 
-        save_solution(self, Path(path))
+        save_solution(self, Path(path), full_paths)
 
     def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
         """A picture of the run; docs/plots.md shows each kind.
@@ -121,11 +131,11 @@ class SegmentedSolution(SegmentedResult, Solution):
         """See :attr:`Solution.degrees_of_freedom`."""
         return self.rows_of_parts(lambda part: part.degrees_of_freedom)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, full_paths: bool = False) -> None:
         """Write all segments into one file; see :meth:`Solution.save`."""
         from srm_mbs.simulation.storage import save_segments
 
-        save_segments(self, Path(path))
+        save_segments(self, Path(path), full_paths)
 
 
 class DaeSolution(DaeResult):
@@ -359,13 +369,14 @@ def solve_dae(
 def load_solution(path: str | Path) -> Solution:
     """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
 
-    A controller is not saved: reactions of a controlled run cannot be computed afterwards, unless
-    it was sampled; what it held is saved.
+    Meshes are looked for beside the file.  A controller is not saved: reactions of a controlled run
+    cannot be computed afterwards, unless it was sampled; what it held is saved.
 
     Raises
     ------
     InputError
-        If the file is missing, is no saved run, or is of another format.
+        If the file is missing, is no saved run, is of another format, or unpacks to more than 20
+        times its size and 64 MB, or more than 2 GB.
     """
     from srm_mbs.simulation.storage import load_result
 

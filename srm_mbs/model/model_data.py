@@ -17,8 +17,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
-LARGEST_COUNT = 100_000
-"""Joints or frames of a model."""
+MOST_JOINTS = 5_000
+"""Joints of a model: Pinocchio's matrices of it have as many rows and columns."""
+MOST_FRAMES = 100_000
+"""Frames or bodies of a model."""
 LONGEST_NAME = 1000
 """Characters of a name."""
 ORTHONORMAL = 1e-9
@@ -48,7 +50,7 @@ def _orthonormal(numbers: list[float]) -> list[float]:
 
 
 Name = Annotated[str, Field(max_length=LONGEST_NAME)]
-Index = Annotated[int, Field(ge=0, lt=LARGEST_COUNT, strict=True)]
+Index = Annotated[int, Field(ge=0, le=MOST_FRAMES, strict=True)]
 Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Placement = Annotated[
     list[FiniteFloat], Field(min_length=12, max_length=12), AfterValidator(_orthonormal)
@@ -106,8 +108,10 @@ class ModelData(_Data):
     name: Name
     gravity: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
     base_inertia: InertiaNumbers
-    joints: Annotated[list[JointData], Field(max_length=LARGEST_COUNT)]
-    frames: Annotated[list[FrameData], Field(max_length=LARGEST_COUNT)]
+    joints: Annotated[list[JointData], Field(max_length=MOST_JOINTS)]
+    frames: Annotated[list[FrameData], Field(max_length=MOST_FRAMES)]
+    bodies: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
+    """Pinocchio's count of bodies, the universe included; no computation reads it."""
     vectors: dict[str, Numbers]
 
 
@@ -183,6 +187,7 @@ def model_to_data(model: pin.Model) -> dict[str, Any]:
             }
             for frame in list(model.frames)[1:]
         ],
+        "bodies": int(model.nbodies),
         "vectors": {name: getattr(model, name).tolist() for name in VECTORS},
     }
 
@@ -278,6 +283,8 @@ def _built(data: ModelData) -> pin.Model:
         kind = pin.FrameType.names[frame.type]
         at, share = _placement(frame.placement), _inertia(frame.inertia)
         model.addFrame(pin.Frame(frame.name, frame.joint, frame.parent, at, kind, share), False)
+    for _ in range(data.bodies - model.nbodies):
+        model.appendBodyToJoint(0, pin.Inertia.Zero(), pin.SE3.Identity())
     for i, inertia in enumerate([data.base_inertia, *(joint.inertia for joint in data.joints)]):
         model.inertias[i] = _inertia(inertia)
     if set(data.vectors) != set(VECTORS):

@@ -8,8 +8,11 @@ cannot go on returns a partial :class:`~srm_mbs.Solution` and raises
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 import sys
+import unicodedata
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -22,8 +25,62 @@ CHECK_WRITING = "Check the folder, its permissions and the space on the disk"
 """Remedy for a file that cannot be written."""
 
 
+_PRINTABLE_ASCII = re.compile(r"[\x20-\x7e]*")
+_ESCAPED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Unicode categories: control, format (bidirectional overrides among them), surrogate, line and
+paragraph separator."""
+_SHORT = {"\t": r"\t", "\n": r"\n", "\r": r"\r"}
+
+
+def printable(text: object, keep: str = "") -> str:
+    """``text`` with characters that a terminal would act on shown as in Python's strings.
+
+    Names and texts of foreign files contain them: ``\\x1b`` begins commands of terminals, and
+    ``\\u202e`` reverses what follows.  A backslash stays one, so that nothing is escaped twice.
+
+    Parameters
+    ----------
+    keep
+        Characters that stay as they are, such as the ends of lines.
+    """
+    words = str(text)
+    if _PRINTABLE_ASCII.fullmatch(words):
+        return words
+    return "".join(
+        character
+        if character in keep or unicodedata.category(character) not in _ESCAPED
+        else _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")
+        for character in words
+    )
+
+
+class _Printable(logging.Filter):
+    """Escapes the texts of log records, as :func:`printable` does."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        shown = printable(text)
+        if shown != text:
+            record.msg, record.args = shown, ()
+        return True
+
+
+def get_logger(name: str) -> logging.Logger:
+    """The logger ``name``; control characters in its messages are shown escaped."""
+    logger = logging.getLogger(name)
+    if not any(isinstance(known, _Printable) for known in logger.filters):
+        logger.addFilter(_Printable())
+    return logger
+
+
 class SrmError(Exception):
-    """Base class of everything that this package raises on purpose."""
+    """Base class of everything that this package raises on purpose.
+
+    Its text shows control characters of names escaped (:func:`printable`).
+    """
+
+    def __str__(self) -> str:
+        return printable(super().__str__(), keep="\n")
 
 
 class InputError(SrmError, ValueError):
@@ -55,9 +112,9 @@ class InputError(SrmError, ValueError):
         super().__init__(problem)
 
     def __str__(self) -> str:
-        where = ": ".join(part for part in (self.file, self.element) if part)
+        where = ": ".join(printable(part) for part in (self.file, self.element) if part)
         text = f"{where}: {self.problem}" if where else self.problem
-        return f"{text}. {self.remedy}"
+        return printable(f"{text}. {self.remedy}", keep="\n")
 
     def located(self, file: str) -> InputError:
         """The same error with ``file`` filled in where it was unknown (the object itself)."""
@@ -155,6 +212,9 @@ class SimulationError(SrmError, RuntimeError):
 
 class SrmWarning(UserWarning):
     """A setting was changed to a safe value, or the input is unusual but usable."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__(), keep="\n")
 
 
 def warn(message: str) -> None:

@@ -7,7 +7,6 @@ led to each mode indicates how likely it is that none is missing.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Integral
@@ -21,10 +20,10 @@ from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 SAME_MODE_TOLERANCE = 1e-6
 """Largest difference (rad, scene diagonals) of two solutions of one mode."""

@@ -10,7 +10,6 @@ with the constrained acceleration v' at rest.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -36,10 +35,10 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
     smallest_singular_value,
 )
-from srm_mbs.errors import AnalysisError, InputError
+from srm_mbs.errors import AnalysisError, InputError, get_logger
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 MAX_ITERATIONS = 150
 LARGEST_STEP = 0.5

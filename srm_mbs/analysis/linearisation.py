@@ -9,7 +9,6 @@ linear in the forces.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,12 +27,12 @@ from srm_mbs.dynamics.controllers import Controller
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.simulation.options import positive
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 CONSTRAINT_TOLERANCE, RATE_TOLERANCE = 1e-9, 1e-9
 """Largest closure error of the state and its rate, over units."""

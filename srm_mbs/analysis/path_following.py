@@ -5,7 +5,6 @@ The continuation method is in :mod:`srm_mbs.assembly.continuation`.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,12 +18,12 @@ from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.model.coordinates import position_of
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 BRANCH_COSINE = 0.9
 """Smallest cosine between successive tangents on one branch."""

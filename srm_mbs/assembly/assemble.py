@@ -7,7 +7,6 @@ initial ones, hold their coordinates where their laws begin.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,11 +27,11 @@ from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError, get_logger, naming
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
 from srm_mbs.model.numbers import finite_numbers
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 LARGEST_CONTRADICTION = 1e-9
 """Largest difference (rad, m) between a held position and the initial value of a drive."""

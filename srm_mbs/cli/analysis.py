@@ -15,6 +15,7 @@ from srm_mbs.cli.output import (
     Html,
     Model,
     check_output,
+    echo,
     option,
     reported,
     say_written,
@@ -95,9 +96,9 @@ def modes(
         seed=seed,
     )
     if not found:
-        typer.echo("no closed configuration was found", err=True)
+        echo("no closed configuration was found", err=True)
         raise typer.Exit(RUN_FAILED)
-    typer.echo(f"held: {', '.join(found[0].held) or 'no joint'}")
+    echo(f"held: {', '.join(found[0].held) or 'no joint'}")
     table(mode_rows(mechanism, found), ("mode", "found", "", *mechanism.joint_names))
 
 
@@ -121,7 +122,7 @@ def equilibrium(
         mechanism, positions, hold=names, search="nearest" if nearest else "stable"
     )
     table(equilibrium_rows(mechanism, found))
-    typer.echo()
+    echo("")
     table(position_rows(mechanism, found.q), ("joint", "position"))
 
 
@@ -167,7 +168,7 @@ def linearise(
     found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
     inputs = (f"force of {name}" for name in found.inputs)
     table(matrix_rows(found), ("", *state_names(found), *inputs, "drift"))
-    typer.echo()
+    echo("")
     header = ("mode", "eigenvalue 1/s", "frequency Hz", "damping")
     table(eigenvalue_rows(found), (*header, *coordinate_names(mechanism)))
     _write_page(html, lambda: found.mode_shape(mode or 0))
@@ -215,7 +216,7 @@ def drag(
         )
     found = srm_mbs.follow(mechanism, targets)
     table(path_rows(found))
-    typer.echo()
+    echo("")
     table(
         position_rows(mechanism, found.q[-1] if found.complete else found.path[-1]),
         ("joint", "position"),

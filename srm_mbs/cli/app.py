@@ -1,11 +1,12 @@
 """The command line ``srm-mbs``: every command calls the package and prints the result.
 
 Slow imports are made inside the commands, so that ``srm-mbs --help`` answers at once.
-Exit status: 0; 1 when a run or a search did not reach its end; 2 for bad input.
+Exit status: 0; 1 when a run or a search did not reach its end; 2 for bad input; 130 after Ctrl-C.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import re
@@ -31,8 +32,11 @@ from srm_mbs.cli.output import (
     Lines,
     Model,
     check_output,
+    echo,
+    flush_output,
     option,
     reported,
+    say,
     say_written,
     several,
     table,
@@ -57,7 +61,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"srm-mbs {srm_mbs.__version__}")
+        echo(f"srm-mbs {srm_mbs.__version__}")
         raise typer.Exit
 
 
@@ -194,7 +198,7 @@ def simulate(
         from srm_mbs.cli.tables import balance_rows
 
         table(balance_rows(solution.energy_balance))
-    typer.echo(solution.message, err=not solution.success)
+    echo(solution.message, err=not solution.success)
     if play or view:
         playback.play_run(solution, overlays, view)
     if failed:
@@ -225,7 +229,7 @@ def convert(
     for path in written:
         say_written(path)
     for note in notes:
-        typer.echo(f"note: {note}")
+        echo(f"note: {note}")
 
 
 @app.command()
@@ -253,15 +257,15 @@ def info(model: Model) -> None:
         (("drive", "law", "moves", "values"), drive_rows(mechanism)),
     ):
         if listed := list(rows):
-            typer.echo()
+            echo("")
             table(listed, header)
     notes = [*mechanism.notes, *mechanism.structure.notes]
     if missing:
         notes.append(f"the compiled kernel is not available: {missing}. {remedy}")
     if notes:
-        typer.echo()
+        echo("")
     for note in notes:
-        typer.echo(f"note: {note}")
+        echo(f"note: {note}")
 
 
 @app.command()
@@ -272,7 +276,7 @@ def models() -> None:
 
     folder = models_folder()
     table((name, _first_sentence(folder / f"{name}.toml")) for name in srm_mbs.bundled_models())
-    typer.echo(f"n_four_bar_<N> is made for any N up to {largest_n()}.")
+    echo(f"n_four_bar_<N> is made for any N up to {largest_n()}.")
 
 
 def _first_sentence(path: Path) -> str:
@@ -320,5 +324,15 @@ def benchmark(context: typer.Context) -> None:
 
 
 def main() -> None:
-    """Entry point of the console script."""
-    app(prog_name="srm-mbs")
+    """Entry point of the console script; nothing that a user gives or does shows a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What the terminal has no code for is shown escaped.
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        app(prog_name="srm-mbs")
+    except OSError as error:  # of help texts; commands report their own
+        say("error", error.strerror or error)
+        raise SystemExit(BAD_INPUT) from error
+    finally:
+        flush_output()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, get_type_hints
@@ -15,10 +16,21 @@ from typing import Annotated, Any, ParamSpec, get_type_hints
 import typer
 from typer.models import ArgumentInfo, OptionInfo
 
-from srm_mbs.errors import CHECK_WRITING, InputError, SrmError, SrmWarning
+from srm_mbs.errors import (
+    CHECK_WRITING,
+    InputError,
+    SrmError,
+    SrmWarning,
+    get_logger,
+    printable,
+)
 
-RUN_FAILED, BAD_INPUT = 1, 2
-"""Exit status."""
+log = get_logger(__name__)
+
+RUN_FAILED, BAD_INPUT, FAULT, INTERRUPTED = 1, 2, 70, 130
+"""Exit status; that of a fault of the package is EX_SOFTWARE of sysexits.h."""
+REPORT_IT = "Report this fault of srm-mbs, with the output of --verbose"
+"""Remedy for what no user can mend."""
 Given = ParamSpec("Given")
 
 
@@ -49,7 +61,27 @@ HTML_SUFFIXES = (".html", ".htm")
 
 def say(kind: str, text: object) -> None:
     """One unwrapped line on standard error."""
-    typer.echo(f"{kind}: {' '.join(str(text).split())}", err=True)
+    echo(f"{kind}: {' '.join(str(text).split())}", err=True)
+
+
+def echo(text: str, err: bool = False) -> None:
+    """One line on standard output, or on standard error; what a terminal would act on is shown
+    escaped."""
+    typer.echo(printable(text), err=err)
+
+
+def flush_output() -> None:
+    """Write what is left for standard output; if nobody can take it, drop it without a word."""
+    for stream in (sys.stdout, sys.stderr):
+        if stream is None:  # closed before the program began
+            continue
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, stream.fileno())
+                os.close(nowhere)
 
 
 class Lines(logging.Handler):
@@ -72,6 +104,9 @@ def reported(command: Callable[Given, None]) -> Callable[Given, None]:
                 command(*args, **kwargs)
         except BrokenPipeError:
             raise  # the reader of a pipe has ended: typer exits silently
+        except KeyboardInterrupt as error:
+            say("error", "interrupted")
+            raise typer.Exit(INTERRUPTED) from error
         except SrmError as error:
             if isinstance(error, InputError) and error.element is not None:
                 error.element = _as_written(error.element, command)
@@ -81,6 +116,13 @@ def reported(command: Callable[Given, None]) -> Callable[Given, None]:
             where = f"{error.filename}: " if error.filename else ""
             say("error", f"{where}{error.strerror or error}")
             raise typer.Exit(BAD_INPUT) from error
+        except (typer.Exit, typer.Abort):
+            raise
+        except Exception as error:  # a fault of the package; --verbose shows where
+            for line in traceback.format_exception(error):
+                log.debug("%s", line)
+            say("error", f"unexpected {type(error).__name__}: {error}. {REPORT_IT}")
+            raise typer.Exit(FAULT) from error
 
     return run
 
@@ -108,17 +150,17 @@ def _as_written(element: str, command: Callable[..., None]) -> str:
     return element
 
 
-def table(rows: Iterable[Iterable[str]], header: Iterable[str] = ()) -> None:
+def table(rows: Iterable[Iterable[str]], header: Sequence[str] = ()) -> None:
     """Aligned columns on standard output; wrapped on a terminal, never in a pipe."""
     from rich.console import Console
     from rich.table import Table
 
-    names = tuple(header)
-    grid = Table(*names, box=None, show_header=bool(names), pad_edge=False, padding=(0, 2, 0, 0))
+    names = map(printable, header)
+    grid = Table(*names, box=None, show_header=bool(header), pad_edge=False, padding=(0, 2, 0, 0))
     for row in rows:
-        grid.add_row(*row)
+        grid.add_row(*map(printable, row))
     # No markup: "[0]" in a name is text.
-    width = None if sys.stdout.isatty() else 10_000
+    width = None if sys.stdout is not None and sys.stdout.isatty() else 10_000
     console = Console(width=width, markup=False, emoji=False, highlight=False)
     with console.capture() as captured:
         console.print(grid)
@@ -148,7 +190,7 @@ def check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> N
         problem, remedy = f"there is no folder {str(folder)!r}", "Make it first"
     elif path.is_dir():
         problem, remedy = "it is a folder", "Give a file name"
-    elif not os.access(path if path.exists() else folder, os.W_OK):
+    elif not (os.access(folder, os.W_OK) and (os.access(path, os.W_OK) or not path.exists())):
         problem, remedy = "it cannot be written", "Check its permissions"
     if problem:
         raise InputError(problem, file=str(path), element=option, remedy=remedy)
@@ -185,4 +227,4 @@ def write_files(
 
 def say_written(path: Path) -> None:
     """Name a written file on standard output."""
-    typer.echo(f"written: {path}")
+    echo(f"written: {path}")

@@ -17,6 +17,7 @@ from srm_mbs.cli.output import (
     BAD_INPUT,
     Run,
     check_output,
+    echo,
     option,
     reported,
     say_written,
@@ -206,7 +207,7 @@ def live_view(mechanism: Mechanism) -> LiveView:
 def play_run(solution: Solution, options: dict[str, Any], view: LiveView | None = None) -> None:
     """Play a run until Ctrl-C, in its live view if it has one."""
     _log_address()
-    typer.echo("Ctrl-C ends the playback.", err=True)
+    echo("Ctrl-C ends the playback.", err=True)
     with suppress(KeyboardInterrupt):  # while the page is made; later play() handles it
         if view is None:
             solution.play(**options)

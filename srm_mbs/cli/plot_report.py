@@ -12,6 +12,7 @@ from srm_mbs.cli.output import (
     HTML_SUFFIXES,
     Run,
     check_output,
+    echo,
     option,
     reported,
     say_written,
@@ -118,7 +119,7 @@ def report(
         )
     solution = srm_mbs.load_solution(run)
     if not no_second_run:
-        typer.echo("repeating the run, to estimate its error", err=True)
+        echo("repeating the run, to estimate its error", err=True)
     certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)
     write_report(solution, path, animation=not no_animation, certificate=certificate)
     table((found.topic, found.grade, found.text) for found in certificate.findings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError, naming
+from srm_mbs.errors import AssemblyError, EvaluationError, InputError, get_logger, naming
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
@@ -28,7 +27,7 @@ from srm_mbs.model.coordinates import write_position, write_rate
 from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.model.validation import check_inertia, undetermined_joint
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 
 def _acting_joints(description: Description) -> Iterator[tuple[str, str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -14,11 +13,12 @@ from xml.etree.ElementTree import Element
 
 import tomli_w
 
-from srm_mbs.errors import CHECK_WRITING, InputError, naming
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
 from srm_mbs.formats.build import unassembled
+from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 
 def convert(
@@ -47,7 +47,7 @@ def convert(
     InputError
         For input that cannot be read, or output that exists or cannot be written.
     """
-    description = Path(out)
+    description = checked_path(out, "out")
     if description.suffix.lower() != ".toml":
         raise InputError(
             f"the suffix {description.suffix!r} is not .toml", file=str(out), remedy="Use .toml"
@@ -71,8 +71,7 @@ def convert(
     entries = deepcopy(dict(reading.entries)) | {"urdf": urdf.name}
     _move_tables(entries, Path(source.path), description)
     try:
-        urdf.write_text(written, encoding="utf-8")
-        description.write_text(tomli_w.dumps(entries), encoding="utf-8")
+        write_texts({urdf: written, description: tomli_w.dumps(entries)})
     except OSError as error:
         raise InputError(
             f"it cannot be written: {error.strerror}",

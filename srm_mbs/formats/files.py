@@ -6,11 +6,12 @@ written here.
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -115,13 +116,19 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Raises
     ------
+    InputError
+        If ``path`` is not a file name.
     OSError
-        If the file cannot be written; it names ``path``.
+        If the file cannot be written, or is write-protected; it names ``path``.
     """
+    path = checked_path(path)
     target = Path(os.path.realpath(path))  # a link stays a link
     if target.exists() and not target.is_file():
         yield target
         return
+    if target.exists() and not os.access(target, os.W_OK):
+        # Replacing it needs permissions of the folder only.
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(path))
     suffix = target.suffix if len(target.suffix) <= LONGEST_SUFFIX else ""
     temporary = target.with_name(f".srm-{secrets.token_hex(8)}{suffix}")
     try:
@@ -164,7 +171,56 @@ def writing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         yield file
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write ``text`` as UTF-8; see :func:`whole_file`."""
+def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write ``content``; see :func:`whole_file`."""
     with writing(path) as file:
-        file.write(text.encode("utf-8"))
+        file.write(content)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write ``text`` as UTF-8, lone surrogates escaped; see :func:`whole_file`."""
+    write_bytes(path, utf8(text))
+
+
+def write_texts(texts: Mapping[Path, str]) -> None:
+    """Write several files, path -> text, of which none is replaced before all are on the disk.
+
+    They are replaced in the order given; see :func:`whole_file`.
+    """
+    with ExitStack() as stack:
+        for path, text in reversed(list(texts.items())):  # the first is replaced first
+            temporary = stack.enter_context(whole_file(path))
+            with temporary.open("wb") as file:
+                file.write(utf8(text))
+                file.flush()
+                if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                    os.fsync(file.fileno())
+
+
+def utf8(text: str) -> bytes:
+    """``text`` in UTF-8; a lone surrogate, which UTF-8 has no code for, as ``\\udc80``."""
+    return text.encode("utf-8", "backslashreplace")
+
+
+def checked_path(path: object, element: str = "path") -> Path:
+    """``path`` as a path.
+
+    Raises
+    ------
+    InputError
+        If it is not a string or a path, is empty, or contains a null character; it names the
+        argument ``element``.
+    """
+    try:
+        name = os.fspath(path)  # type: ignore[call-overload]
+    except Exception as error:  # objects may raise anything
+        raise InputError(
+            f"{type(path).__name__} is not a type of paths",
+            element=element,
+            remedy="Give a string or a pathlib.Path",
+        ) from error
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise InputError(
+            f"{name!r} is not a file name", element=element, remedy="Give the path of a file"
+        )
+    return Path(name)

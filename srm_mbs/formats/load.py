@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 import tomli_w
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, naming
+from srm_mbs.errors import InputError, get_logger, naming
 from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
@@ -25,7 +24,7 @@ from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
 """Names of generated mechanisms, with the number of loops."""

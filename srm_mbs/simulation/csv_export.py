@@ -17,7 +17,7 @@ Reactions are left out: there are six per loop, and they are better taken from
 from __future__ import annotations
 
 import csv
-import logging
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,11 @@ from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
+from srm_mbs.errors import get_logger
+from srm_mbs.formats.files import writing
 from srm_mbs.simulation.result import SimulationResult
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 _LENGTHS, _QUATERNION = ("x (m)", "y (m)", "z (m)"), ("qx", "qy", "qz", "qw")
 _LINEAR, _ANGULAR = ("vx (m/s)", "vy (m/s)", "vz (m/s)"), ("wx (rad/s)", "wy (rad/s)", "wz (rad/s)")
@@ -46,7 +48,7 @@ _COMPONENTS = {
 """Columns of joints of several degrees of freedom: positions, velocities."""
 
 
-def write_csv(solution: SimulationResult, path: Path) -> None:
+def write_csv(solution: SimulationResult, path: str | Path) -> None:
     """Write ``solution`` at its times ``solution.t`` to ``path``; see the module's text.
 
     Raises
@@ -60,7 +62,7 @@ def write_csv(solution: SimulationResult, path: Path) -> None:
     write_table(columns, path)
 
 
-def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
+def write_table(columns: Mapping[str, NDArray[Any]], path: str | Path) -> None:
     """Write ``columns``, header -> values (n,), to ``path``.
 
     Raises
@@ -68,11 +70,14 @@ def write_table(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
     OSError
         If the file cannot be written.
     """
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
+    with writing(path) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8", errors="backslashreplace", newline="")
+        writer = csv.writer(text, lineterminator="\n")
         writer.writerow(columns)
         # Python's own floats: the csv module writes them with repr.
         writer.writerows(zip(*(column.tolist() for column in columns.values())))
+        text.flush()
+        text.detach()  # the file is closed by its owner
     log.info("written: %s", path)
 
 

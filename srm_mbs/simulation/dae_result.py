@@ -153,7 +153,7 @@ class DaeResult(RunOutcome):
         columns = {"t": self.t}
         for name, values in (("x", self.x), ("y", self.y)):
             columns |= {f"{name}[{i}]": column for i, column in enumerate(values.T)}
-        write_table(columns, Path(path))
+        write_table(columns, path)
 
     def __repr__(self) -> str:
         return (

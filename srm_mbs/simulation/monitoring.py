@@ -15,13 +15,14 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
+from srm_mbs.errors import get_logger
 from srm_mbs.integration.driver import RunStatus, Tick
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import RunOutcome
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 LISTED_PASSAGES = 50
 """Passages of a run that are listed."""

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
-from srm_mbs.errors import EvaluationError, EventError, InputError
+from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import EventFunction, acting, prepare_events, same_time
 from srm_mbs.model.drives import positions
@@ -158,7 +157,7 @@ def impact(
     return out
 
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 CHATTER_ACTIONS = 10
 """Actions of an event after which it may chatter."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import io
 import json
-import logging
 import os
 import re
 import zipfile
@@ -27,7 +26,7 @@ import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.formats.archive import (
     LARGEST_CONTENT,
     LARGEST_RATIO,
@@ -59,7 +58,7 @@ from srm_mbs.simulation.result import Settings, SimulationResult, Statistics
 from srm_mbs.simulation.saved_run import Arrays
 from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 FORMAT = 5
 ARCHIVED_MODEL_FORMAT = 4

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
+from srm_mbs.formats.files import whole_file
 from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.sweeps.cases import Case
 from srm_mbs.sweeps.tasks import Outcome
@@ -21,7 +21,7 @@ from srm_mbs.sweeps.tasks import Outcome
 if TYPE_CHECKING:
     import pandas
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,9 @@ class Sweep:
             If the file cannot be written.
         """
         table = _optional("pyarrow").table(self.table)
-        _optional("pyarrow.parquet").write_table(table, str(path))
+        parquet = _optional("pyarrow.parquet")
+        with whole_file(path) as temporary:
+            parquet.write_table(table, str(temporary))
         log.info("written: %s", path)
 
     def to_csv(self, path: str | Path) -> None:
@@ -130,7 +132,7 @@ class Sweep:
         OSError
             If the file cannot be written.
         """
-        write_table(self.table, Path(path))
+        write_table(self.table, path)
 
     def __repr__(self) -> str:
         ended = sum(outcome.success for outcome in self._outcomes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
@@ -14,7 +13,7 @@ from typing import Any
 
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress, checked_span
 from srm_mbs.simulation.runner import mechanism_method
@@ -31,7 +30,7 @@ from srm_mbs.sweeps.tasks import (
     standard_measures,
 )
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 MAX_PENDING_CHUNKS = 512
 """Most chunks that are submitted at once: each has a copy of the mechanism."""
@@ -143,7 +142,7 @@ def sweep(
         journal = None
         outcomes: dict[int, Outcome] = {}
         if resume is not None:
-            journal = stack.enter_context(closing(Journal(Path(resume), task, given)))
+            journal = stack.enter_context(closing(Journal(resume, task, given)))
             outcomes |= journal.known
         resumed = len(outcomes)
         log.info("sweep of %d cases, %d of them known", len(given), resumed)

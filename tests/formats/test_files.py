@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.formats.files import open_regular, read_bytes, read_text, whole_file, write_text
+from srm_mbs.formats.files import (
+    checked_path,
+    open_regular,
+    read_bytes,
+    read_text,
+    whole_file,
+    write_text,
+    write_texts,
+)
 
 posix = pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
 
@@ -123,3 +131,52 @@ def test_a_folder_that_is_not_there_is_named_by_the_path_given(tmp_path: Path) -
 
     with pytest.raises(OSError, match=r"no folder.file\.txt"):
         write_text(path, "text")
+
+
+@posix
+def test_a_write_protected_file_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    path.chmod(0o444)
+    if os.access(path, os.W_OK):
+        pytest.skip("root may write every file")
+
+    with pytest.raises(PermissionError, match=r"file\.txt"):
+        write_text(path, "new")
+
+    assert path.read_text() == "old"
+
+
+def test_of_several_files_none_is_replaced_if_one_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("old")
+
+    with pytest.raises(OSError, match="no folder"):
+        write_texts({tmp_path / "a": "new", tmp_path / "no folder" / "b": "new"})
+    with pytest.raises(OSError, match="no folder"):
+        write_texts({tmp_path / "no folder" / "b": "new", tmp_path / "a": "new"})
+
+    assert (tmp_path / "a").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_several_files_are_written_together(tmp_path: Path) -> None:
+    write_texts({tmp_path / "a": "first", tmp_path / "b": "second \udc80"})
+
+    assert (tmp_path / "a").read_text() == "first"
+    assert (tmp_path / "b").read_text() == "second \\udc80"
+    assert sorted(os.listdir(tmp_path)) == ["a", "b"]
+
+
+class Raising:
+    """A path whose name cannot be asked for."""
+
+    def __fspath__(self) -> str:
+        raise RuntimeError("no name")
+
+
+@pytest.mark.parametrize("path", [None, 3, b"bytes", "", "a\0b", ["a"], Raising()])
+def test_what_is_no_path_is_refused_by_the_name_of_the_argument(path: object) -> None:
+    with pytest.raises(srm.InputError) as caught:
+        checked_path(path, "out")
+
+    assert caught.value.element == "out"

@@ -257,6 +257,69 @@ def test_a_sweep_that_was_killed_is_resumed_where_it_stopped(tmp_path: Path) -> 
     assert len({line["case"] for line in lines[1:]}) == len(lines) - 1 == 5
 
 
+def test_two_sweeps_do_not_write_to_one_file_at_once(
+    tmp_path: Path, four_bar: srm.Mechanism
+) -> None:
+    file = tmp_path / "sweep.jsonl"
+    refusals: list[str] = []
+
+    def sweep_again(done: int, total: int) -> None:
+        with pytest.raises(srm.InputError, match="another sweep is writing") as caught:
+            srm.sweep(four_bar, [{}, {}], 0.1, resume=file)
+        refusals.append(str(caught.value))
+
+    srm.sweep(four_bar, [{}, {}], 0.1, resume=file, progress=sweep_again)
+
+    assert len(refusals) == 2
+    assert srm.sweep(four_bar, [{}, {}], 0.1, resume=file).resumed == 2
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"success": "yes"},
+        {"status": 3},
+        {"message": None},
+        {"measures": 3},
+        {"measures": {"steps": [1]}},
+        {"traceback": "import os"},
+        {"other": 1},
+    ],
+)
+def test_an_outcome_in_the_file_that_no_sweep_writes_is_refused(
+    damage: dict[str, Any], tmp_path: Path, four_bar: srm.Mechanism
+) -> None:
+    file = tmp_path / "sweep.jsonl"
+    srm.sweep(four_bar, [{}], 0.1, resume=file)
+    head, line = file.read_text(encoding="utf-8").splitlines()
+    entry = json.loads(line)
+    entry["outcome"] |= damage
+    file.write_text(f"{head}\n{json.dumps(entry)}\n", encoding="utf-8")
+
+    with pytest.raises(srm.InputError, match="line 2 is damaged"):
+        srm.sweep(four_bar, [{}], 0.1, resume=file)
+
+
+@pytest.mark.parametrize("head", ["[" * 100_000, '{"format": 1, "sweep": [3]}', "3"])
+def test_a_file_with_a_foreign_first_line_is_refused(
+    head: str, tmp_path: Path, four_bar: srm.Mechanism
+) -> None:
+    file = tmp_path / "sweep.jsonl"
+    file.write_text(head + "\n", encoding="utf-8")
+
+    with pytest.raises(srm.InputError, match=r"damaged|not a file of a sweep"):
+        srm.sweep(four_bar, [{}], 0.1, resume=file)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes of POSIX")
+@pytest.mark.timeout(20)
+def test_a_pipe_is_no_file_of_a_sweep(tmp_path: Path, four_bar: srm.Mechanism) -> None:
+    os.mkfifo(tmp_path / "pipe")
+
+    with pytest.raises(srm.InputError, match="no regular file"):
+        srm.sweep(four_bar, [{}], 0.1, resume=tmp_path / "pipe")
+
+
 def test_cases_that_raised_are_tried_again(tmp_path: Path) -> None:
     tries: list[float] = []
 

@@ -9,7 +9,6 @@ Source: docs/notation.md, "Load-time analysis" and "Manifold sampling".
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,12 +30,12 @@ from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
-from srm_mbs.errors import EvaluationError
+from srm_mbs.errors import EvaluationError, get_logger
 from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.mechanism import MechanismData, per_start
 from srm_mbs.model.validation import check_inertia
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 OPEN_SAMPLES = 24
 """Random open configurations from which rows are scaled."""

@@ -6,7 +6,6 @@ Pinocchio gets a URDF that contains only what
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,11 +14,11 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.formats.urdf.joint_types import take_extended, with_joints
 from srm_mbs.formats.urdf.validation import UrdfChecker
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,16 @@ How runs are made on it is in :mod:`srm_mbs.integration.kernel`.
 
 from __future__ import annotations
 
-import logging
 import os
 from functools import cache
 
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, warn
+from srm_mbs.errors import InputError, get_logger, warn
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 BACKENDS = ("auto", "python", "kernel")
 PLACEMENTS = ("automatic", "off")

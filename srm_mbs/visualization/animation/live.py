@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import time
 from dataclasses import replace
@@ -17,7 +16,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, node_names
 from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays
@@ -39,7 +38,7 @@ from srm_mbs.visualization.animation.playback import (
 from srm_mbs.visualization.animation.scene import make_picture
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 SHARE = 0.03
 """Largest part of the wall time of the run that the view takes."""

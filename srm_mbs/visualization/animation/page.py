@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import base64
-import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,14 +16,15 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import row_dimensions
-from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
+from srm_mbs.formats.files import write_bytes
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
 from srm_mbs.visualization.animation.scene import ASPECT, Picture
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 FOLDER = Path(__file__).with_name("web")
 
@@ -202,7 +202,7 @@ def write_file(path: Path, content: bytes) -> None:
         If it cannot be written.
     """
     try:
-        path.write_bytes(content)
+        write_bytes(path, content)
     except OSError as error:
         raise InputError(
             f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING

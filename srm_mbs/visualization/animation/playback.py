@@ -7,7 +7,6 @@ so that the browser plays the motion in real time and its time slider scrubs thr
 from __future__ import annotations
 
 import atexit
-import logging
 import math
 import sys
 import time
@@ -18,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
 from srm_mbs.visualization.animation.overlays import OverlayOptions
@@ -33,7 +32,7 @@ from srm_mbs.visualization.animation.scene import Picture, make_picture
 from srm_mbs.visualization.animation.server import SERVERLESS, start_server
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 REPLY_TIME = 30.0
 """Time (s) for meshcat's server to accept one command."""

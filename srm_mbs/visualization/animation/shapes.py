@@ -7,7 +7,6 @@ visuals is drawn as bars between its joints and loop anchors.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,12 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.formats.xml import parse_numbers, parse_xml
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 Colour = tuple[float, float, float, float]
 

@@ -7,7 +7,6 @@ of the bodies at the key frames of an animation.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -20,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.errors import get_logger
 from srm_mbs.model.closures import LoopClosure
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 MAX_BODY_FRAMES = 30_000
 """Key frames of all bodies together; in a page one costs up to 90 bytes, so 2.7 MB at most."""

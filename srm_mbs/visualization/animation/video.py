@@ -7,7 +7,6 @@ headless Chromium and takes a screenshot at each requested time.
 from __future__ import annotations
 
 import io
-import logging
 import math
 import shutil
 import subprocess
@@ -20,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import write_file
 from srm_mbs.visualization.animation.playback import check_fps, page_of
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 SIZE = (900, 600)
 """Width and height of an image in pixels; ratios other than 3 to 2 have margins."""

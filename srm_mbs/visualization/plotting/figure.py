@@ -6,7 +6,6 @@ object interface is used, not pyplot: no display and no global state.
 
 from __future__ import annotations
 
-import logging
 import string
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +24,8 @@ from matplotlib.ticker import (
     ScalarFormatter,
 )
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
+from srm_mbs.formats.files import writing
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinned
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from srm_mbs._typing import FloatArray
 
-log = logging.getLogger(__name__)
+log = get_logger(__name__)
 
 FORMATS = (".png", ".pdf", ".svg")
 """Suffixes under which a figure can be saved."""
@@ -128,7 +128,8 @@ def save(figure: Figure, path: Path) -> None:
     OSError
         If the file cannot be written.
     """
-    figure.savefig(path, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    with writing(path) as file:
+        figure.savefig(file, format=path.suffix.lower()[1:], dpi=RESOLUTION)
     log.info("written: %s", path)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError
+from srm_mbs.formats.files import writing
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
@@ -194,7 +195,7 @@ def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a page, image or video; an existing file is replaced.
+    """Write a page, image or video, whole or not at all; an existing file is replaced.
 
     Raises
     ------
@@ -202,7 +203,8 @@ def write_file(path: Path, content: bytes) -> None:
         If it cannot be written.
     """
     try:
-        path.write_bytes(content)
+        with writing(path) as file:
+            file.write(content)
     except OSError as error:
         raise InputError(
             f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING

@@ -6,6 +6,7 @@ object interface is used, not pyplot: no display and no global state.
 
 from __future__ import annotations
 
+import io
 import logging
 import string
 import textwrap
@@ -26,6 +27,7 @@ from matplotlib.ticker import (
 )
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import writing
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinned
 
@@ -121,14 +123,17 @@ def check_suffix(path: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write ``figure`` in the format that the suffix of ``path`` names.
+    """Write ``figure`` in the format that the suffix of ``path`` names, whole or not at all.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
-    figure.savefig(path, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    content = io.BytesIO()
+    figure.savefig(content, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    with writing(path) as file:
+        file.write(content.getbuffer())
     log.info("written: %s", path)
 
 

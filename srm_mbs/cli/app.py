@@ -46,6 +46,10 @@ from srm_mbs.errors import InputError
 
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
+HARNESS = Path("benchmarks", "work_precision", "__main__.py")
+"""The benchmark in a checkout of the source."""
+LARGEST_PROJECT_FILE = 10**6
+"""Bytes of a project file that is read to recognise a checkout."""
 
 app = typer.Typer(
     name="srm-mbs",
@@ -307,20 +311,46 @@ def benchmark(context: typer.Context) -> None:
     In a checkout of the source only, and with the compiled kernel unless --backend python asks
     for the Python reference.  The options are those of 'python -m benchmarks.work_precision'.
     """
-    harness = Path("benchmarks", "work_precision", "__main__.py")
-    if not harness.is_file():
+    folder = Path.cwd()
+    if not _is_checkout(folder):
         if "--help" in context.args:
             typer.echo(context.get_help())
             raise typer.Exit
         raise InputError(
-            "the benchmark is not installed with the package, and there is none in this folder",
-            file=str(harness),
+            "the benchmark is not installed with the package, and this folder is not a checkout "
+            "of its source",
+            file=str(HARNESS),
             element="benchmark",
             remedy="Run it at the top of a checkout of the source",
         )
-    # A new process, which reads the number of threads before it loads NumPy.
+    # A new process, which reads the number of threads before it loads NumPy.  It finds the modules
+    # of the checkout before those of other folders.
     arguments = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
-    raise typer.Exit(subprocess.run(arguments, check=False).returncode)
+    settings = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    done = subprocess.run(arguments, cwd=folder, env=settings, check=False)
+    raise typer.Exit(done.returncode)
+
+
+def _is_checkout(folder: Path) -> bool:
+    """Whether a folder is the top of a checkout of this project.
+
+    Its project file names the package, and it has the package and the benchmark as regular
+    packages, which precede those of the same name in other folders.
+    """
+    from srm_mbs.formats.files import read_text
+    from srm_mbs.formats.toml.description import parse_toml
+
+    try:
+        text = read_text(folder / "pyproject.toml", LARGEST_PROJECT_FILE)
+        project = parse_toml(text, "pyproject.toml").get("project")
+    except InputError:
+        return False
+    needed = (HARNESS, Path("benchmarks", "__init__.py"), HARNESS.with_name("__init__.py"))
+    return (
+        isinstance(project, dict)
+        and project.get("name") == "srm-mbs"
+        and all((folder / file).is_file() for file in (*needed, Path("srm_mbs", "__init__.py")))
+    )
 
 
 def main() -> None:

@@ -137,7 +137,7 @@ class Socket(Private, WebSocketHandler):
     def open(self, *_: str) -> None:
         self.behind = 0
         if len(self.scene.pages) >= MOST_PAGES:
-            self.close(1013)
+            self._stream().close()
             return
         self.set_nodelay(True)
         self.door.keep(self._stream())
@@ -166,7 +166,7 @@ class Socket(Private, WebSocketHandler):
             done.exception()  # the page has gone: on_close follows
 
     def on_message(self, _: str | bytes) -> None:
-        self.close(1008)
+        self._stream().close()
 
     def on_close(self) -> None:
         self.scene.pages.discard(self)

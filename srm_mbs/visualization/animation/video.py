@@ -97,7 +97,7 @@ def browser() -> Iterator[Any]:
             if "sandboxing failed" in error.message:
                 reason = "its sandbox does not work here"
             raise InputError(
-                f"Chromium does not start: {reason}",
+                f"the browser does not start: {reason}",
                 file=path,
                 remedy="Use the Chromium of your system, and check that user namespaces are "
                 "allowed; or use solution.export_html(path)",

@@ -215,7 +215,7 @@ def test_a_view_whose_server_does_not_answer_stops_it_and_says_so(
         return served[0]
 
     monkeypatch.setattr("srm_mbs.visualization.animation.live.serve", stopped)
-    monkeypatch.setattr("srm_mbs.visualization.animation.playback.REPLY_TIME", 0.05)
+    monkeypatch.setattr("srm_mbs.visualization.animation.live.REPLY_TIME", 0.05)
     with pytest.raises(srm.InputError, match="the server of the page does not answer"):
         srm.LiveView(load("four_bar"), open_browser=False)
     assert served[0].window.server_proc.poll() is not None

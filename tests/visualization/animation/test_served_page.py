@@ -31,12 +31,21 @@ ROOT = Path(__file__).parents[3]
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
 
-@pytest.fixture
-def visualizer() -> Iterator[Any]:
+@contextlib.contextmanager
+def served() -> Iterator[Any]:
     """A played run."""
-    served = play(srm.simulate(load("four_bar"), 0.2), open_browser=False, block=False)
-    yield served
-    close(served)
+    visualizer = play(srm.simulate(load("four_bar"), 0.2), open_browser=False, block=False)
+    try:
+        yield visualizer
+    finally:
+        close(visualizer)
+
+
+@pytest.fixture(scope="module")
+def visualizer() -> Iterator[Any]:
+    """A played run, whose server bears all that the tests of this file do to it."""
+    with served() as one:
+        yield one
 
 
 def port_of(visualizer: Any) -> int:
@@ -92,6 +101,8 @@ def hung_up(page: socket.socket) -> bool:
             pass
     except TimeoutError:
         return False
+    except ConnectionError:
+        return True
     return True
 
 
@@ -266,6 +277,18 @@ def test_connections_that_ask_nothing_do_not_keep_the_page_from_its_reader(visua
         assert not hung_up(page)
 
 
+def test_a_bounded_number_of_pages_is_open(visualizer: Any) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(server.MOST_PAGES):
+            stack.enter_context(upgraded(visualizer))
+        with upgraded(visualizer) as page:
+            assert hung_up(page)
+    assert still_draws(visualizer)
+    time.sleep(0.2)
+    with upgraded(visualizer) as page:
+        assert not hung_up(page)
+
+
 def test_a_thousand_visits_do_not_block_a_server_whose_pipes_nobody_reads(visualizer: Any) -> None:
     for _ in range(1000):
         with upgraded(visualizer):
@@ -287,6 +310,7 @@ def test_a_page_that_reads_nothing_is_disconnected_before_it_fills_the_memory(
         with contextlib.suppress(ConnectionResetError):
             while page.recv(2**20):
                 pass
+    visualizer["/heavy"].delete()
     assert still_draws(visualizer)
 
 
@@ -368,14 +392,15 @@ def test_a_question_to_the_page_is_an_input_error_with_another_way(visualizer: A
     assert still_draws(visualizer)
 
 
-def test_waiting_for_a_page_ends_when_one_is_open(visualizer: Any) -> None:
-    with (
-        pytest.raises(srm.InputError, match="does not answer within"),
-        visualizer.window.answering(0.2),
-    ):
-        visualizer.wait()
-    with upgraded(visualizer), visualizer.window.answering(20.0):
-        visualizer.wait()
+def test_waiting_for_a_page_ends_when_one_is_open() -> None:
+    with served() as visualizer:
+        with (
+            pytest.raises(srm.InputError, match="does not answer within"),
+            visualizer.window.answering(0.2),
+        ):
+            visualizer.wait()
+        with upgraded(visualizer), visualizer.window.answering(20.0):
+            visualizer.wait()
 
 
 @pytest.mark.browser

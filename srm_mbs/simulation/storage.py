@@ -45,6 +45,7 @@ from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Curve, Law
 from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.options import REPEATED, RunOptions
 from srm_mbs.simulation.result import ATTEMPT, Settings, SimulationResult, Statistics
 from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
@@ -202,7 +203,7 @@ def _archive(solution: SimulationResult, path: Path) -> bytes:
         "pin": pin.__version__,
         "mechanism": {
             "name": mechanism.name,
-            "source": None if mechanism.source is None else asdict(mechanism.source),
+            "source": None if mechanism.source is None else mechanism.source.entries(),
             "model": mechanism.model.saveToString() if mechanism.source is None else None,
             "loops": [_plain(loop) for loop in mechanism.loops],
             "forces": [_plain(force) for force in mechanism.forces if force.type in FORCE_TYPES],
@@ -258,13 +259,15 @@ def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
 # -- reading ----------------------------------------------------------------------------------
 
 
-def load_result(path: Path, types: ResultTypes[R]) -> R:
+def load_result(path: Path, types: ResultTypes[R], reach: Reach) -> R:
     """Read a saved run; see :func:`srm_mbs.load_solution`.
 
     Parameters
     ----------
     types
         Classes of the result.
+    reach
+        Where its animations may read meshes, which the file does not decide.
 
     Raises
     ------
@@ -277,8 +280,8 @@ def load_result(path: Path, types: ResultTypes[R]) -> R:
             raise ValueError("no archive of arrays")
         with zipfile.ZipFile(file) as archive:
             if CONTENTS in archive.namelist():
-                return _segments(archive, path, types)
-        return _one_segment(file, types.plain)
+                return _segments(archive, path, types, reach)
+        return _one_segment(file, types.plain, reach)
 
 
 @contextmanager
@@ -303,14 +306,15 @@ def _check_format(what: str, found: int, known: int) -> None:
         raise InputError(f"{what} format {found}, this version reads {known}", remedy=OTHER_VERSION)
 
 
-def _segments(archive: zipfile.ZipFile, path: Path, types: ResultTypes[R]) -> R:
+def _segments(archive: zipfile.ZipFile, path: Path, types: ResultTypes[R], reach: Reach) -> R:
     """A run of several segments."""
     contents = json.loads(archive.read(CONTENTS))
     _check_format("its segments have", contents["format"], SEGMENTS_FORMAT)
     segments = []
     for k in range(contents["count"]):
         with _naming(f"{path}, segment {k}"):
-            segments.append(_one_segment(io.BytesIO(archive.read(f"{k}.npz")), types.plain))
+            file = io.BytesIO(archive.read(f"{k}.npz"))
+            segments.append(_one_segment(file, types.plain, reach))
     t_eval = contents["t_eval"]
     whole = types.segmented(
         segments,
@@ -322,7 +326,7 @@ def _segments(archive: zipfile.ZipFile, path: Path, types: ResultTypes[R]) -> R:
     return whole
 
 
-def _one_segment(file: io.BytesIO, result_type: type[R]) -> R:
+def _one_segment(file: io.BytesIO, result_type: type[R], reach: Reach) -> R:
     """A run of one segment."""
     with np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -330,7 +334,7 @@ def _one_segment(file: io.BytesIO, result_type: type[R]) -> R:
         raise ValueError(f"it has the arrays {', '.join(arrays)} only")
     meta = json.loads(str(arrays.pop("meta")))
     _check_format("it has", meta["format"], FORMAT)
-    mechanism = _mechanism(meta["mechanism"], arrays)
+    mechanism = _mechanism(meta["mechanism"], arrays, reach)
     # The analysis of the run itself, so that the dense output is the same to the last bit.
     mechanism = mechanism.with_structure(_structure(mechanism, meta["structure"], arrays))
     zones = {
@@ -366,9 +370,10 @@ def _one_segment(file: io.BytesIO, result_type: type[R]) -> R:
     return solution
 
 
-def _mechanism(entry: dict[str, Any], arrays: Arrays) -> Mechanism:
+def _mechanism(entry: dict[str, Any], arrays: Arrays, reach: Reach) -> Mechanism:
     if entry["source"] is not None:
-        source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
+        gravity = tuple(entry["source"]["gravity"])
+        source = Source(**entry["source"] | {"gravity": gravity, "reach": reach})
         model = rebuild(source).model
     else:
         source, model = None, pin.Model()

@@ -17,7 +17,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
-from srm_mbs.formats.files import read_bytes
+from srm_mbs.formats.files import read_bytes, shortened
 from srm_mbs.formats.xml import local_name, parse_xml
 
 SUFFIXES = (".stl", ".obj", ".dae")
@@ -60,7 +60,7 @@ def read_mesh(path: Path) -> Triangles:
             if isinstance(error, InputError):
                 raise
             raise InputError(
-                f"it is not a {suffix[1:].upper()} mesh: {str(error)[:60]}", remedy=KNOWN
+                f"it is not a mesh of type {suffix!r}: {shortened(str(error))}", remedy=KNOWN
             ) from error
         return _checked(vertices, faces)
 
@@ -87,13 +87,13 @@ def _stl(content: bytes) -> Triangles:
         count = int.from_bytes(content[STL_HEADER - 4 : STL_HEADER], "little")
         if len(content) == STL_HEADER + STL_TRIANGLE * count:
             return _binary_stl(content, count)
-    if not content[:512].lstrip().lower().startswith(b"solid"):
+    if b"\0" in content or not content[:512].lstrip().lower().startswith(b"solid"):
         raise ValueError("its size does not agree with its number of triangles")
-    words = np.array(content.split(b"vertex")[1:], dtype=object)
-    if len(words) % 3:
-        raise ValueError(f"{len(words)} vertices make no triangles")
-    vertices = np.array([word.split(None, 3)[:3] for word in words], dtype=float)
-    return _merged(vertices.reshape(-1, 3))
+    words = map(bytes.split, content.splitlines())
+    found = [line[1:] for line in words if line and line[0].lower() == b"vertex"]
+    if len(found) % 3:
+        raise ValueError(f"{len(found)} vertices make no triangles")
+    return _merged(np.array(found, dtype=float).reshape(len(found), 3))
 
 
 def _binary_stl(content: bytes, count: int) -> Triangles:

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.files import check_name, open_regular, shortened
 from srm_mbs.model.reach import Reach
 
@@ -88,7 +88,7 @@ def read_csv(path: Path) -> CsvTable:
     InputError
         If it cannot be read, or is too large.
     """
-    with open_regular(path, LARGEST_TABLE) as stream:
+    with open_regular(path, LARGEST_TABLE) as stream, naming(file=str(path)):
         try:
             return _Reader(str(path)).table(stream)
         except (OSError, UnicodeDecodeError, csv.Error) as error:

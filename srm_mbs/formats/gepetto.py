@@ -27,7 +27,7 @@ from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf import loops as urdf_loops
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
-LARGEST_YAML = 4 * 10**6
+LARGEST_YAML = 10**6
 """Characters of the YAML file."""
 LARGEST_YAML_DEPTH = 20
 """Values in each other, the stream and the document included."""

@@ -55,7 +55,8 @@ def read_mesh(path: Path) -> Triangles:
             raise InputError(f"meshes of type {suffix[:12]!r} are not read", remedy=KNOWN)
         content = read_bytes(path, LARGEST_MESH)
         try:
-            vertices, faces = READERS[suffix](content)
+            with np.errstate(all="ignore"):  # infinite coordinates are refused below
+                vertices, faces = READERS[suffix](content)
         except (ValueError, IndexError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise

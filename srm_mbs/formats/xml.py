@@ -38,7 +38,7 @@ MOST_ELEMENTS = 10**6
 """Number of elements, and of attributes, in a file."""
 NAMING = ("name", "link", "joint", "body", "site", "body1", "body2", "joint1", "joint2", "frame")
 """Attributes that hold names."""
-PIECE = 10**5
+PIECE = 4 * 10**6
 """Characters that the parser gets at once."""
 LARGEST_TAG = 4 * 10**6
 """Bytes of a tag with its attributes, or of a comment."""
@@ -344,7 +344,7 @@ def _parsed(text: str) -> Element:
         piece = text[start : start + PIECE].encode()
         parser.feed(piece)
         size += len(piece)
-        if size - parser.parser.CurrentByteIndex > LARGEST_TAG + 4 * PIECE:
+        if size - parser.parser.CurrentByteIndex > LARGEST_TAG + PIECE:
             raise ValueError(f"a tag or comment has more than {LARGEST_TAG / 1e6:.0f} MB")
     root: Element = parser.close()
     return root

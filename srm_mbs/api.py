@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from srm_mbs.integration.driver import Tick
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.dae import SemiExplicitDAE
+from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.dae_run import run_dae
 from srm_mbs.simulation.options import RunOptions
@@ -366,11 +368,21 @@ def solve_dae(
     return run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
 
 
-def load_solution(path: str | Path) -> Solution:
+def load_solution(
+    path: str | Path, *, mesh_dirs: Sequence[str | Path] = (), allow_outside: bool = False
+) -> Solution:
     """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
 
     Meshes are looked for beside the file.  A controller is not saved: reactions of a controlled run
     cannot be computed afterwards, unless it was sampled; what it held is saved.
+
+    Parameters
+    ----------
+    path
+        A file of :meth:`Solution.save`.
+    mesh_dirs, allow_outside
+        Where its animations may read meshes, as for :func:`srm_mbs.load`; the folder of the model
+        is that of ``path``.
 
     Raises
     ------
@@ -380,4 +392,4 @@ def load_solution(path: str | Path) -> Solution:
     """
     from srm_mbs.simulation.storage import load_result
 
-    return load_result(Path(path), SOLUTIONS)
+    return load_result(Path(path), SOLUTIONS, Reach.of(path, mesh_dirs, allow_outside))

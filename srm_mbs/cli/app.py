@@ -28,6 +28,7 @@ from srm_mbs.cli.output import (
     BAD_INPUT,
     HTML_SUFFIXES,
     RUN_FAILED,
+    AllowOutside,
     Html,
     Lines,
     Model,
@@ -151,6 +152,7 @@ def simulate(
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
     live: playback.Live = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -168,7 +170,7 @@ def simulate(
     check_output(html, "--html", HTML_SUFFIXES)
     playback.check_pictures(image, at, video)
 
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     defaults = mechanism.defaults
@@ -225,11 +227,12 @@ def convert(
     ],
     cut: Annotated[list[str] | None, several("--cut", "JOINT", "Cut a loop at this joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write a file of any format as a TOML description and a URDF."""
     from srm_mbs.formats.convert import convert as write
 
-    *written, notes = write(model, out, cut=cut or (), force=force)
+    *written, notes = write(model, out, cut=cut or (), force=force, allow_outside=allow_outside)
     for path in written:
         say_written(path)
     for note in notes:
@@ -238,7 +241,7 @@ def convert(
 
 @app.command()
 @reported
-def info(model: Model) -> None:
+def info(model: Model, allow_outside: AllowOutside = False) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
@@ -252,7 +255,7 @@ def info(model: Model) -> None:
         mechanism_rows,
     )
 
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     table(mechanism_rows(mechanism))
     for header, rows in (
         (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),

@@ -52,6 +52,7 @@ from srm_mbs.model.laws import Curve, Law
 from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.model.model_data import model_from_data, model_to_data
 from srm_mbs.model.pinocchio_archive import model_from_archive
+from srm_mbs.model.reach import Reach
 from srm_mbs.simulation import saved_run
 from srm_mbs.simulation.options import REPEATED, RunOptions
 from srm_mbs.simulation.result import Settings, SimulationResult, Statistics
@@ -64,6 +65,8 @@ FORMAT = 5
 ARCHIVED_MODEL_FORMAT = 4
 """The format that holds models made in Python as archives of Pinocchio."""
 SEGMENTS_FORMAT = 1
+NO_REACH = Reach()
+"""No meshes are read but those that come with the package."""
 CONTENTS = "segments.json"
 """Entry of an archive of segments that describes the whole run."""
 SAVED_BY = "Give a file written by solution.save or srm-mbs simulate --out"
@@ -224,7 +227,7 @@ def _without_folders(text: str, source: Source) -> str:
 
 def _source_entry(source: Source, full_paths: bool) -> dict[str, Any]:
     """``source`` as JSON, without the folders that its files lay in unless asked for."""
-    entry = asdict(source)
+    entry = source.entries()
     if not full_paths:
         entry |= {key: _without_folders(entry[key], source) for key in ("description", "urdf")}
         entry |= {key: _file_name(entry[key]) for key in ("path", "urdf_path")}
@@ -312,13 +315,15 @@ def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
 # -- reading ----------------------------------------------------------------------------------
 
 
-def load_result(path: Path, types: ResultTypes[R]) -> R:
+def load_result(path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
     """Read a saved run; see :func:`srm_mbs.load_solution`.
 
     Parameters
     ----------
     types
         Classes of the result.
+    reach
+        Where its animations may read meshes, which the file does not decide.
 
     Raises
     ------
@@ -327,17 +332,17 @@ def load_result(path: Path, types: ResultTypes[R]) -> R:
         :mod:`srm_mbs.formats.archive` allows.
     """
     with _naming(str(path)), open_regular(path, LARGEST_CONTENT) as file:
-        return load_from(file, path, types)
+        return load_from(file, path, types, reach)
 
 
-def load_from(file: IO[bytes], path: Path, types: ResultTypes[R]) -> R:
+def load_from(file: IO[bytes], path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
     """As :func:`load_result`, from an open file; ``path`` names it, and its folder is searched for
     meshes."""
     with _naming(str(path)):
         archive = Archive(file)
         if CONTENTS in archive.names:
-            return _segments(archive, path, types)
-        return run_from(archive.arrays(), path, types.plain)
+            return _segments(archive, path, types, reach)
+        return run_from(archive.arrays(), path, types.plain, reach)
 
 
 @contextmanager
@@ -362,7 +367,7 @@ def _check_format(what: str, found: Any, known: tuple[int, ...]) -> None:
         )
 
 
-def _segments(archive: Archive, path: Path, types: ResultTypes[R]) -> R:
+def _segments(archive: Archive, path: Path, types: ResultTypes[R], reach: Reach) -> R:
     """A run of several segments."""
     contents = json_object(archive.read(CONTENTS), CONTENTS)
     _check_format("its segments have", contents.get("format"), (SEGMENTS_FORMAT,))
@@ -375,7 +380,7 @@ def _segments(archive: Archive, path: Path, types: ResultTypes[R]) -> R:
         with _naming(f"{path}, segment {k}"):
             inner = Archive(io.BytesIO(archive.read(f"{k}.npz")), budget)
             budget -= inner.content
-            segments.append(run_from(inner.arrays(), path, types.plain))
+            segments.append(run_from(inner.arrays(), path, types.plain, reach))
             _check_continues(segments)
     start = float(segments[0].steps.times[0])
     t_eval = None
@@ -404,7 +409,7 @@ def _check_continues(segments: Sequence[SimulationResult]) -> None:
         raise ValueError("it begins before the end of the segment before it")
 
 
-def run_from(arrays: Arrays, path: Path, result_type: type[R]) -> R:
+def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach = NO_REACH) -> R:
     """The run of one segment in the ``arrays`` of the file ``path``.
 
     Raises
@@ -420,7 +425,7 @@ def run_from(arrays: Arrays, path: Path, result_type: type[R]) -> R:
     meta = json_object(str(text[()]), "meta")
     _check_format("it has", meta.get("format"), (FORMAT, ARCHIVED_MODEL_FORMAT))
     entry = saved_run.checked_entry(saved_run.RunEntry, meta)
-    mechanism = _mechanism(entry, arrays, path)
+    mechanism = _mechanism(entry, arrays, path, reach)
     # The analysis of the run itself, so that the dense output is the same to the last bit.
     structure = saved_run.structure_from(mechanism, entry.structure, arrays)
     mechanism = mechanism.with_structure(structure)
@@ -462,19 +467,20 @@ def _model_of(entry: saved_run.RunEntry) -> pin.Model:
     raise ValueError("it has neither the source of its mechanism nor its model")
 
 
-def _source(entry: saved_run.SourceEntry, path: Path) -> Source:
+def _source(entry: saved_run.SourceEntry, path: Path, reach: Reach) -> Source:
     """The source of the mechanism in the file ``path``: its meshes are looked for beside that
     file, wherever the URDF lay when it was written."""
     values = entry.model_dump() | {
         "gravity": tuple(entry.gravity),
         "urdf_path": str(path.parent / _file_name(entry.urdf_path)),
+        "reach": reach,
     }
     return Source(**values)
 
 
-def _mechanism(run: saved_run.RunEntry, arrays: Arrays, path: Path) -> Mechanism:
+def _mechanism(run: saved_run.RunEntry, arrays: Arrays, path: Path, reach: Reach) -> Mechanism:
     entry = run.mechanism
-    source = None if entry.source is None else _source(entry.source, path)
+    source = None if entry.source is None else _source(entry.source, path, reach)
     model = _model_of(run) if source is None else rebuild(source).model
     q0, v0 = saved_run.checked_start(arrays, model)
     forces = tuple(map(saved_run.value_of, entry.forces))

@@ -31,6 +31,8 @@ LONGEST_NAME = 1000
 """Characters of the name of a member."""
 DEEPEST_JSON = 64
 """Objects and lists inside each other."""
+MOST_OBJECTS, MOST_COMMAS = 500_000, 5 * 10**6
+"""Objects and lists of a JSON text, and its commas: of each value much memory is made."""
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Ways of packing whose unpacking is bounded."""
@@ -44,7 +46,8 @@ _HEADER = re.compile(
     r"'shape': \((?P<shape>[0-9, ]{0,200})\), \} *\n"
 )
 _SCALAR = re.compile(r"[<>|]([fiu][1248]|b1|U[0-9]{1,10})")
-_TEXT_OR_BRACKET = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"|[\[{]|[\]}]', re.DOTALL)
+# A text need not end: an expression that fails at the end of the file begins anew at every quote.
+_TEXT_OR_BRACKET = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"?|[\[{]|[\]}]', re.DOTALL)
 
 
 class Archive:
@@ -205,16 +208,21 @@ def json_object(text: str | bytes, name: str) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If it describes none, or one with more than DEEPEST_JSON objects and lists inside each
-        other; ``name`` is its name.
+        If it describes none, one with more than DEEPEST_JSON objects and lists inside each other,
+        or one with more values than a run has; ``name`` is its name.
     """
     text = text if isinstance(text, str) else text.decode("utf-8")
-    depth = 0
+    depth = opened = 0
     for found in _TEXT_OR_BRACKET.finditer(text):
         character = text[found.start()]
+        opened += character in "[{"
         depth += (character in "[{") - (character in "]}")
         if depth > DEEPEST_JSON:
             raise ValueError(f"{name} has more than {DEEPEST_JSON} objects inside each other")
+        if opened > MOST_OBJECTS:
+            break
+    if opened > MOST_OBJECTS or text.count(",") > MOST_COMMAS:
+        raise ValueError(f"{name} has more values than a run has")
     found_object = json.loads(text)
     if not isinstance(found_object, dict):
         raise ValueError(f"{name} is no object")

@@ -12,14 +12,22 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
 MOST_JOINTS = 5_000
 """Joints of a model: Pinocchio's matrices of it have as many rows and columns."""
-MOST_FRAMES = 100_000
+MOST_FRAMES = 20_000
 """Frames or bodies of a model."""
 LONGEST_NAME = 1000
 """Characters of a name."""
@@ -42,8 +50,27 @@ _PLAIN = (
 """Types of joints made without an axis; H joints have a pitch."""
 
 
+def plain_numbers(values: list[Any]) -> list[Any]:
+    """``values``, from JSON, if they are numbers; infinite ones and NaN among them.
+
+    One check of the list: pydantic would make an error of each of a million wrong items.
+    """
+    if not all(
+        type(value) is float or (type(value) is int and abs(value) < 2**63) for value in values
+    ):
+        raise ValueError("it does not consist of numbers")
+    return values
+
+
+def finite_numbers(values: list[Any]) -> list[Any]:
+    """``values``, from JSON, if they are finite numbers."""
+    if not np.isfinite(np.array(plain_numbers(values), dtype=float)).all():
+        raise ValueError("it has numbers that are no finite number")
+    return values
+
+
 def _orthonormal(numbers: list[float]) -> list[float]:
-    R = np.reshape(numbers[:9], (3, 3))
+    R = np.reshape(finite_numbers(numbers)[:9], (3, 3)).astype(float)
     if not np.allclose(R @ R.T, np.eye(3), atol=ORTHONORMAL, rtol=0) or np.linalg.det(R) < 0.0:
         raise ValueError("the first nine numbers are not a rotation")
     return numbers
@@ -52,36 +79,47 @@ def _orthonormal(numbers: list[float]) -> list[float]:
 Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 Index = Annotated[int, Field(ge=0, le=MOST_FRAMES, strict=True)]
 Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-Placement = Annotated[
-    list[FiniteFloat], Field(min_length=12, max_length=12), AfterValidator(_orthonormal)
-]
+Placement = Annotated[list[Any], Field(min_length=12, max_length=12), AfterValidator(_orthonormal)]
 """Rotation row by row, and translation."""
-InertiaNumbers = Annotated[list[FiniteFloat], Field(min_length=10, max_length=10)]
+InertiaNumbers = Annotated[
+    list[Any], Field(min_length=10, max_length=10), AfterValidator(finite_numbers)
+]
 """Mass, centre of mass (3), and I_xx, I_xy, I_xz, I_yy, I_yz, I_zz about it."""
-Numbers = list[Annotated[float, Field(allow_inf_nan=True)]]
+Numbers = Annotated[list[Any], AfterValidator(plain_numbers)]
+MOST_KEYS = 100
+"""Entries of an object, many more than any has: each wrong one makes an error of its own."""
 
 
-class _Data(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
+class StrictData(BaseModel):
+    """Data of strangers: no further entries, no other types, and few errors at a time."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_many(cls, values: Any) -> Any:
+        if isinstance(values, dict) and len(values) > MOST_KEYS:
+            raise ValueError(f"it has {len(values)} entries")
+        return values
 
 
-class JointTypeData(_Data):
+class JointTypeData(StrictData):
     """Type of a joint, and the numbers that it is made with."""
 
     type: str
-    axes: list[Vector3] = []
-    numbers: list[FiniteFloat] = []
-    parts: list[PartData] = []
+    axes: Annotated[list[Vector3], Field(max_length=2)] = []
+    numbers: Annotated[list[FiniteFloat], Field(max_length=3)] = []
+    parts: Annotated[list[PartData], Field(max_length=MOST_JOINTS)] = []
 
 
-class PartData(_Data):
+class PartData(StrictData):
     """A joint inside a composite joint."""
 
     kind: JointTypeData
     placement: Placement
 
 
-class JointData(_Data):
+class JointData(StrictData):
     """A joint, its parent, and the inertia that it carries."""
 
     name: Name
@@ -91,7 +129,7 @@ class JointData(_Data):
     inertia: InertiaNumbers
 
 
-class FrameData(_Data):
+class FrameData(StrictData):
     """A frame on a joint; ``inertia`` is its share of the joint's."""
 
     name: Name
@@ -102,7 +140,7 @@ class FrameData(_Data):
     inertia: InertiaNumbers
 
 
-class ModelData(_Data):
+class ModelData(StrictData):
     """A model: joints without the universe, frames without its first one, and vectors."""
 
     name: Name
@@ -112,7 +150,7 @@ class ModelData(_Data):
     frames: Annotated[list[FrameData], Field(max_length=MOST_FRAMES)]
     bodies: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
     """Pinocchio's count of bodies, the universe included; no computation reads it."""
-    vectors: dict[str, Numbers]
+    vectors: Annotated[dict[Name, Numbers], Field(max_length=MOST_KEYS)]
 
 
 def _placement_numbers(placement: pin.SE3) -> list[float]:
@@ -255,7 +293,8 @@ def model_from_data(data: Any) -> pin.Model:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise _no_model(f"{where}: {first['msg']}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        raise _no_model(f"{where[:100]}: {message}" if where else message) from error
     except ValueError as error:
         raise _no_model(str(error)) from error
 

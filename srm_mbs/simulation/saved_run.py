@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -37,6 +38,7 @@ from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.forces import FORCE_TYPES
 from srm_mbs.model.laws import LAW_TYPES
+from srm_mbs.model.model_data import StrictData, finite_numbers
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 from srm_mbs.simulation.result import ATTEMPT
 
@@ -56,20 +58,35 @@ VERDICTS = ("rejected", "replaced")
 ELEMENT_TYPES: dict[str, Any] = {**LAW_TYPES, **FORCE_TYPES}
 """Elements that are saved with their type; the others follow from where they are."""
 
+
+def _positive_numbers(values: list[Any]) -> list[Any]:
+    if not all(0.0 < value <= LARGEST_MAGNITUDE for value in finite_numbers(values)):
+        raise ValueError("it has numbers that are not positive, or too large")
+    return values
+
+
+def _pairs(values: list[Any]) -> list[tuple[int, float]]:
+    """Pairs of a step and a threshold."""
+    for pair in values:
+        if not isinstance(pair, list) or len(pair) != 2 or type(pair[0]) is not int:
+            raise ValueError("it does not consist of a step and a threshold each")
+        if pair[0] < 0 or min(finite_numbers(pair)) < 0.0:
+            raise ValueError("it has numbers that are negative")
+    return [(index, float(threshold)) for index, threshold in values]
+
+
 Arrays = dict[str, NDArray[Any]]
 Text = Annotated[str, Field(max_length=LONGEST_TEXT)]
 Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 Sentence = Annotated[str, Field(max_length=LONGEST_SENTENCE)]
 Number = Annotated[float, Field(ge=-LARGEST_MAGNITUDE, le=LARGEST_MAGNITUDE, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST_MAGNITUDE, allow_inf_nan=False)]
+Numbers = Annotated[list[Any], AfterValidator(finite_numbers)]
+Sentences = Annotated[list[Sentence], Field(max_length=MOST_ELEMENTS)]
 Elements = Annotated[list[dict[str, Any]], Field(max_length=MOST_ELEMENTS)]
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class SourceEntry(_Entry):
+class SourceEntry(StrictData):
     """:class:`~srm_mbs.model.mechanism.Source`."""
 
     description: Text
@@ -81,7 +98,7 @@ class SourceEntry(_Entry):
     format: Name = "URDF"
 
 
-class DefaultsEntry(_Entry):
+class DefaultsEntry(StrictData):
     """:class:`~srm_mbs.model.mechanism.SimulationDefaults`."""
 
     t_end: Positive | None
@@ -89,7 +106,7 @@ class DefaultsEntry(_Entry):
     atol: Positive | None
 
 
-class MechanismEntry(_Entry):
+class MechanismEntry(StrictData):
     """A mechanism; ``model`` is data in format 5, Pinocchio's archive in format 4, and None beside
     a source."""
 
@@ -99,39 +116,39 @@ class MechanismEntry(_Entry):
     loops: Elements
     forces: Elements
     drives: Elements
-    drive_starts: dict[Name, Number] | None = None
+    drive_starts: Annotated[dict[Name, Number], Field(max_length=MOST_ELEMENTS)] | None = None
     friction_speed: Positive
     defaults: DefaultsEntry
-    notes: list[Sentence]
+    notes: Sentences
 
 
-class StructureEntry(_Entry):
+class StructureEntry(StrictData):
     """Numbers of :class:`~srm_mbs.dynamics.constraints.structure.Structure` and its units."""
 
     rank: NonNegativeInt
     loop_rank: NonNegativeInt
     sigma_ref: Positive
     samples: NonNegativeInt
-    notes: list[Sentence]
+    notes: Sentences
     length: Positive
     rate: Positive
 
 
-class SettingsEntry(_Entry):
+class SettingsEntry(StrictData):
     """:class:`~srm_mbs.simulation.result.Settings`."""
 
     method: Name
     tableau: Name
     rtol: Positive
-    atol: list[Positive]
+    atol: Annotated[list[Any], AfterValidator(_positive_numbers)]
     step: Positive | None
     controlled: bool
     placement: Literal[tuple(PLACEMENTS)] = "automatic"  # type: ignore[valid-type]
-    singular_times: list[Number] = []
+    singular_times: Numbers = Field(default_factory=list)
     backend: Literal["python", "kernel"] = "python"
 
 
-class StatisticsEntry(_Entry):
+class StatisticsEntry(StrictData):
     """:class:`~srm_mbs.simulation.result.Statistics`."""
 
     steps: NonNegativeInt
@@ -144,7 +161,7 @@ class StatisticsEntry(_Entry):
     wall_time: Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
 
 
-class OptionsEntry(_Entry):
+class OptionsEntry(StrictData):
     """Options of :class:`~srm_mbs.simulation.options.RunOptions` that are saved; a rerun checks
     them as those of any run."""
 
@@ -154,24 +171,25 @@ class OptionsEntry(_Entry):
     first_step: Positive | None
     max_step: Annotated[float, Field(gt=0.0)] | None
     sample_time: Positive | None
-    breakpoints: list[Number]
+    breakpoints: Numbers
     placement: Literal[tuple(PLACEMENTS)]  # type: ignore[valid-type]
-    singular_times: list[Number]
+    singular_times: Numbers
     backend: Literal["auto", "python", "kernel"]
 
 
-class RequestEntry(_Entry):
+class RequestEntry(StrictData):
     """How the run was asked for, and what of it is not saved."""
 
     t_end: Number
     options: OptionsEntry
-    lost: list[Sentence]
+    lost: Sentences
 
 
+Zones = Annotated[list[Any], AfterValidator(_pairs)]
 Status = Literal["running", "finished", "event", "interrupted", "failed"]
 
 
-class RunEntry(_Entry):
+class RunEntry(StrictData):
     """The JSON text of a run of one segment."""
 
     format: int
@@ -183,12 +201,12 @@ class RunEntry(_Entry):
     request: RequestEntry | None = None
     status: Status
     message: Sentence
-    zones: list[tuple[NonNegativeInt, Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]]]
+    zones: Zones
     stop: Number | None
     events: NonNegativeInt | None
 
 
-class SegmentsEntry(_Entry):
+class SegmentsEntry(StrictData):
     """The JSON text of a run of several segments."""
 
     format: int
@@ -196,7 +214,7 @@ class SegmentsEntry(_Entry):
     status: Status
     message: Sentence
     request: RequestEntry | None = None
-    t_eval: list[Number] | None
+    t_eval: Numbers | None
 
 
 E = TypeVar("E", bound=BaseModel)
@@ -210,9 +228,6 @@ def checked_entry(kind: type[E], values: Mapping[str, Any]) -> E:
     ValueError
         Naming the first entry that is missing, unknown, or of another kind or size.
     """
-    pairs = values.get("zones")
-    if isinstance(pairs, list) and all(isinstance(pair, list) for pair in pairs):
-        values = {**values, "zones": [tuple(pair) for pair in pairs]}
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -222,7 +237,7 @@ def checked_entry(kind: type[E], values: Mapping[str, Any]) -> E:
 def _first_fault(error: ValidationError) -> str:
     first = error.errors(include_input=False, include_url=False)[0]
     where = ".".join(map(str, first["loc"]))
-    return f"{where[:100]}: {first['msg'][:200]}"
+    return f"{where[:100]}: {first['msg'].removeprefix('Value error, ')[:200]}"
 
 
 # -- elements: closures, forces, drives, laws and anchors ------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import time
 import zipfile
 from typing import Any
 
@@ -141,3 +142,15 @@ def test_json_of_great_depth_is_refused_and_brackets_in_texts_are_not_counted() 
         json_object(deep, "meta")
     with pytest.raises(ValueError, match="is no object"):
         json_object("[1]", "meta")
+
+
+def test_json_of_many_values_or_a_text_that_does_not_end_is_refused_in_little_time() -> None:
+    begun = time.process_time()
+    for text in (
+        '{"a": [' + "[]," * 10**6 + "[]]}",
+        '{"a": [' + "0," * (archive.MOST_COMMAS + 1) + "0]}",
+        '{"a": "' + '\\"' * 10**6,
+    ):
+        with pytest.raises(ValueError, match=r"more values than a run has|Unterminated string"):
+            json_object(text, "meta")
+    assert time.process_time() - begun < 5.0

@@ -78,7 +78,7 @@ class Source:
             )
 
     def entries(self) -> dict[str, Any]:
-        """What is saved of it: everything but the reach."""
+        """Its fields for a saved run: all but the reach."""
         return {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 
 import numpy as np
 from defusedxml import DefusedXmlException
@@ -338,7 +338,7 @@ def parse_xml(text: str, file: str) -> Element:
 def _parsed(text: str) -> Element:
     """Root element of ``text``, which is handed over in pieces: the time of the parser would grow
     without bound with the length of an attribute or a comment."""
-    parser = SafeTree.DefusedXMLParser()
+    parser = SafeTree.DefusedXMLParser(target=TreeBuilder())
     size = 0
     for start in range(0, len(text), PIECE):
         piece = text[start : start + PIECE].encode()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from srm_mbs.dynamics.controllers import Controller
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.formats.files import checked_path
 from srm_mbs.integration.driver import Tick
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -56,7 +57,7 @@ class Solution(AnimationMixin, SimulationResult):
         """
         from srm_mbs.simulation.csv_export import write_csv
 
-        write_csv(self if t is None else self.at(t), Path(path))
+        write_csv(self if t is None else self.at(t), checked_path(path))
 
     def save(self, path: str | Path, full_paths: bool = False) -> None:
         """Write everything needed to replay and interpolate the run, description included.
@@ -78,7 +79,7 @@ class Solution(AnimationMixin, SimulationResult):
         """
         from srm_mbs.simulation.storage import save_solution
 
-        save_solution(self, Path(path), full_paths)
+        save_solution(self, checked_path(path), full_paths)
 
     def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
         """A picture of the run; docs/plots.md shows each kind.
@@ -122,7 +123,7 @@ class Solution(AnimationMixin, SimulationResult):
         """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`."""
         from srm_mbs.analysis.report.report import write_report
 
-        write_report(self, Path(path), **options)
+        write_report(self, path, **options)
 
 
 class SegmentedSolution(SegmentedResult, Solution):
@@ -137,7 +138,7 @@ class SegmentedSolution(SegmentedResult, Solution):
         """Write all segments into one file; see :meth:`Solution.save`."""
         from srm_mbs.simulation.storage import save_segments
 
-        save_segments(self, Path(path), full_paths)
+        save_segments(self, checked_path(path), full_paths)
 
 
 class DaeSolution(DaeResult):
@@ -392,4 +393,5 @@ def load_solution(
     """
     from srm_mbs.simulation.storage import load_result
 
-    return load_result(Path(path), SOLUTIONS, Reach.of(path, mesh_dirs, allow_outside))
+    checked = checked_path(path)
+    return load_result(checked, SOLUTIONS, Reach.of(checked, mesh_dirs, allow_outside))

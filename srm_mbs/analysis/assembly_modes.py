@@ -19,9 +19,10 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.errors import InputError, get_logger
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
+from srm_mbs.model.numbers import name_list, named_values
 
 log = get_logger(__name__)
 
@@ -140,6 +141,9 @@ def assembly_modes(
         raise InputError(
             f"seed = {seed!r} is not a natural number", element="seed", remedy="Give 0, 1, 2 ..."
         )
+    check_mechanism(mechanism)
+    positions = named_values(q, "q")
+    further = () if hold is None else name_list(hold, "hold")
     mechanism = mechanism.undriven  # modes are those of the loops alone
     if not mechanism.loops:
         raise InputError(
@@ -148,14 +152,13 @@ def assembly_modes(
             remedy="Give a mechanism with closures",
         )
     start = np.array(mechanism.q0)
-    for name, value in (q or {}).items():
+    for name, value in positions.items():
         set_position(mechanism, start, name, value)
-    further = (hold,) if isinstance(hold, str) else tuple(hold or ())
     problem = ClosureProblem(mechanism, start)
     if q is None and hold is None:
         held = tuple(_joints_to_hold(mechanism, problem, start))
     else:
-        held = tuple(dict.fromkeys([*(q or {}), *further]))
+        held = tuple(dict.fromkeys([*positions, *further]))
     free = free_coordinates(mechanism, held)
     modes: list[FloatArray] = []
     counts: list[int] = []

@@ -27,7 +27,7 @@ from srm_mbs.dynamics.constraints.local_coordinates import (
     tangent_basis,
 )
 from srm_mbs.dynamics.constraints.reactions import reactions_at
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import (
     SINGULAR,
@@ -37,6 +37,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
 )
 from srm_mbs.errors import AnalysisError, InputError, get_logger
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
+from srm_mbs.model.numbers import name_list
 
 log = get_logger(__name__)
 
@@ -327,14 +328,15 @@ def equilibrium(
     AnalysisError
         If there is no equilibrium, or none was found; its ``q`` is the last configuration.
     """
-    if search not in ("stable", "nearest"):
+    check_mechanism(mechanism)
+    if not isinstance(search, str) or search not in ("stable", "nearest"):
         raise InputError(
             f"search = {search!r} is not known",
             element="search",
             remedy='Give "stable" or "nearest"',
         )
     mechanism.refuse_drives("an equilibrium")
-    held = (hold,) if isinstance(hold, str) else tuple(hold)
+    held = name_list(hold, "hold")
     start = assemble(mechanism, q, hold=held)
     if start.singular:
         raise InputError(

@@ -23,11 +23,11 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.constraints.reactions import reactions_at
 from srm_mbs.dynamics.constraints.structure import structure_of
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
-from srm_mbs.simulation.options import numbers
+from srm_mbs.simulation.options import numbers, positive
 from srm_mbs.simulation.result import SimulationResult
 
 MOTION_TOLERANCE = 1e-6
@@ -160,6 +160,8 @@ def inverse_dynamics(
         If the motion violates the closures, includes a singular configuration, or needs forces that
         the actuated joints cannot exert.
     """
+    check_mechanism(mechanism)
+    tolerance = positive(tolerance, "tolerance")
     mechanism = mechanism.undriven  # the actuators replace the drives
     times, q, v, a = _motion(mechanism, motion, t)
     names = mechanism.joint_names if actuated is None else actuated

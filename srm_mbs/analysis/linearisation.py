@@ -24,7 +24,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import TangentChart, differences, tangent_basis
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.controllers import Controller
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
 from srm_mbs.errors import InputError, get_logger
@@ -152,10 +152,11 @@ class Linearisation:
                 remedy=f"Give a positive number, for example {FRAMES}",
             )
         count = len(self.eigenvalues)
-        if not -count <= mode < count:
+        if not isinstance(mode, Integral) or not -count <= mode < count:
             raise InputError(
-                f"there is no mode {mode}", element="mode", remedy=f"Give 0 to {count - 1}"
+                f"there is no mode {mode!r}", element="mode", remedy=f"Give 0 to {count - 1}"
             )
+        mode = int(mode)
         turning = abs(float(self.eigenvalues[mode].imag))
         period = 2.0 * np.pi / turning if turning > 0.0 else 1.0
         # Coordinates of the shape: z = L times the joint motion.
@@ -231,13 +232,14 @@ def linearise(
         If the state is not consistent, or singular (there the closures leave no tangent space of
         the right size), or names do not fit.
     """
+    check_mechanism(mechanism)
     mechanism.refuse_drives("a linearisation")
     step = positive(step, "step")
     if q is None:
         q, v = mechanism.q0, mechanism.v0 if v is None else v
-    q = np.array(q, dtype=float)
-    v = np.zeros(mechanism.model.nv) if v is None else np.array(v, dtype=float)
-    mechanism = mechanism.with_state(q, v)  # checks them
+    # The new mechanism checks them.
+    mechanism = mechanism.with_state(q, np.zeros(mechanism.model.nv) if v is None else v)
+    q, v = np.array(mechanism.q0), np.array(mechanism.v0)
     geometry = ClosureGeometry(mechanism, q)
     unit, nv = geometry.unit, mechanism.model.nv
     everything = np.arange(nv)

@@ -16,11 +16,11 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.continuation import drag
 from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError, get_logger
 from srm_mbs.model.coordinates import position_of
-from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.numbers import finite_array, named_values
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
@@ -81,20 +81,23 @@ class FollowedPath:
         InputError
             If the duration is not positive.
         """
-        if not duration > 0.0:
+        number = finite_array(duration, ())
+        if number is None or not number > 0.0:
             raise InputError(
                 f"duration = {duration!r} is not positive",
                 element="duration",
                 remedy="Give a positive number of seconds",
             )
-        times = np.linspace(0.0, duration, len(self.path)) if len(self.path) > 1 else np.zeros(1)
+        times = (
+            np.linspace(0.0, float(number), len(self.path)) if len(self.path) > 1 else np.zeros(1)
+        )
         return JointMotion(self.mechanism, times, self.path)
 
 
 def _dragged(mechanism: Mechanism, values: Mapping[str, Any]) -> FloatArray:
     """The values (n, joints) of the dragged joints."""
     columns = []
-    for name, given in values.items():
+    for name, given in named_values(values, "values").items():
         joint = mechanism.joint(name)
         array = finite_array(given)
         if joint.nv != 1 or array is None or array.ndim > 1 or not array.size:
@@ -132,6 +135,7 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     AssemblyError
         If the start cannot be closed.
     """
+    check_mechanism(mechanism)
     mechanism = mechanism.undriven  # dragged joints replace the drives
     wanted = _dragged(mechanism, values)
     if not mechanism.loops:

@@ -25,11 +25,11 @@ from srm_mbs.assembly.position import (
 from srm_mbs.assembly.velocity import assemble_velocity
 from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError, get_logger, naming
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
-from srm_mbs.model.numbers import finite_numbers
+from srm_mbs.model.numbers import finite_numbers, flag, name_list, named_values
 
 log = get_logger(__name__)
 
@@ -186,9 +186,11 @@ def assemble(
         For unknown joints or malformed values, or a guess in which the points of a ``distance``
         coincide.
     """
+    check_mechanism(mechanism)
+    flag(limits, "limits")
     model = mechanism.model
     start = np.array(mechanism.q0)
-    for name, value in (guess or {}).items():
+    for name, value in named_values(guess, "guess").items():
         if isinstance(q, Mapping) and name in q:
             raise InputError(
                 f"joint {name!r} is held in q and guessed in guess",
@@ -212,7 +214,7 @@ def assemble(
                 remedy="Use pinocchio.normalize(model, q)",
             )
     if hold is not None:
-        held = (hold,) if isinstance(hold, str) else tuple(hold)
+        held = name_list(hold, "hold")
         for name in held:
             with naming(element="hold"):
                 mechanism.joint(name)

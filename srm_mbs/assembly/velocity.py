@@ -215,9 +215,10 @@ def _onto_tangent(
     from scipy.optimize import least_squares
 
     size = float(np.abs(u).max())
-    if size == 0.0 or np.abs(curvature(u)).max(initial=0.0) <= CURVATURE * size**2:
+    largest = float(np.abs(curvature(u)).max(initial=0.0))
+    if size == 0.0 or largest <= CURVATURE * size * size < np.inf:
         return u
-    if not null.shape[1]:
+    if not null.shape[1] or not np.isfinite(largest):  # squares of the rates overflow
         return None
 
     def bent(w: FloatArray) -> FloatArray:
@@ -229,7 +230,7 @@ def _onto_tangent(
     zeros = []
     for start in (np.zeros(null.shape[1]), *rng.uniform(-2.0, 2.0, (8, null.shape[1]))):
         found = least_squares(
-            lambda w: curvature(bent(w)) / size**2, start, xtol=1e-15, ftol=1e-15, gtol=1e-15
+            lambda w: curvature(bent(w)) / (size * size), start, xtol=1e-15, ftol=1e-15, gtol=1e-15
         )
         if np.abs(found.fun).max() <= CURVATURE:
             zeros.append(found.x)

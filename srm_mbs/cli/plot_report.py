@@ -103,6 +103,10 @@ def report(
         typer.Option("--no-second-run", help="Leave out the second run and the error estimate."),
     ] = False,
     allow_outside: AllowOutside = False,
+    full_paths: Annotated[
+        bool,
+        typer.Option("--full-paths", help="Name the folders of the mechanism's files in the page."),
+    ] = False,
 ) -> None:
     """Write one page about a saved run.
 
@@ -123,6 +127,12 @@ def report(
     if not no_second_run:
         echo("repeating the run, to estimate its error", err=True)
     certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)
-    write_report(solution, path, animation=not no_animation, certificate=certificate)
+    write_report(
+        solution,
+        path,
+        animation=not no_animation,
+        certificate=certificate,
+        full_paths=full_paths,
+    )
     table((found.topic, found.grade, found.text) for found in certificate.findings)
     say_written(path)

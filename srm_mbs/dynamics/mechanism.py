@@ -12,6 +12,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.mobility import Mobility, mobility
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.constraints.structure import Structure, structure_of
+from srm_mbs.errors import InputError
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.mechanism import MechanismData, per_start
 
@@ -116,3 +117,19 @@ class Mechanism(MechanismData):
 def _initial_errors(mechanism: Mechanism) -> tuple[FloatArray, FloatArray]:
     g, c = constraint_errors(mechanism, np.zeros(1), mechanism.q0[None], mechanism.v0[None])
     return g[0], c[0]
+
+
+def check_mechanism(mechanism: Any) -> None:
+    """Refuse what is not a mechanism.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if not isinstance(mechanism, Mechanism):
+        raise InputError(
+            f"{mechanism!r} is not a mechanism",
+            element="mechanism",
+            remedy="Give srm.load(...) or srm.Mechanism(...)",
+        )

@@ -17,6 +17,7 @@ from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
 from srm_mbs.formats.build import unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
+from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.model.reach import Reach
 
 log = get_logger(__name__)
@@ -55,12 +56,15 @@ def convert(
         For input that cannot be read, or output that exists or cannot be written.
     """
     description = checked_path(out, "out")
+    flag(force, "force")
     if description.suffix.lower() != ".toml":
         raise InputError(
             f"the suffix {description.suffix!r} is not .toml", file=str(out), remedy="Use .toml"
         )
     urdf = description.with_suffix(".urdf")
-    overrides = Overrides(cut=tuple(cut), mesh_dirs=tuple(mesh_dirs), allow_outside=allow_outside)
+    overrides = Overrides(
+        cut=name_list(cut, "cut"), mesh_dirs=tuple(mesh_dirs), allow_outside=allow_outside
+    )
     reading = read(path, overrides)
     source = reading.source
     written = _with_meshes_from(reading.tree, source.urdf, Path(source.urdf_path), urdf)

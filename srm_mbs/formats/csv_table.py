@@ -28,6 +28,19 @@ QUOTED_CHUNK = 10_000
 """Rows with quotes that are converted at once."""
 GIVE_NUMBERS = "Give one finite number in every column"
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+"""Beginnings of cells that a spreadsheet computes or takes apart, full-width signs included."""
+
+
+def text_cell(text: str) -> str:
+    """``text`` as a cell that spreadsheets take as text: a formula begins with an apostrophe."""
+    return f"'{text}" if text.startswith(FORMULA) else text
+
+
+def cell_text(cell: str) -> str:
+    """The text that :func:`text_cell` wrote as ``cell``."""
+    return cell[1:] if cell.startswith("'") and cell[1:].startswith(FORMULA) else cell
+
 
 @dataclass(frozen=True)
 class CsvTable:
@@ -130,7 +143,7 @@ class _Reader:
         return CsvTable(self.file, self.names, values, self.faults)
 
     def header(self, cells: Iterable[str]) -> None:
-        self.names = tuple(cell.strip() for cell in cells)
+        self.names = tuple(cell_text(cell.strip()) for cell in cells)
         if len(self.names) > MOST_COLUMNS:
             raise self.fault(f"it has more than {MOST_COLUMNS} columns", "Give fewer columns")
         for name in self.names:

@@ -244,6 +244,11 @@ def checked_path(path: object, element: str = "path") -> Path:
     """
     try:
         name = os.fspath(path)  # type: ignore[call-overload]
+        os.fsencode(name)  # lone surrogates have no bytes
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{name!r} is not a file name", element=element, remedy="Give the path of a file"
+        ) from error
     except Exception as error:  # objects may raise anything
         raise InputError(
             f"{type(path).__name__} is not a type of paths",

@@ -22,7 +22,7 @@ from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.model.mechanism import Source
-from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
 
 log = get_logger(__name__)
@@ -159,7 +159,14 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
     InputError
         For anything that cannot be read, naming file, element and remedy.
     """
-    name = str(name)
+    try:
+        name = str(name)
+    except Exception as error:  # objects may raise anything
+        raise InputError(
+            f"a {type(name).__name__} is not a name or a path",
+            element="path",
+            remedy="Give a bundled mechanism or the path of a file",
+        ) from error
     is_name = not Path(name).suffix and "/" not in name and "\\" not in name
     if is_name and name in bundled_models():
         name = str(models_folder() / f"{name}.toml")
@@ -213,7 +220,7 @@ def load(
     AssemblyError
         If the loops cannot close or held values contradict each other.
     """
-    overrides = Overrides(gravity, base, tuple(cut), tuple(mesh_dirs), allow_outside)
+    overrides = Overrides(gravity, base, name_list(cut, "cut"), tuple(mesh_dirs), allow_outside)
     reading = read(path, overrides)
     with naming(file=reading.source.path):
         return assembled(reading)

@@ -59,7 +59,7 @@ def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
     """
     try:
         times = np.array(t, dtype=float)
-    except (TypeError, ValueError):
+    except Exception:  # objects may raise anything
         raise InputError(
             f"t = {t!r} does not consist of numbers", element="t", remedy="Give times (s)"
         ) from None

@@ -35,7 +35,7 @@ signature already, it is ``lambda event: event``.  ``record.stop`` belongs into
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -157,7 +157,7 @@ def prepare_events(
     """
     given: Sequence[Any] = [events]
     if not callable(events):
-        given = list(events) if isinstance(events, Iterable) else given
+        given = listed_events(events)
     prepared = [
         event if isinstance(event, EventFunction) else _event_function(event, i)
         for i, event in enumerate(given)
@@ -198,10 +198,17 @@ def _event_function(event: Any, i: int) -> EventFunction:
 
 def acting(events: Any) -> bool:
     """Whether any of the user's events has an action."""
-    given = [events] if callable(events) else events
-    return isinstance(given, Iterable) and any(
-        getattr(event, "action", None) is not None for event in given
-    )
+    return any(getattr(event, "action", None) is not None for event in listed_events(events))
+
+
+def listed_events(events: Any) -> list[Any]:
+    """The user's events as a list; what cannot be iterated is one of them."""
+    if callable(events):
+        return [events]
+    try:
+        return list(events)
+    except Exception:  # objects may raise anything
+        return [events]
 
 
 def _number(value: Any) -> float:

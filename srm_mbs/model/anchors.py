@@ -141,8 +141,12 @@ def resolve_moving(
     """
     if isinstance(anchors, Anchor):
         raise InputError(f"{element} is one anchor", element=element, remedy="Give a list of them")
+    try:
+        given: list[Any] = list(anchors)
+    except Exception:  # objects may raise anything
+        given = [anchors]
     found = []
-    for anchor in anchors:
+    for anchor in given:
         if not isinstance(anchor, Anchor):
             raise InputError(
                 f"{anchor!r} is not a point of a link", element=element, remedy=_GIVE_ANCHOR

@@ -33,7 +33,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
-from srm_mbs.model.numbers import finite_number, finite_numbers, unit_vector
+from srm_mbs.model.numbers import check_name, finite_number, finite_numbers, unit_vector
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -309,9 +309,11 @@ class LoopClosure:
 
     def __post_init__(self) -> None:
         places = name_places(self._element, self.a, self.b) or self.joints or ()
+        check_name(self.name, "loop")
         if not self.name:
-            object.__setattr__(self, "name", "_".join((self.type_name, *places)))
-        if not isinstance(self.type, ClosureType) and self.type not in CLOSURE_TYPES:
+            object.__setattr__(self, "name", "_".join((self.type_name, *map(str, places))))
+        known = isinstance(self.type, str) and self.type in CLOSURE_TYPES
+        if not (known or isinstance(self.type, ClosureType)):
             raise self._fault(
                 f"there is no closure type {self.type!r}",
                 f"Known: {', '.join(CLOSURE_TYPES)}",

@@ -16,7 +16,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError
 from srm_mbs.model.mechanism import MechanismData
-from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.numbers import finite_array, name_list
 
 UNIT_LENGTH_TOLERANCE = 1e-3
 """Largest deviation from 1 of the length of a quaternion, or (cos, sin) pair, that users give."""
@@ -104,7 +104,7 @@ def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexAr
         For an unknown joint, or one that is named twice.
     """
     indices: list[int] = []
-    for name in names:
+    for name in name_list(names, "joints"):
         joint = mechanism.joint(name)
         if joint.idx_v in indices:
             raise InputError(f"joint {name!r} is named twice", remedy="Name it once")

@@ -20,7 +20,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
-from srm_mbs.model.numbers import unit_vector
+from srm_mbs.model.numbers import check_name, unit_vector
 
 LAWS_WITH_VALUES = (Table, Polynomial, Sine)
 """Laws with a value s(0) of their own, which can prescribe positions."""
@@ -71,6 +71,7 @@ class Drive:
 
     def __post_init__(self) -> None:
         places = name_places(self._element, self.a, self.b)
+        check_name(self.name, "drive")
         if not self.name:
             object.__setattr__(self, "name", self.joint or "_".join(["drive", *places]))
         if not isinstance(self.law, Law):

@@ -10,6 +10,7 @@ read them, with the units, lengths and bounds that :func:`quantity` gives them.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -30,7 +31,7 @@ from srm_mbs.model.anchors import (
     resolve_moving,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.numbers import check_name, finite_array
 
 
 def quantity(
@@ -85,7 +86,8 @@ class ForceElement(ABC):
     @property
     def _element(self) -> str:
         """Its name in messages."""
-        return f"force {self.name or self.type!r}"
+        named = isinstance(self.name, str) and self.name
+        return f"force {named or self.type!r}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
@@ -95,6 +97,8 @@ class ForceElement(ABC):
 
     def _take_name(self, *places: str) -> None:
         """The default name, if none is given."""
+        for name in (self.name, *places):
+            check_name(name, self._element)
         self._set("name", self.name or "_".join((self.type, *places)))
 
     def _take_number(self, key: str, count: int, nonnegative: bool = False) -> None:
@@ -116,7 +120,7 @@ class ForceElement(ABC):
 
     def _refuse_zeros(self, *keys: str) -> None:
         """Refuse an element without effect: all its quantities ``keys`` are zero."""
-        if not np.any([getattr(self, key) for key in keys]):
+        if not any(np.any(getattr(self, key)) for key in keys if getattr(self, key) is not None):
             raise self._fault(
                 f"{' and '.join(keys)} are zero", "Give one of them, or remove the element"
             )
@@ -270,10 +274,14 @@ class JointTorque(ForceElement):
     def __post_init__(self) -> None:
         self._take_name(self.joint)
         given: Any = self.torque
-        laws = self._take_law(max(1, np.size(given)))
+        try:
+            shape = np.shape(given)
+        except Exception:  # objects may raise anything
+            shape = ()
+        laws = self._take_law(max(1, math.prod(shape)))
         if given is None:
             self._set("torque", 1.0 if laws else 0.0)
-        self._take_number("torque", np.size(given) if np.ndim(given) else 0)
+        self._take_number("torque", math.prod(shape) if shape else 0)
 
     def check(self, model: pin.Model) -> None:
         count = moving_joint(model, self.joint, self._element).nv
@@ -370,7 +378,7 @@ class Wrench(ForceElement):
             self._set("moment", (1.0, 1.0, 1.0))
         self._take_quantities()
         self._refuse_zeros("force", "moment")
-        if self.frame not in ("world", "link"):
+        if not isinstance(self.frame, str) or self.frame not in ("world", "link"):
             raise self._fault(f"there is no frame {self.frame!r}", 'Give "world" or "link"')
 
     def check(self, model: pin.Model) -> None:
@@ -449,7 +457,7 @@ class LimitSpring(ForceElement):
     def __post_init__(self) -> None:
         self._take_name(self.joint)
         self._take_quantities()
-        if not self.stiffness > 0.0:
+        if self.stiffness is None or not self.stiffness > 0.0:
             raise self._fault("a limit needs a stiffness", "Give a positive stiffness")
         if self.depth is not None and not self.depth > 0.0:
             raise self._fault(f"depth = {self.depth:g} is not positive", "Give a positive depth")

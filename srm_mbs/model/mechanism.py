@@ -23,6 +23,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
+from srm_mbs.model.numbers import check_name
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,
     closures_from_pinocchio,
@@ -172,7 +173,14 @@ class MechanismData(ResultOwner):
         self._forget()
         model = self.model
         set_ = object.__setattr__
+        if not isinstance(model, pin.Model):
+            raise InputError(
+                f"a {type(model).__name__} is not a model",
+                element="model",
+                remedy="Give a pinocchio.Model",
+            )
         check_tree(model)
+        check_name(self.name, "name")
         set_(self, "name", self.name or model.name)
         self._take_start(
             pin.neutral(model) if self.q0 is None else self.q0,
@@ -359,7 +367,7 @@ class MechanismData(ResultOwner):
         InputError
             If there is no such joint; the message lists those there are.
         """
-        if name not in self.joint_names:
+        if not isinstance(name, str) or name not in self.joint_names:
             raise InputError(
                 f"there is no joint {name!r}", remedy=f"Known: {', '.join(self.joint_names)}"
             )

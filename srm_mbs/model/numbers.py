@@ -1,7 +1,8 @@
-"""Finite numbers of a given shape: the one check of numbers that users hand over."""
+"""Numbers of a given shape, truth values, words and names: the one check of what users give."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,13 +29,104 @@ def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> Fl
         if given.dtype.kind == "c":  # NumPy drops imaginary parts with no more than a warning
             return None
         array: FloatArray = given.astype(float)
-    except (TypeError, ValueError, OverflowError):
+    except Exception:  # objects may raise anything
         return None
     fits = shape is None or (
         len(shape) == array.ndim
         and all(length in (None, actual) for length, actual in zip(shape, array.shape))
     )
     return array if fits and np.isfinite(array).all() else None
+
+
+def flag(value: Any, name: str) -> bool:
+    """``value``, the argument ``name``, as a truth value.
+
+    Raises
+    ------
+    InputError
+        If it is neither True nor False, 1 and 0 included.
+    """
+    if isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1)):
+        return bool(value)
+    raise InputError(
+        f"{name} = {value!r} is neither True nor False",
+        element=name,
+        remedy="Give True or False",
+    )
+
+
+def choice(value: Any, known: Iterable[str], name: str) -> str:
+    """``value``, the argument ``name``, as one of the ``known`` words.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    words = tuple(known)
+    if isinstance(value, str) and value in words:
+        return value
+    raise InputError(
+        f"there is no {name} {value!r}",
+        element=name,
+        remedy=f"Known: {', '.join(map(repr, words))}",
+    )
+
+
+def name_list(given: Any, element: str) -> tuple[str, ...]:
+    """``given``, one name or several, as a tuple; messages name ``element``.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if isinstance(given, str):
+        return (given,)
+    try:
+        names = tuple(given)
+    except Exception:  # objects may raise anything
+        names = (None,)
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f"{element} = {given!r} is not a list of names",
+            element=element,
+            remedy="Give a list of names",
+        )
+    return names
+
+
+def named_values(given: Any, element: str) -> Mapping[str, Any]:
+    """``given``, name -> value; empty for None; messages name ``element``.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(
+            f"{element} = {given!r} does not have a value for each name",
+            element=element,
+            remedy="Give a dictionary: name -> value",
+        )
+    return given
+
+
+def check_name(name: Any, what: str) -> None:
+    """Refuse a name of ``what``, such as a force, that is not a text.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if not isinstance(name, str):
+        raise InputError(
+            f"the name {name!r} is not a text", element=what, remedy="Give a text, or none"
+        )
 
 
 def finite_number(value: Any, name: str, element: str) -> float:

@@ -87,7 +87,10 @@ def closures_from_pinocchio(model: pin.Model, constraint_models: Any) -> tuple[L
         For a model of another kind, one with a desired offset or motion, or a joint without frame.
     """
     given = constraint_models
-    models: Sequence[Any] = list(given) if isinstance(given, Iterable) else [given]
+    try:
+        models: Sequence[Any] = list(given) if isinstance(given, Iterable) else [given]
+    except Exception:  # objects may raise anything
+        models = [given]
     closures: list[LoopClosure] = []
     for k, constraint in enumerate(models):
         closure = _closure(model, constraint, f"constraint_models[{k}]")

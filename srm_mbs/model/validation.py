@@ -173,7 +173,10 @@ def checked_elements(
         not fit ``model``.
     """
     several = isinstance(given, Iterable) and not isinstance(given, str)
-    parts: tuple[Any, ...] = tuple(given) if several else (given,)
+    try:
+        parts: tuple[Any, ...] = tuple(given) if several else (given,)
+    except Exception:  # objects may raise anything
+        several, parts = False, (given,)
     if not several or not all(hasattr(part, "name") and hasattr(part, "check") for part in parts):
         raise InputError(
             f"{what}s = {given!r} is not a list of {what}s",

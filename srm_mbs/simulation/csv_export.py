@@ -12,6 +12,8 @@ One row per time, with a header that names each column and its unit:
 
 Reactions are left out: there are six per loop, and they are better taken from
 ``solution.reactions``.  Every number is written with as many digits as give the same float back.
+Names and texts that a spreadsheet would take as a formula (they begin with = + - @, a tab or an
+end of line) get an apostrophe in front, which tables of laws are read without.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
 from srm_mbs.errors import get_logger
+from srm_mbs.formats.csv_table import text_cell
 from srm_mbs.formats.files import writing
 from srm_mbs.simulation.result import SimulationResult
 
@@ -73,12 +76,18 @@ def write_table(columns: Mapping[str, NDArray[Any]], path: str | Path) -> None:
     with writing(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", errors="backslashreplace", newline="")
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(columns)
+        writer.writerow(map(text_cell, columns))
         # Python's own floats: the csv module writes them with repr.
-        writer.writerows(zip(*(column.tolist() for column in columns.values())))
+        writer.writerows(zip(*(_cells(column) for column in columns.values())))
         text.flush()
         text.detach()  # the file is closed by its owner
     log.info("written: %s", path)
+
+
+def _cells(column: NDArray[Any]) -> list[Any]:
+    """The values of a column as the csv module writes them; numbers stay as they are."""
+    values: list[Any] = column.tolist()
+    return list(map(text_cell, values)) if column.dtype.kind == "U" else values
 
 
 def _columns(solution: SimulationResult) -> dict[str, FloatArray]:

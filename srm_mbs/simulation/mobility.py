@@ -18,7 +18,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names
-from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.result import SimulationResult, check_run
 from srm_mbs.simulation.segmented_result import SegmentedResult
 
 
@@ -105,6 +105,7 @@ def mobility_map(solution: SimulationResult) -> MobilityMap:
     InputError
         For a run of several segments, which may have different mechanisms.
     """
+    check_run(solution)
     if isinstance(solution, SegmentedResult):
         raise InputError(
             "a run with event actions has no single map: its mechanism may change",

@@ -19,8 +19,9 @@ from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
-from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.numbers import choice, finite_array, flag
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""
@@ -111,6 +112,7 @@ class RunOptions(NamedTuple):
         InputError
             For the first invalid option.
         """
+        flag(self.raise_on_failure, "raise_on_failure")
         tightest, loosest = rtol_range
         t0, t_end = span
         for name in ("step", "first_step", "max_step"):
@@ -162,7 +164,7 @@ def positive(value: Any, what: str, unit: str = "") -> float:
     """``value`` as a positive finite float."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except Exception:  # objects may raise anything
         number = math.nan
     if not (math.isfinite(number) and number > 0.0):
         raise InputError(
@@ -264,6 +266,8 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
                 element="method",
                 remedy=f"Known: {', '.join(repr(name) for name in METHODS)}",
             )
+        if tableau is not None:
+            get_tableau(tableau)  # refuses what cannot be looked up
         return _named(method.lower(), tableau)
     if tableau is not None:
         raise InputError(
@@ -304,13 +308,7 @@ def checked_times(t_eval: Any, t0: float, t_end: float) -> FloatArray | None:
 
 def checked_placement(placement: Any) -> str:
     """One of the known placements around singular configurations."""
-    if placement not in PLACEMENTS:
-        raise InputError(
-            f"there is no placement {placement!r}",
-            element="placement",
-            remedy=f"Known: {', '.join(repr(name) for name in PLACEMENTS)}",
-        )
-    return str(placement)
+    return choice(placement, PLACEMENTS, "placement")
 
 
 def _given_times(values: Any, what: str, remedy: str) -> FloatArray:

@@ -420,3 +420,19 @@ class SimulationResult(RunOutcome):
             f"{len(self.t)} points, {self.stats.steps} steps, {self.status}, "
             f"{self.settings.backend})"
         )
+
+
+def check_run(solution: Any) -> None:
+    """Refuse what is not the run of a mechanism.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if not isinstance(solution, SimulationResult):
+        raise InputError(
+            f"a {type(solution).__name__} is not a run",
+            element="solution",
+            remedy="Give what srm.simulate or srm.load_solution returned",
+        )

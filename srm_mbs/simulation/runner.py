@@ -18,7 +18,7 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.dynamics.system import System
@@ -190,16 +190,6 @@ def checked_accuracy(
         unit=" of seconds",
         arguments="(t, h, state)",
     )
-
-
-def check_mechanism(mechanism: Any) -> None:
-    """Refuse what is no mechanism."""
-    if not isinstance(mechanism, Mechanism):
-        raise InputError(
-            f"{mechanism!r} is not a mechanism",
-            element="mechanism",
-            remedy="Give srm.load(...) or srm.Mechanism(...)",
-        )
 
 
 def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:

@@ -14,7 +14,7 @@ import numpy as np
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger
@@ -22,6 +22,7 @@ from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import EventFunction, acting, prepare_events, same_time
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
+from srm_mbs.model.numbers import finite_array
 from srm_mbs.simulation.options import RunOptions, numbers, positive
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import check_consistent, checked_options, finished, run_segment
@@ -129,7 +130,9 @@ def impact(
     """
     import pinocchio as pin
 
-    if not 0.0 <= restitution <= 1.0:
+    check_mechanism(mechanism)
+    share = finite_array(restitution, ())
+    if share is None or not 0.0 <= share <= 1.0:
         raise InputError(
             f"restitution = {restitution!r} is not between 0 and 1",
             element="restitution",

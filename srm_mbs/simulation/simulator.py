@@ -10,7 +10,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError
@@ -23,7 +23,6 @@ from srm_mbs.simulation.options import RunOptions, check_embedded, finite, posit
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
     check_consistent,
-    check_mechanism,
     checked_accuracy,
     error_norm,
 )

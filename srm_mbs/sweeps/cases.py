@@ -57,7 +57,10 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
     if isinstance(cases, Mapping):
         found = _from_mapping(cases)
     elif isinstance(cases, Iterable) and not isinstance(cases, str | bytes):
-        found = list(enumerate(cases))
+        try:
+            found = list(enumerate(cases))
+        except Exception:  # objects may raise anything
+            found = []
     else:
         found = []
     out = []

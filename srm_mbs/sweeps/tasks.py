@@ -15,6 +15,7 @@ from srm_mbs.api import Solution, simulate
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
+from srm_mbs.simulation.result import check_run
 from srm_mbs.sweeps.cases import RESERVED, STARTS
 
 Value = bool | int | float | str | None
@@ -31,6 +32,7 @@ def standard_measures(solution: Solution) -> dict[str, Value]:
     there, ``energy_change`` (J) the change of kinetic plus potential energy since the start,
     ``steps`` the number of accepted steps, ``wall_time`` in seconds.
     """
+    check_run(solution)
     ends = solution.at(solution.span)
     # The energy of a divergent state overflows.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.formats.csv_table import cell_text, read_csv
 from tests.support.mechanisms import along_x, floating_ring, rod
 
 
@@ -139,3 +140,41 @@ def test_a_table_ends_at_a_terminal_event(tmp_path: Path) -> None:
     solution.to_csv(tmp_path / "run.csv")
     _, table = read(tmp_path / "run.csv")
     assert table[-1, 0] == solution.t[-1] == pytest.approx(0.5)
+
+
+def formula_named() -> srm.Mechanism:
+    """A pendulum whose joint has the name of a formula."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "=1+cmd|' /C calc'!A0")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    return srm.Mechanism(model, v0=np.array([-1.0]))
+
+
+def test_a_spreadsheet_takes_a_name_that_begins_like_a_formula_as_text(tmp_path: Path) -> None:
+    solution = srm.simulate(formula_named(), 0.1)
+    solution.to_csv(tmp_path / "run.csv")
+    header, table = read(tmp_path / "run.csv")
+
+    assert header[1] == "'=1+cmd|' /C calc'!A0 (rad)"
+    assert table[0, 2] == -1.0  # numbers are as they are
+    names = ["=1+cmd|' /C calc'!A0 (rad)", "t (s)"]
+    assert np.array_equal(
+        read_csv(tmp_path / "run.csv").columns(names), table[:, [1, 0]]
+    )  # and its columns are found by their names
+
+
+@pytest.mark.parametrize("text", ["=1", "+1", "-1", "@A1", "\tx", "\rx", "\n=1", "\uff1d1"])
+def test_texts_of_a_sweep_are_no_formulas_and_numbers_stay(text: str, tmp_path: Path) -> None:
+    cases = {text: {}, "plain": {}}
+    swept = srm.sweep(
+        formula_named(), cases, 0.01, measure=lambda solution: {text: text, "number": -2.5}
+    )
+    swept.to_csv(tmp_path / "sweep.csv")
+
+    with (tmp_path / "sweep.csv").open(newline="", encoding="utf-8") as file:
+        header, first, second = csv.reader(file)
+    assert header[0] == "case"
+    assert header[-2:] == [f"'{text}", "number"]
+    assert (first[0], second[0]) == (f"'{text}", "plain")
+    assert first[-2:] == [f"'{text}", "-2.5"]
+    assert cell_text(first[0]) == text

@@ -16,9 +16,9 @@ from srm_mbs.analysis.accuracy.assessment import (
 )
 from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of, energy_error
 from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
-from srm_mbs.errors import InputError
+from srm_mbs.model.numbers import flag
 from srm_mbs.simulation.rerun import unsupported_reason
-from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.result import SimulationResult, check_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +112,10 @@ def certify(
     InputError
         If ``solution`` is no run, or ``rtol`` is not valid for it.
     """
-    if not isinstance(solution, SimulationResult):
-        raise InputError(
-            f"a {type(solution).__name__} is not a run",
-            element="solution",
-            remedy="Give what srm.simulate or srm.load_solution returned",
-        )
+    check_run(solution)
     settings = checked_settings(solution, rtol)
     drift, energy = drift_of(solution), energy_error(solution)
-    reason = unsupported_reason(solution) if again else "it was not asked for"
+    reason = unsupported_reason(solution) if flag(again, "again") else "it was not asked for"
     if not reason and not solution.steps.count:
         reason = "the run took no step"
     estimate = reason or estimate_error(solution, settings, progress)

@@ -22,6 +22,8 @@ from srm_mbs.analysis.report.sections import (
     run_data,
 )
 from srm_mbs.errors import InputError, __version__
+from srm_mbs.formats.files import checked_path, utf8
+from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import render, write_file
@@ -51,6 +53,7 @@ def write_report(
     rtol: float | None = None,
     again: bool = True,
     progress: Any = False,
+    full_paths: bool = False,
 ) -> None:
     """Write one page about a run: :meth:`srm_mbs.Solution.report`, ``srm-mbs report``.
 
@@ -70,13 +73,19 @@ def write_report(
         and ``progress``.
     rtol, again, progress
         As for :func:`srm_mbs.certify`.
+    full_paths
+        Whether the page names the folders of the mechanism's files; by default it has the names of
+        the files only.
 
     Raises
     ------
     InputError
         If ``rtol`` or a kind of plot is not valid, or the animation or the file cannot be written.
     """
-    for kind in pictures:
+    file = checked_path(path)
+    flag(animation, "animation")
+    flag(full_paths, "full_paths")
+    for kind in name_list(pictures, "pictures"):
         if kind not in PICTURES:
             raise InputError(
                 f"reports have no picture of the kind {kind!r}",
@@ -85,8 +94,10 @@ def write_report(
             )
     if certificate is None:
         certificate = certify(solution, rtol=rtol, again=again, progress=progress)
-    page = report_page(solution, certificate, animation=animation, pictures=pictures)
-    write_file(Path(path), page.encode())
+    page = report_page(
+        solution, certificate, animation=animation, pictures=pictures, full_paths=full_paths
+    )
+    write_file(file, utf8(page))
 
 
 def report_page(
@@ -95,6 +106,7 @@ def report_page(
     *,
     animation: bool = True,
     pictures: Sequence[str] = tuple(PICTURES),
+    full_paths: bool = False,
 ) -> str:
     """The page of :func:`write_report`."""
     player = None
@@ -111,12 +123,12 @@ def report_page(
         summary=_summary(solution, certificate),
         passages=bool(solution.crossings),
         grades=GRADE_LABELS,
-        mechanism=mechanism_data(solution),
+        mechanism=mechanism_data(solution, full_paths),
         animation=player,
         freedom=freedom_rows(solution.mechanism),
         run=run_data(solution),
         accuracy=accuracy_data(solution, certificate),
-        pictures=pictures_data(solution, pictures) if pictures else None,
+        pictures=pictures_data(solution, pictures, full_paths) if pictures else None,
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
+import os
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +117,26 @@ def _image(data: bytes, media_type: str, description: str, caption: str) -> dict
     return {"source": source, "description": description, "caption": caption}
 
 
-def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
+def _file_name(path: str) -> str:
+    """The last part of a path of any operating system."""
+    return re.split(r"[\\/]", path)[-1]
+
+
+def without_folders(text: object, mechanism: Mechanism, full_paths: bool) -> str:
+    """``text`` about ``mechanism``, without the folders of its files unless ``full_paths``."""
+    words = str(text)
+    source = mechanism.source
+    if full_paths or source is None:
+        return words
+    for path in (source.path, source.urdf_path):
+        folder = path.removesuffix(_file_name(path))
+        for name in {folder, os.path.abspath(folder) + os.sep} if folder else ():
+            if len(name) > 1:
+                words = words.replace(name, "")
+    return words
+
+
+def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict[str, Any]:
     """Snapshot, provenance, joints, bodies, loops, forces and drives."""
     mechanism = solution.mechanism
     model = mechanism.model
@@ -124,7 +145,8 @@ def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
     if source is None:
         rows.append(("read from", "built in Python"))
     else:
-        rows += [("read from", source.path), ("format", source.format), ("base", source.base)]
+        path = source.path if full_paths else _file_name(source.path)
+        rows += [("read from", path), ("format", source.format), ("base", source.base)]
     gravity = ", ".join(f"{g:.6g}" for g in model.gravity.linear)
     mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
     rows += [("gravity", f"[{gravity}] m/s²"), ("moving mass", f"{mass:.6g} kg")]
@@ -138,7 +160,7 @@ def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
             f"The mechanism at the start of the run, t = {start:.6g} s.",
         )
     except InputError as error:
-        problem = str(error)
+        problem = without_folders(error, mechanism, full_paths)
     return {
         "properties": rows,
         "snapshot": snapshot,
@@ -150,7 +172,10 @@ def mechanism_data(solution: SimulationResult) -> dict[str, Any]:
         ],
         "forces": list(force_rows(mechanism)),
         "drives": list(drive_rows(mechanism)),
-        "notes": (*mechanism.notes, *mechanism.structure.notes),
+        "notes": [
+            without_folders(note, mechanism, full_paths)
+            for note in (*mechanism.notes, *mechanism.structure.notes)
+        ],
     }
 
 
@@ -254,7 +279,9 @@ def _events(solution: SimulationResult) -> list[tuple[str, str, str]]:
     return rows
 
 
-def pictures_data(solution: SimulationResult, kinds: Sequence[str]) -> dict[str, Any]:
+def pictures_data(
+    solution: SimulationResult, kinds: Sequence[str], full_paths: bool = False
+) -> dict[str, Any]:
     """Plots of the run, and sentences about those that it does not have."""
     images, missing = [], []
     for kind in kinds:
@@ -265,7 +292,8 @@ def pictures_data(solution: SimulationResult, kinds: Sequence[str]) -> dict[str,
         try:
             figure = plot_solution(solution, kind=kind)
         except InputError as error:
-            missing.append(f"{PICTURES[kind]} Not drawn: {error}")
+            problem = without_folders(error, solution.mechanism, full_paths)
+            missing.append(f"{PICTURES[kind]} Not drawn: {problem}")
             continue
         images.append(_plot_image(figure, f"Plot: {PICTURES[kind]}", PICTURES[kind]))
     return {"images": images, "missing": missing}

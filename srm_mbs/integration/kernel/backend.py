@@ -75,7 +75,7 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
     InputError
         If there is no such backend, or ``asked`` is the kernel and it cannot make the run.
     """
-    if asked not in BACKENDS:
+    if not isinstance(asked, str) or asked not in BACKENDS:
         raise InputError(
             f"there is no backend {asked!r}",
             element="backend",

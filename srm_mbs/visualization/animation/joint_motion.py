@@ -13,8 +13,10 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import checked_path
+from srm_mbs.model.numbers import finite_array
 
 if TYPE_CHECKING:
     from srm_mbs.visualization.animation.playback import Embedded
@@ -45,7 +47,7 @@ class AnimationMixin:
         :func:`srm_mbs.visualization.animation.playback.export_html`."""
         from srm_mbs.visualization.animation.playback import export_html
 
-        export_html(self, Path(path), **options)  # type: ignore[arg-type]
+        export_html(self, checked_path(path), **options)  # type: ignore[arg-type]
 
     def export_image(self, path: str | Path, **options: Any) -> None:
         """Write a picture at one time; see
@@ -78,7 +80,17 @@ class JointMotion(AnimationMixin):
     q: FloatArray
 
     def __post_init__(self) -> None:
+        check_mechanism(self.mechanism)
         nq = self.mechanism.model.nq
+        for name, wanted in (("t", "times (n,)"), ("q", f"configurations (n, {nq})")):
+            array = finite_array(getattr(self, name))
+            if array is None or array.ndim != (1 if name == "t" else 2):
+                raise InputError(
+                    f"{name} is not an array of finite {wanted}",
+                    element="motion",
+                    remedy=f"Give increasing times (n,) and configurations (n, {nq})",
+                )
+            object.__setattr__(self, name, array)
         if self.q.shape != (len(self.t), nq) or not len(self.t) or np.any(np.diff(self.t) <= 0.0):
             raise InputError(
                 f"times of shape {self.t.shape} and configurations of shape {self.q.shape} do not "

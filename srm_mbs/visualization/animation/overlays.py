@@ -19,6 +19,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, resolve_moving
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import SpringDamper
+from srm_mbs.model.numbers import flag
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.shapes import Colour, Cylinder, Mesh, Shape, Sphere
 from srm_mbs.visualization.animation.trajectory import (
@@ -89,7 +90,7 @@ class OverlayOptions:
         self.anchors(mechanisms[0])
         loops = [loop for mechanism in mechanisms for loop in mechanism.loops]
         for element, requested in (("gaps", self.gaps), ("reactions", self.reactions)):
-            if requested and not any(loop.anchors for loop in loops):
+            if flag(requested, element) and not any(loop.anchors for loop in loops):
                 raise InputError(
                     f"the mechanism has no closures with {element}",
                     element=element,

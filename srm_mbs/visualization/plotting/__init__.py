@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import checked_path
 from srm_mbs.visualization.plotting.dae import draw_dae_run, draw_dae_state
 from srm_mbs.visualization.plotting.energy import draw_balance
 from srm_mbs.visualization.plotting.figure import check_suffix, save
@@ -53,7 +54,7 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
     InputError
         With the known kinds or options.
     """
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise InputError(
             f"there is no kind of picture {kind!r}",
             element="kind",
@@ -85,9 +86,10 @@ def _plot(
     kinds: Kinds, solution: Any, path: str | Path | None, kind: str, **options: Any
 ) -> Figure:
     check_options(kind, options, kinds)
-    if path is not None:
-        check_suffix(Path(path))
+    file = None if path is None else checked_path(path)
+    if file is not None:
+        check_suffix(file)
     figure = kinds[kind](solution, **options)
-    if path is not None:
-        save(figure, Path(path))
+    if file is not None:
+        save(figure, file)
     return figure

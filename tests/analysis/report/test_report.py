@@ -432,3 +432,24 @@ def test_every_bundled_mechanism_has_a_page_below_five_megabytes(name: str, tmp_
     run.report(tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size < 5 * MEGABYTES
     Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+
+
+def test_a_report_names_files_and_folders_only_if_asked(tmp_path: Path) -> None:
+    folder = tmp_path / "home of the author"
+    folder.mkdir()
+    srm.convert("four_bar", folder / "mine.toml")
+    urdf = folder / "mine.urdf"
+    visual = '<visual><geometry><mesh filename="no.stl"/></geometry></visual>'
+    urdf.write_text(urdf.read_text().replace("</link>", f"{visual}</link>"))
+    solution = srm.simulate(srm.load(folder / "mine.toml"), 0.2)
+
+    solution.report(tmp_path / "a.html", again=False)
+    solution.report(tmp_path / "b.html", again=False, full_paths=True)
+    solution.save(tmp_path / "run.npz")
+    run_command("report", tmp_path / "run.npz", "--no-second-run", "--out", tmp_path / "c.html")
+
+    for name in ("a.html", "c.html"):
+        page = (tmp_path / name).read_text(encoding="utf-8")
+        assert "mine.toml" in page
+        assert folder.name not in page
+    assert str(folder / "mine.toml") in (tmp_path / "b.html").read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ import numpy as np
 
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.numbers import finite_array
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
@@ -56,7 +57,8 @@ def parse_eps(value: Any) -> Regularisation:
             elif match["top"]:
                 power = math.nan
     elif isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
-        factor = float(value)
+        number = finite_array(value, ())
+        factor = math.nan if number is None else float(number)
     if not (math.isfinite(factor) and factor > 0.0 and math.isfinite(power)):
         raise InputError(
             f"eps = {value!r} is neither a positive number nor a power of the step",

@@ -43,7 +43,7 @@ def checked_regulariser(T: str) -> None:
     InputError
         For an unknown name.
     """
-    if T not in REGULARISERS:
+    if not isinstance(T, str) or T not in REGULARISERS:
         raise InputError(
             f"there is no T = {T!r}",
             element="T",

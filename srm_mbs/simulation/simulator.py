@@ -214,9 +214,9 @@ class Simulator:
 
     def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> None:
         """Go on from ``t`` to ``end`` (s) across breakpoints."""
-        pieces = smooth_intervals(kinks, np.zeros(0), t, end)
-        for k, until in enumerate(pieces.ends.tolist()):
-            first, last = float(pieces.first[k]), float(pieces.last[k])
+        intervals = smooth_intervals(kinks, np.zeros(0), t, end)
+        for k, until in enumerate(intervals.ends.tolist()):
+            first, last = float(intervals.first[k]), float(intervals.last[k])
             forces_jumped = k > 0 or first > -math.inf
             grid = self._grid(until - self._run.t)
             self._run.go_on(until, first, last, force, forces_jumped, grid)

@@ -11,7 +11,7 @@ import pytest
 import srm_mbs as srm
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring, floating_slider_crank
-from tests.support.snapshots import check_messages, refused
+from tests.support.snapshots import check_refusals
 
 
 def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "certify: no run": lambda: srm.certify(four),
         "report: picture": lambda: run.report(tmp_path / "report.html", pictures=["phase"]),
     }
-    check_messages("analysis", {case: refused(call) for case, call in calls.items()})
+    check_refusals("analysis", calls)
 
 
 def test_an_unknown_joint_is_named_beside_the_known_ones() -> None:

@@ -32,6 +32,7 @@ from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.model.anchors import WORLD, Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure, perpendicular_basis
 from tests.support.backends import needs_kernel
+from tests.support.dynamics import evaluate_rows
 from tests.support.mechanisms import random_state
 from tests.support.snapshots import check_refusals
 
@@ -124,7 +125,7 @@ class Scene:
 
     def rows(self, q: FloatArray | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
         """g, G and Gdot v of the closures at (q, v)."""
-        return evaluate(self.model, self.kinematics, self.q if q is None else q, self.v)
+        return evaluate_rows(self.model, self.kinematics, self.q if q is None else q, self.v)
 
     def relative(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation R and position p of anchor a in anchor b."""
@@ -159,17 +160,6 @@ EVERYWHERE = tuple((kind, place) for kind in TYPES for place in PLACES)
 def anchor_at(link: str, placement: pin.SE3) -> Anchor:
     rpy = Rotation.from_matrix(placement.rotation).as_euler("xyz")
     return Anchor(link, xyz=tuple(placement.translation), rpy=tuple(rpy))
-
-
-def evaluate(
-    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """g, G and Gdot v at (q, v)."""
-    data = model.createData()
-    pin.crba(model, data, q, pin.Convention.WORLD)
-    pin.nonLinearEffects(model, data, q, v)
-    rows.update(data, q)
-    return rows.g.copy(), rows.G.copy(), rows.bias.copy()
 
 
 def anchor_placement(model: pin.Model, q: FloatArray, anchor: Anchor) -> tuple[FloatArray, ...]:
@@ -335,7 +325,7 @@ def test_scales_divide_the_rows_and_only_kept_rows_are_evaluated(seed: int) -> N
     for share in (1.0, 0.5, 0.5, 0.5, 0.2, 0.0):
         keep = here.rng.random(len(scale)) < share
         rows = LoopKinematics(here.model, here.loops, scale, keep)
-        for part, all_ in zip(evaluate(here.model, rows, here.q, here.v), whole):
+        for part, all_ in zip(evaluate_rows(here.model, rows, here.q, here.v), whole):
             by = scale if all_.ndim == 1 else scale[:, None]
             assert_close(part, (all_ / by)[keep], rtol=1e-13, atol=1e-14)
 

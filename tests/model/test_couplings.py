@@ -20,6 +20,7 @@ from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.support.backends import needs_kernel, on_both
+from tests.support.dynamics import evaluate_rows
 from tests.support.mechanisms import random_state
 from tests.support.snapshots import check_messages, refused
 
@@ -194,16 +195,8 @@ def test_rows_have_constant_entries_at_the_coordinates_of_their_joints(seed: int
     scale = np.array([0.3, 2.5])
     for keep in ([True, True], [False, True], [True, False], [False, False]):
         rows = LoopKinematics(model, loops, scale, np.array(keep))
-        data = model.createData()
         q, v = random_state(model, rng)
-
-        def at(q: Any, v: Any = v, rows: Any = rows, data: Any = data) -> Any:
-            pin.crba(model, data, q, pin.Convention.WORLD)
-            pin.nonLinearEffects(model, data, q, v)
-            rows.update(data, q)
-            return rows.g.copy(), rows.G.copy(), rows.bias.copy()
-
-        g, G, bias = at(q)
+        g, G, bias = evaluate_rows(model, rows, q, v)
         angle = {name: q[model.joints[model.getJointId(name)].idx_q] for name in names}
         expected = [
             c @ list(angle.values()) - 0.7,
@@ -213,7 +206,10 @@ def test_rows_have_constant_entries_at_the_coordinates_of_their_joints(seed: int
         assert not bias.any()
         step = 1e-3
         for column, e in enumerate(np.eye(model.nv)):
-            forward, back = (at(pin.integrate(model, q, s * step * e))[0] for s in (1.0, -1.0))
+            forward, back = (
+                evaluate_rows(model, rows, pin.integrate(model, q, h * e), v)[0]
+                for h in (step, -step)
+            )
             assert_close(G[:, column], (forward - back) / (2.0 * step), atol=1e-12)
 
 

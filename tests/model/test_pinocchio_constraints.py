@@ -11,6 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from tests.support.dynamics import evaluate_rows
 from tests.support.snapshots import check_refusals
 
 
@@ -44,14 +45,6 @@ def constraint(kind: str, model: pin.Model, joints: tuple[int, int], seed: int) 
     return pin.ConstraintModel(anchor) if kind.startswith("wrapped") else anchor
 
 
-def rows(model: pin.Model, loop: srm.LoopClosure, q: Any) -> tuple[np.ndarray, np.ndarray]:
-    kinematics = LoopKinematics(model, (loop,))
-    data = model.createData()
-    pin.crba(model, data, q, pin.Convention.WORLD)
-    kinematics.update(data, q, with_bias=False)
-    return kinematics.g.copy(), kinematics.G.copy()
-
-
 def of_pinocchio(model: pin.Model, given: Any, q: Any) -> tuple[Any, np.ndarray]:
     data = model.createData()
     pin.forwardKinematics(model, data, q)
@@ -72,7 +65,7 @@ def test_rows_and_jacobians_are_those_of_pinocchio(kind: str, joints: tuple[int,
     rng = np.random.default_rng(2)
     for _ in range(3):
         q = pin.integrate(model, pin.neutral(model), rng.normal(size=model.nv))
-        g, G = rows(model, loop, q)
+        g, G, _ = evaluate_rows(model, LoopKinematics(model, (loop,)), q, np.zeros(model.nv))
         relative, J = of_pinocchio(model, given, q)
         swapped = joints[1] == 0  # b is the world
         if swapped:

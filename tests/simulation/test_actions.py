@@ -11,12 +11,11 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.kernel import backend as kernel
+from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.snapshots import check_messages, refused
 
 G = 9.81
-BACKENDS = ("python", *(["kernel"] if kernel.core is not None else []))
 
 
 def one_joint(joint: Any, name: str = "slide") -> pin.Model:
@@ -51,7 +50,7 @@ def bounces(restitution: float, t_end: float) -> np.ndarray:
     return np.array(times[:-1])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize(("restitution", "step"), [(0.7, None), (0.7, 0.05), (0.9, None)])
 def test_a_ball_bounces_at_the_exact_times_to_the_exact_heights(
     ball: srm.Mechanism, restitution: float, step: float | None, backend: str
@@ -138,7 +137,7 @@ def clock(at: float) -> Any:
     return lambda t, q, v: t - at
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_clutch_conserves_angular_momentum(backend: str) -> None:
     """It closes at 1 s under whatever angle, and opens again at 2 s."""
     wheels = flywheels()
@@ -171,7 +170,7 @@ def test_a_clutch_conserves_angular_momentum(backend: str) -> None:
     assert energy[0] - energy[-1] > 0.0
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_closure_lets_go_and_the_mechanism_falls_on_freely(backend: str) -> None:
     """The slider-crank loses its pin: from there it is the open chain from that state."""
     mechanism = load("slider_crank")
@@ -190,7 +189,7 @@ def test_a_closure_lets_go_and_the_mechanism_falls_on_freely(backend: str) -> No
     assert len(solution.crossings) == len(before.crossings)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_drive_lets_go(backend: str) -> None:
     """The crank turns at constant speed, passes a singular configuration, and is then free."""
     free = load("slider_crank")
@@ -219,7 +218,7 @@ def test_a_drive_lets_go(backend: str) -> None:
     assert on.q[-1, 0] == pytest.approx(float(free.q0[0]) + speed * 0.9, abs=1e-11)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("law", [srm.ConstantSpeed(speed=6.0), srm.Sine(amplitude=0.4, omega=9.0)])
 def test_a_drive_engages_where_it_finds_its_joint(law: Any, backend: str, tmp_path: Path) -> None:
     free = load("slider_crank_regular")
@@ -243,7 +242,7 @@ def test_a_drive_engages_where_it_finds_its_joint(law: Any, backend: str, tmp_pa
 
 
 @pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-9])
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_an_event_may_act_next_to_a_singular_configuration(backend: str, beside: float) -> None:
     mechanism = load("slider_crank")
     plain = srm.simulate(mechanism, 3.0, rtol=1e-11)
@@ -255,7 +254,7 @@ def test_an_event_may_act_next_to_a_singular_configuration(backend: str, beside:
     assert run.drift.max() < 1e-10
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_state_from_which_no_run_can_start_ends_the_run_with_everything_kept(
     backend: str,
 ) -> None:
@@ -341,7 +340,7 @@ def three_balls(height: float, lower: float, **options: Any) -> srm.Solution:
     return solution
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("rtol", [1e-6, pytest.param(1e-9, marks=pytest.mark.stress)])
 @pytest.mark.parametrize("lower", [0.0, 1e-13, 1e-10])
 def test_impacts_that_are_simultaneous_but_for_rounding_all_act(
@@ -357,7 +356,7 @@ def test_impacts_that_are_simultaneous_but_for_rounding_all_act(
     assert solution.q[-1] == pytest.approx([exact] * 3, abs=1e-8)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("height", [1.0, 1.3])
 @pytest.mark.parametrize("lower", [1e-10, 1e-9])
 def test_two_impacts_at_once_act_just_after_a_third(
@@ -411,17 +410,17 @@ def test_a_run_of_segments_is_saved_and_loaded(ball: srm.Mechanism, tmp_path: Pa
     solution.plot(tmp_path / "run.png")
 
 
-def test_runs_start_at_any_time(ball: srm.Mechanism) -> None:
+@on_both
+def test_runs_start_at_any_time(ball: srm.Mechanism, backend: str) -> None:
     """A force of t, from 1 s on; a drive or a table would do the same."""
-    for backend in BACKENDS:
-        options: dict[str, Any] = {"backend": backend, "rtol": 1e-10}
-        force = srm.simulate(ball, 3.0, controller=lambda t, q, v: [np.sin(t)], **options)
-        q, v = force(1.0)
-        late = srm.simulate(
-            ball, 3.0, t0=1.0, q0=q, v0=v, controller=lambda t, q, v: [np.sin(t)], **options
-        )
-        assert late.t[0] == 1.0
-        assert np.abs(late.q[-1] - force.q[-1]).max() < 1e-9
+    options: dict[str, Any] = {"backend": backend, "rtol": 1e-10}
+    force = srm.simulate(ball, 3.0, controller=lambda t, q, v: [np.sin(t)], **options)
+    q, v = force(1.0)
+    late = srm.simulate(
+        ball, 3.0, t0=1.0, q0=q, v0=v, controller=lambda t, q, v: [np.sin(t)], **options
+    )
+    assert late.t[0] == 1.0
+    assert np.abs(late.q[-1] - force.q[-1]).max() < 1e-9
 
 
 @pytest.mark.parametrize(

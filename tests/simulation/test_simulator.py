@@ -12,12 +12,9 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.integration.kernel import backend as kernel
+from tests.support.backends import needs_kernel, on_both
 from tests.support.mechanisms import floating_ring
 from tests.support.snapshots import check_messages, refused
-
-BACKENDS = ("python", *(["kernel"] if kernel.core is not None else []))
-needs_kernel = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +22,7 @@ def slider_crank() -> srm.Mechanism:
     return srm.load("slider_crank")
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("dt", [0.01, 0.37])
 def test_steps_follow_the_motion_through_singular_configurations(
     slider_crank: srm.Mechanism, backend: str, dt: float
@@ -42,7 +39,7 @@ def test_steps_follow_the_motion_through_singular_configurations(
     assert simulator.stats.steps >= round(2.6 / dt)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_held_forces_are_those_of_a_sampled_controller(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:
@@ -59,7 +56,7 @@ def test_held_forces_are_those_of_a_sampled_controller(
     assert np.abs(simulator.v - run.v[-1]).max() < 1e-8
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize(("tableau", "order"), [("erk4", 4.0), ("tvd32", 3.0)])
 def test_fixed_inner_steps_have_the_order_of_the_tableau(
     slider_crank: srm.Mechanism, backend: str, tableau: str, order: float
@@ -81,7 +78,7 @@ def test_fixed_inner_steps_have_the_order_of_the_tableau(
     assert np.log2(errors[0] / errors[-1]) / 2.0 > order - 0.3
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("step", [None, 0.02])
 @pytest.mark.parametrize("name", ["slider_crank", "ring"])
 def test_a_clone_continues_identically_and_independently(
@@ -108,7 +105,7 @@ def test_a_clone_continues_identically_and_independently(
     assert copy.t == original.t
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_clone_knows_the_force_that_acted_before(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:
@@ -130,7 +127,7 @@ def test_copies_are_clones(slider_crank: srm.Mechanism) -> None:
         assert other.t == 0.2
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_steps_within_rounding_move_the_time_and_spoil_nothing(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:
@@ -148,7 +145,7 @@ def test_steps_within_rounding_move_the_time_and_spoil_nothing(
     assert np.abs(simulator.q - plain.q).max() < 1e-9
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_times_are_of_double_precision_whatever_the_type_of_a_step(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:
@@ -160,7 +157,7 @@ def test_times_are_of_double_precision_whatever_the_type_of_a_step(
     assert simulator.t == pytest.approx(1000.0 + 10 * float(dt), abs=1e-11)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_states_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator = srm.Simulator(slider_crank, backend=backend)
     q, v = simulator.step(0.1)
@@ -170,7 +167,7 @@ def test_states_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: st
     np.testing.assert_array_equal((simulator.q, simulator.v), before)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_forces_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator, other = (srm.Simulator(slider_crank, backend=backend) for _ in range(2))
     tau = np.zeros(2)
@@ -181,7 +178,7 @@ def test_forces_may_be_changed_in_place(slider_crank: srm.Mechanism, backend: st
     assert np.array_equal(simulator.q, other.q)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_reset_repeats_the_run_to_the_last_bit(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator = srm.Simulator(slider_crank, backend=backend)
     first = [simulator.step(0.05, [0.3, 0.0]) for _ in range(30)]
@@ -215,7 +212,7 @@ def test_states_off_the_closures_can_be_projected(slider_crank: srm.Mechanism) -
     simulator.step(0.1)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_a_failed_step_raises_and_leaves_the_last_good_state(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:
@@ -231,7 +228,7 @@ def test_a_failed_step_raises_and_leaves_the_last_good_state(
     simulator.step(0.2)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 def test_bad_steps_and_times_are_refused(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator = srm.Simulator(slider_crank, backend=backend)
     simulator.step(0.1)
@@ -277,7 +274,7 @@ def test_joints_of_many_degrees_are_stepped() -> None:
     assert np.abs(simulator.v - after.v[-1]).max() < 1e-7
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@on_both
 @pytest.mark.parametrize("dt", [0.1, 0.07])
 def test_drives_have_their_knots_between_steps_and_on_them(backend: str, dt: float) -> None:
     """The crank follows a table with kinks in its acceleration."""

@@ -44,12 +44,19 @@ def assert_same_dynamics(
         )
 
 
-def closure(mechanism: srm.Mechanism, q: FloatArray, v: FloatArray) -> FloatArray:
-    """[g, G v, Gdot v] of all rows."""
-    model = mechanism.model
+def evaluate_rows(
+    model: pin.Model, rows: LoopKinematics, q: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """g (m,), G (m, nv) and Gdot v (m,) at (q, v)."""
     data = model.createData()
-    rows = LoopKinematics(model, mechanism.loops)
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, v)
     rows.update(data, q)
-    return np.concatenate([rows.g, rows.G @ v, rows.bias])
+    return rows.g.copy(), rows.G.copy(), rows.bias.copy()
+
+
+def closure(mechanism: srm.Mechanism, q: FloatArray, v: FloatArray) -> FloatArray:
+    """[g, G v, Gdot v] of all rows."""
+    rows = LoopKinematics(mechanism.model, mechanism.loops)
+    g, G, bias = evaluate_rows(mechanism.model, rows, q, v)
+    return np.concatenate([g, G @ v, bias])

@@ -122,7 +122,7 @@ def compare(
     method = srm.PSRM(tableau, eps=eps)
     scheme = method.scheme
     system = make_system(mechanism, controller)
-    pieces = smooth_intervals(np.array(breakpoints), np.zeros(0), 0.0, t_end)
+    intervals = smooth_intervals(np.array(breakpoints), np.zeros(0), 0.0, t_end)
     kernel_system = make_kernel_system(system)
     norm = ErrorNorm(
         absolute_tolerance(mechanism, None, rtol),
@@ -143,7 +143,7 @@ def compare(
         norm,
         memory,
         x,
-        pieces,
+        intervals,
         step=step,
         first_step=first,
         max_step=max_step,
@@ -153,7 +153,7 @@ def compare(
     out = Comparison()
     one = np.concatenate([norm.one, norm.one])[: 2 * system.nv]
     t = 0.0
-    passing = BreakpointHandler(pieces, system, method, norm)
+    passing = BreakpointHandler(intervals, system, method, norm)
     control.set_target_time(passing.end)
     while t < t_end and out.attempts < 4000:
         if t >= passing.end:

@@ -25,7 +25,7 @@ import pytest
 import srm_mbs as srm
 from benchmarks import sweep_throughput as throughput
 from srm_mbs.sweeps.fingerprint import fingerprint
-from tests.support.snapshots import check_messages, refused
+from tests.support.snapshots import check_messages, check_refusals, refused
 from tests.support.sweeping import deadly, dying_once, lowest, pendulum, period, states
 
 COUNT = 5
@@ -399,7 +399,7 @@ def test_bad_input_is_refused_before_any_run(four_bar: srm.Mechanism, processes:
         "chunk": lambda: srm.sweep(four_bar, one, 1.0, chunk=0),
         "executor": lambda: srm.sweep(four_bar, one, 1.0, executor=3),
     }
-    check_messages("sweeps", {case: refused(call) for case, call in calls.items()})
+    check_refusals("sweeps", calls)
     with pytest.raises(srm.InputError, match="cannot be sent"):
         unsent(executor=processes)
 

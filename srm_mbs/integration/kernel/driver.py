@@ -72,16 +72,14 @@ def integrate(
     record = CompiledRecord(run.t0, start, run=run)
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
-    stride = 0
-    if one_by_one:
-        stride = getattr(tick, "stride", 1) if events is None else 1
     try:
         if events is not None:
             events.begin(run.t0, start)
         reason = ReturnReason.CHUNK_FULL
         while reason is not ReturnReason.FINISHED:
             made = run.count
-            reason = run.advance(stride)
+            stride = getattr(tick, "stride", 1) if events is None else 1  # a tick may change it
+            reason = run.advance(stride if one_by_one else 0)
             if reason is ReturnReason.BREAKPOINT and passing is not None:
                 run.pass_breakpoint(passing)
                 continue

@@ -188,10 +188,13 @@ def control_struct(**state: float) -> Any:
     return _core.ControlState(**_CONTROL_START | state)
 
 
-def intervals_struct(pieces: SmoothIntervals) -> Any:
+def intervals_struct(intervals: SmoothIntervals) -> Any:
     """``SmoothIntervals`` of run.hpp."""
     return _core.SmoothIntervals(
-        ends=pieces.ends, first=pieces.first, last=pieces.last, given=pieces.given.tolist()
+        ends=intervals.ends,
+        first=intervals.first,
+        last=intervals.last,
+        given=intervals.given.tolist(),
     )
 
 

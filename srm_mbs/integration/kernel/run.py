@@ -54,7 +54,7 @@ class CompiledRun:
         From :func:`~srm_mbs.integration.kernel.system.make_kernel_system`.
     method, norm, memory, state
         As for :func:`~srm_mbs.integration.driver.integrate`.
-    pieces
+    intervals
         The smooth intervals of the run, which ends with the last one.
     t0
         Start of the run (s).
@@ -73,7 +73,7 @@ class CompiledRun:
         norm: ErrorNorm,
         memory: IntegratorState,
         state: FloatArray,
-        pieces: SmoothIntervals,
+        intervals: SmoothIntervals,
         *,
         t0: float = 0.0,
         step: float | None,
@@ -83,7 +83,7 @@ class CompiledRun:
         arrivals: bool = False,
     ) -> None:
         self.kernel_system, self.method, self.norm = kernel_system, method, norm
-        self.start, self.t0, self.t_end = state.copy(), t0, float(pieces.ends[-1])
+        self.start, self.t0, self.t_end = state.copy(), t0, float(intervals.ends[-1])
         self.adaptive = step is None
         options = marshalling.options_struct(
             t0=t0,
@@ -101,7 +101,7 @@ class CompiledRun:
             marshalling.norm_struct(norm),
             marshalling.state_struct(memory),
             state,
-            marshalling.intervals_struct(pieces),
+            marshalling.intervals_struct(intervals),
             options,
         )
 

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from srm_mbs.integration.driver import Tick
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.dae import SemiExplicitDAE
+from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.dae_run import run_dae
 from srm_mbs.simulation.options import RunOptions
@@ -57,17 +59,27 @@ class Solution(AnimationMixin, SimulationResult):
 
         write_csv(self if t is None else self.at(t), checked_path(path))
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, full_paths: bool = False) -> None:
         """Write everything needed to replay and interpolate the run, description included.
 
         Parameters
         ----------
         path
             File name; ``.npz`` is usual and is not added.
+        full_paths
+            Whether the file names the folders in which the files of the mechanism lay; by default
+            it holds their names alone, and names of meshes relative to the model.
+
+        Raises
+        ------
+        InputError
+            If a tableau or closure type is not the package's, or the run is too large to be read.
+        OSError
+            If the file cannot be written; a file that was there is then as it was.
         """
         from srm_mbs.simulation.storage import save_solution
 
-        save_solution(self, checked_path(path))
+        save_solution(self, checked_path(path), full_paths)
 
     def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
         """A picture of the run; docs/plots.md shows each kind.
@@ -122,11 +134,11 @@ class SegmentedSolution(SegmentedResult, Solution):
         """See :attr:`Solution.degrees_of_freedom`."""
         return self.rows_of_parts(lambda part: part.degrees_of_freedom)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, full_paths: bool = False) -> None:
         """Write all segments into one file; see :meth:`Solution.save`."""
         from srm_mbs.simulation.storage import save_segments
 
-        save_segments(self, checked_path(path))
+        save_segments(self, checked_path(path), full_paths)
 
 
 class DaeSolution(DaeResult):
@@ -357,17 +369,29 @@ def solve_dae(
     return run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
 
 
-def load_solution(path: str | Path) -> Solution:
+def load_solution(
+    path: str | Path, *, mesh_dirs: Sequence[str | Path] = (), allow_outside: bool = False
+) -> Solution:
     """Read a run that :meth:`Solution.save` wrote; dense output and plots work as before.
 
-    A controller is not saved: reactions of a controlled run cannot be computed afterwards, unless
-    it was sampled; what it held is saved.
+    Meshes are looked for beside the file.  A controller is not saved: reactions of a controlled run
+    cannot be computed afterwards, unless it was sampled; what it held is saved.
+
+    Parameters
+    ----------
+    path
+        A file of :meth:`Solution.save`.
+    mesh_dirs, allow_outside
+        Where its animations may read meshes, as for :func:`srm_mbs.load`; the folder of the model
+        is that of ``path``.
 
     Raises
     ------
     InputError
-        If the file is missing, is no saved run, or is of another format.
+        If the file is missing, is no saved run, is of another format, or unpacks to more than 20
+        times its size and 64 MB, or more than 2 GB.
     """
     from srm_mbs.simulation.storage import load_result
 
-    return load_result(checked_path(path), SOLUTIONS)
+    checked = checked_path(path)
+    return load_result(checked, SOLUTIONS, Reach.of(checked, mesh_dirs, allow_outside))

@@ -12,6 +12,7 @@ import srm_mbs
 from srm_mbs.cli.output import (
     HTML_SUFFIXES,
     RUN_FAILED,
+    AllowOutside,
     Html,
     Model,
     check_output,
@@ -79,6 +80,7 @@ def modes(
         int, option("N", "Number of configurations from which closing starts.")
     ] = 200,
     seed: Annotated[int, option("N", "Seed of the random ones among them.")] = 0,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """List the assembly modes, the ways in which loops close.
 
@@ -86,7 +88,7 @@ def modes(
     """
     from srm_mbs.cli.tables import mode_rows
 
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     positions, names = _held(hold)
     found = srm_mbs.assembly_modes(
         mechanism,
@@ -109,6 +111,7 @@ def equilibrium(
     nearest: Annotated[
         bool, typer.Option("--nearest", help="Find the nearest one, stable or not.")
     ] = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Find a static equilibrium.
 
@@ -116,7 +119,7 @@ def equilibrium(
     """
     from srm_mbs.cli.tables import equilibrium_rows, position_rows
 
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     positions, names = _held(hold)
     found = srm_mbs.equilibrium(
         mechanism, positions, hold=names, search="nearest" if nearest else "stable"
@@ -151,6 +154,7 @@ def linearise(
         int | None, option("N", "Mode that --html shows.", min=0, show_default="0")
     ] = None,
     html: Html = None,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Linearise a mechanism: A, B, eigenvalues and mode shapes."""
     from srm_mbs.cli.tables import eigenvalue_rows, matrix_rows, state_names
@@ -163,7 +167,7 @@ def linearise(
             remedy="Give --html, or leave it out",
         )
     check_output(html, "--html", HTML_SUFFIXES)
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     state = _state(mechanism, at)
     found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
     inputs = (f"force of {name}" for name in found.inputs)
@@ -200,6 +204,7 @@ def drag(
     ],
     html: Html = None,
     duration: Annotated[float, option("S", "Length of the animation (s).")] = 3.0,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Drag joints through positions, on one branch.
 
@@ -208,7 +213,7 @@ def drag(
     from srm_mbs.cli.tables import path_rows, position_rows
 
     check_output(html, "--html", HTML_SUFFIXES)
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     targets, bare = _values(values, "JOINT=VALUE")
     if bare:
         raise InputError(

@@ -28,6 +28,7 @@ from srm_mbs.cli.output import (
     BAD_INPUT,
     HTML_SUFFIXES,
     RUN_FAILED,
+    AllowOutside,
     Html,
     Lines,
     Model,
@@ -46,6 +47,10 @@ from srm_mbs.errors import InputError
 
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
+HARNESS = Path("benchmarks", "work_precision", "__main__.py")
+"""The benchmark in a checkout of the source."""
+LARGEST_PROJECT_FILE = 10**6
+"""Bytes of a project file that is read to recognise a checkout."""
 
 app = typer.Typer(
     name="srm-mbs",
@@ -147,6 +152,7 @@ def simulate(
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
     live: playback.Live = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -164,7 +170,7 @@ def simulate(
     check_output(html, "--html", HTML_SUFFIXES)
     playback.check_pictures(image, at, video)
 
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     defaults = mechanism.defaults
@@ -221,11 +227,12 @@ def convert(
     ],
     cut: Annotated[list[str] | None, several("--cut", "JOINT", "Cut a loop at this joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write a file of any format as a TOML description and a URDF."""
     from srm_mbs.formats.convert import convert as write
 
-    *written, notes = write(model, out, cut=cut or (), force=force)
+    *written, notes = write(model, out, cut=cut or (), force=force, allow_outside=allow_outside)
     for path in written:
         say_written(path)
     for note in notes:
@@ -234,7 +241,7 @@ def convert(
 
 @app.command()
 @reported
-def info(model: Model) -> None:
+def info(model: Model, allow_outside: AllowOutside = False) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
@@ -248,7 +255,7 @@ def info(model: Model) -> None:
         mechanism_rows,
     )
 
-    mechanism = srm_mbs.load(model)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     table(mechanism_rows(mechanism))
     for header, rows in (
         (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),
@@ -307,20 +314,46 @@ def benchmark(context: typer.Context) -> None:
     In a checkout of the source only, and with the compiled kernel unless --backend python asks
     for the Python reference.  The options are those of 'python -m benchmarks.work_precision'.
     """
-    harness = Path("benchmarks", "work_precision", "__main__.py")
-    if not harness.is_file():
+    folder = Path.cwd()
+    if not _is_checkout(folder):
         if "--help" in context.args:
             typer.echo(context.get_help())
             raise typer.Exit
         raise InputError(
-            "the benchmark is not installed with the package, and there is none in this folder",
-            file=str(harness),
+            "the benchmark is not installed with the package, and this folder is not a checkout "
+            "of its source",
+            file=str(HARNESS),
             element="benchmark",
             remedy="Run it at the top of a checkout of the source",
         )
-    # A new process, which reads the number of threads before it loads NumPy.
+    # A new process, which reads the number of threads before it loads NumPy.  It finds the modules
+    # of the checkout before those of other folders.
     arguments = [sys.executable, "-m", "benchmarks.work_precision", *context.args]
-    raise typer.Exit(subprocess.run(arguments, check=False).returncode)
+    settings = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    done = subprocess.run(arguments, cwd=folder, env=settings, check=False)
+    raise typer.Exit(done.returncode)
+
+
+def _is_checkout(folder: Path) -> bool:
+    """Whether a folder is the top of a checkout of this project.
+
+    Its project file names the package, and it has the package and the benchmark as regular
+    packages, which precede those of the same name in other folders.
+    """
+    from srm_mbs.formats.files import read_text
+    from srm_mbs.formats.toml.description import parse_toml
+
+    try:
+        text = read_text(folder / "pyproject.toml", LARGEST_PROJECT_FILE)
+        project = parse_toml(text, "pyproject.toml").get("project")
+    except InputError:
+        return False
+    needed = (HARNESS, Path("benchmarks", "__init__.py"), HARNESS.with_name("__init__.py"))
+    return (
+        isinstance(project, dict)
+        and project.get("name") == "srm-mbs"
+        and all((folder / file).is_file() for file in (*needed, Path("srm_mbs", "__init__.py")))
+    )
 
 
 def main() -> None:

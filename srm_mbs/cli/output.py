@@ -56,6 +56,10 @@ Model = Annotated[
     ),
 ]
 Html = Annotated[Path | None, option("FILE.html", "Write the animation as one page.")]
+AllowOutside = Annotated[
+    bool,
+    typer.Option("--allow-outside", help="Let the file name meshes and other files anywhere."),
+]
 HTML_SUFFIXES = (".html", ".htm")
 
 

@@ -15,6 +15,7 @@ import typer
 import srm_mbs
 from srm_mbs.cli.output import (
     BAD_INPUT,
+    AllowOutside,
     Run,
     check_output,
     echo,
@@ -172,13 +173,14 @@ def play(
     trace: Trace = None,
     gaps: Gaps = False,
     reactions: Reactions = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Play a saved run in the browser.
 
     With --image or --video, write these instead.
     """
     check_pictures(image, at, video)
-    solution = srm_mbs.load_solution(run)
+    solution = srm_mbs.load_solution(run, allow_outside=allow_outside)
     check_time(at, solution.span[1], solution.span[0])
     options = overlay_options(solution.mechanism, trace, gaps, reactions)
     if image is None and video is None:

@@ -10,6 +10,7 @@ import typer
 import srm_mbs
 from srm_mbs.cli.output import (
     HTML_SUFFIXES,
+    AllowOutside,
     Run,
     check_output,
     echo,
@@ -101,6 +102,7 @@ def report(
         bool,
         typer.Option("--no-second-run", help="Leave out the second run and the error estimate."),
     ] = False,
+    allow_outside: AllowOutside = False,
     full_paths: Annotated[
         bool,
         typer.Option("--full-paths", help="Name the folders of the mechanism's files in the page."),
@@ -121,7 +123,7 @@ def report(
             element="--rtol",
             remedy="Leave out one of the two",
         )
-    solution = srm_mbs.load_solution(run)
+    solution = srm_mbs.load_solution(run, allow_outside=allow_outside)
     if not no_second_run:
         echo("repeating the run, to estimate its error", err=True)
     certificate = srm_mbs.certify(solution, rtol=rtol, again=not no_second_run, progress=True)

@@ -205,7 +205,7 @@ def unassembled(
         with naming(element="initial.v"):
             write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
-    csv = CsvFolder(Path(source.path).parent) if tables else None
+    csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
     friction_speed = description.friction_speed
     mechanism = Mechanism(
         model,
@@ -265,6 +265,7 @@ def assembled(reading: Reading) -> Mechanism:
         As :func:`srm_mbs.load`.
     """
     description, source = reading.description, reading.source
+    description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
     # Assembly analyses this copy, of the guess; the mechanism is analysed at its assembled state.
     guess = copy(mechanism)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,19 @@ from srm_mbs.formats.build import unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
 from srm_mbs.model.numbers import flag, name_list
+from srm_mbs.model.reach import Reach
 
 log = get_logger(__name__)
 
 
 def convert(
-    path: str | Path, out: str | Path, *, cut: Sequence[str] = (), force: bool = False
+    path: str | Path,
+    out: str | Path,
+    *,
+    cut: Sequence[str] = (),
+    force: bool = False,
+    mesh_dirs: Sequence[str | Path] = (),
+    allow_outside: bool = False,
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
 
@@ -31,7 +38,7 @@ def convert(
 
     Parameters
     ----------
-    path, cut
+    path, cut, mesh_dirs, allow_outside
         As for :func:`srm_mbs.load`.
     out
         The description to write, ``.toml``; the URDF gets the same name with ``.urdf``.
@@ -55,9 +62,13 @@ def convert(
             f"the suffix {description.suffix!r} is not .toml", file=str(out), remedy="Use .toml"
         )
     urdf = description.with_suffix(".urdf")
-    reading = read(path, Overrides(cut=name_list(cut, "cut")))
+    overrides = Overrides(
+        cut=name_list(cut, "cut"), mesh_dirs=tuple(mesh_dirs), allow_outside=allow_outside
+    )
+    reading = read(path, overrides)
     source = reading.source
     written = _with_meshes_from(reading.tree, source.urdf, Path(source.urdf_path), urdf)
+    meshes = [mesh.get("filename", "") for mesh in reading.tree.iter("mesh")]
     with naming(file=source.path):
         mechanism, _, _ = unassembled(reading)
     inputs = {Path(name).resolve() for name in (path, source.path, source.urdf_path)}
@@ -72,6 +83,7 @@ def convert(
             )
     entries = deepcopy(dict(reading.entries)) | {"urdf": urdf.name}
     _move_tables(entries, Path(source.path), description)
+    elsewhere = _elsewhere((*meshes, *_tables(entries)), description)
     try:
         write_texts({urdf: written, description: tomli_w.dumps(entries)})
     except OSError as error:
@@ -81,7 +93,12 @@ def convert(
             remedy=CHECK_WRITING,
         ) from error
     log.info("written: %s and %s", description, urdf)
-    return description, urdf, mechanism.notes
+    notes = mechanism.notes
+    if elsewhere:
+        names = ", ".join(elsewhere)
+        note = f"files stay in other folders: {names}; load it with allow_outside=True"
+        notes = (*notes, f"{note} (--allow-outside), or move them")
+    return description, urdf, notes
 
 
 def _seen_from(name: str, original: Path, written: Path) -> str:
@@ -101,6 +118,30 @@ def _move_tables(entries: Any, original: Path, written: Path) -> None:
                 entries[key] = _seen_from(value, original, written)
             else:
                 _move_tables(value, original, written)
+
+
+def _tables(entries: Any) -> Iterator[str]:
+    """Paths of the tables that laws are read from."""
+    if isinstance(entries, list):
+        for entry in entries:
+            yield from _tables(entry)
+    elif isinstance(entries, dict):
+        if isinstance(entries.get("table"), str):
+            yield entries["table"]
+        yield from _tables(list(entries.values()))
+
+
+def _elsewhere(names: Iterable[str], written: Path) -> list[str]:
+    """Those of the paths ``names`` that are out of reach of the description ``written``."""
+    reach = Reach.of(written)
+    found = []
+    for name in dict.fromkeys(names):
+        try:
+            if name and not urlsplit(name).scheme:
+                reach.check(written.parent / name, "file")
+        except InputError:
+            found.append(name)
+    return found
 
 
 def _with_meshes_from(root: Element, text: str, original: Path, written: Path) -> str:

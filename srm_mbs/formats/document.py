@@ -8,6 +8,7 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import open_regular, read_text
 from srm_mbs.formats.toml.description import parse_toml
 from srm_mbs.formats.xml import parse_xml, root_tag
 
@@ -40,26 +41,16 @@ class Document:
         Raises
         ------
         InputError
-            If there is none, or it is not UTF-8.
+            As :func:`~srm_mbs.formats.files.read_text`.
         """
-        try:
-            return cls(path.read_text(encoding="utf-8-sig"), str(path))  # Windows editors mark it
-        except (OSError, ValueError) as error:
-            file = str(path)
-            if isinstance(error, FileNotFoundError):
-                problem, remedy = "there is no such file", "Check the path"
-            elif isinstance(error, OSError):
-                problem = f"it cannot be read: {error.strerror}"
-                remedy = "Give the path of a readable file"
-            elif not isinstance(error, UnicodeDecodeError):  # a null character
-                problem, remedy = f"it is not a file name: {error}", "Correct the path"
-                file = repr(path)
-            elif path.suffix.lower() == ".npz":
-                problem = "it is not the file of a mechanism"
-                remedy = "Give a saved run to srm.load_solution, or to srm-mbs plot, play or report"
-            else:
-                problem, remedy = f"it is not UTF-8 text: {error}", "Save it as UTF-8"
-            raise InputError(problem, file=file, remedy=remedy) from error
+        if path.suffix.lower() == ".npz":
+            open_regular(path).close()
+            raise InputError(
+                "it is not the file of a mechanism",
+                file=str(path),
+                remedy="Give a saved run to srm.load_solution, or to srm-mbs plot, play or report",
+            )
+        return cls(read_text(path), str(path))
 
     @cached_property
     def toml(self) -> dict[str, Any]:

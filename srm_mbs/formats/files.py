@@ -41,9 +41,7 @@ def open_regular(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> I
     """
     name = os.fspath(path)
     try:
-        opened = os.open(
-            name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        )
+        opened = os.open(name, _READING)
     except FileNotFoundError as error:
         raise InputError("there is no such file", file=name, remedy="Check the path") from error
     except OSError as error:
@@ -104,6 +102,39 @@ def read_text(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> str:
             remedy="Save it as UTF-8",
         ) from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+LONGEST_QUOTE = 60
+"""Characters of a file that a message quotes."""
+LONGEST_NAME = 1000
+"""Characters of the name of a link, joint, closure ... or file."""
+
+
+def shortened(text: str, longest: int = LONGEST_QUOTE) -> str:
+    """``text`` for a message: on one line, and at most ``longest`` characters of it."""
+    text = " ".join(text[: 4 * longest].split())
+    return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def check_name(text: str, where: str) -> None:
+    """Refuse the name ``text`` of the element ``where`` if it is longer than
+    :data:`LONGEST_NAME`, or has characters that do not print.
+
+    Raises
+    ------
+    InputError
+        If it is.
+    """
+    if len(text) <= LONGEST_NAME and text.isprintable():
+        return
+    long = len(text) > LONGEST_NAME
+    raise InputError(
+        f"the name {shortened(text)!r} has {len(text)} characters"
+        if long
+        else f"the name {shortened(text)!r} has characters that do not print",
+        element=where,
+        remedy=f"Give at most {LONGEST_NAME} printable characters",
+    )
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 import reprlib  # of nested anchors and aliases: repr would write out all of them
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,15 @@ from xml.etree.ElementTree import Element, SubElement
 
 from srm_mbs.errors import InputError
 from srm_mbs.formats.document import Document
+from srm_mbs.formats.files import check_name, shortened
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf import loops as urdf_loops
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+LARGEST_YAML = 10**6
+"""Characters of the YAML file."""
+LARGEST_YAML_DEPTH = 20
+"""Values in each other, the stream and the document included."""
 PAIRED = {"closed_loop": "type", "joint_name": "joint_type"}
 """Lists of the same length."""
 CLOSURES = {"3d": "point", "6d": "frame"}
@@ -35,7 +41,7 @@ REPLACEABLE = ("revolute", "continuous", "prismatic", "floating", "planar")
 
 def recognises(document: Document) -> bool:
     """Whether a text has one of the keys at the beginning of a line."""
-    return re.search(rf"^({'|'.join(KEYS)})\s*:", document.text, re.MULTILINE) is not None
+    return re.search(rf"^({'|'.join(KEYS)})[ \t]*:", document.text, re.MULTILINE) is not None
 
 
 def translate(document: Document, options: Options) -> Translation:
@@ -47,7 +53,9 @@ def translate(document: Document, options: Options) -> Translation:
         Naming the key at fault.
     """
     lists = _read(document.text)
-    urdf = Document.read(_urdf_beside(Path(document.file)))
+    beside = _urdf_beside(Path(document.file))
+    options.reach.check(beside, "URDF")
+    urdf = Document.read(beside)
     plain = urdf_loops.translate(urdf, options)
     root = plain.tree
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
@@ -94,16 +102,23 @@ def _read(text: str) -> dict[str, list[Any]]:
     """The lists by key, of equal length where they belong together; empty where there is none."""
     import yaml
 
+    if len(text) > LARGEST_YAML:
+        raise _fault("", f"it has more than {LARGEST_YAML / 1e6:.0f} MB", "Give a smaller file")
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        raw = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        where = " ".join(str(error).split())
-        raise _fault("", f"this is not valid YAML: {where}", "Correct the file") from error
+        _check_depth(yaml.parse(text, loader))  # the loader recurses
+        raw = yaml.load(text, loader)
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+        # Its own message quotes lines of the file.
+        problem = shortened(getattr(error, "problem", None) or type(error).__name__)
+        mark = getattr(error, "problem_mark", None)
+        at = "" if mark is None else f" at line {mark.line + 1}, column {mark.column + 1}"
+        raise _fault("", f"this is not valid YAML: {problem}{at}", "Correct the file") from error
     if not isinstance(raw, dict):
         raise _fault("", "it holds no keys", f"Give {', '.join(KEYS)}")
     for key in raw:
         if key not in KEYS:
-            raise _fault(str(key), "this key is unknown", f"Known: {', '.join(KEYS)}")
+            raise _fault(shortened(str(key)), "this key is unknown", f"Known: {', '.join(KEYS)}")
     lists: dict[str, list[Any]] = {}
     for key in KEYS:
         value = raw.get(key)
@@ -129,13 +144,24 @@ def _read(text: str) -> dict[str, list[Any]]:
         for entry in lists[key]:
             if not _is_name(entry):
                 raise _fault(key, f"{reprlib.repr(entry)} is not text", "Put it in quotes")
+            check_name(entry, key)
     for kind in lists["type"]:
         if kind.lower() not in CLOSURES:
             raise _fault("type", f"there is no type {kind!r}", "Known: 3d, 6d")
-    for name in lists["joint_name"]:
-        if lists["joint_name"].count(name) > 1:
+    for name, count in Counter(lists["joint_name"]).items():
+        if count > 1:
             raise _fault("joint_name", f"{name!r} is given twice", "Keep one")
     return lists
+
+
+def _check_depth(events: Iterable[Any]) -> None:
+    """Refuse lists and keys in each other deeper than :data:`LARGEST_YAML_DEPTH`."""
+    depth = 0
+    for event in events:
+        kind = type(event).__name__
+        depth += kind.endswith("StartEvent") - kind.endswith("EndEvent")
+        if depth > LARGEST_YAML_DEPTH:
+            raise _fault("", "its values are nested too deep", "Remove what the format has not")
 
 
 def _is_name(value: Any) -> bool:

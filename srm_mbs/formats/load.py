@@ -23,6 +23,7 @@ from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
+from srm_mbs.model.reach import Reach
 
 log = get_logger(__name__)
 
@@ -47,11 +48,17 @@ def bundled_models() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Arguments of :func:`load` that replace values of the file; None or empty: the file's."""
+    """Arguments of :func:`load`.
+
+    ``gravity``, ``base`` and ``cut`` replace values of the file (None or empty: the file's);
+    ``mesh_dirs`` and ``allow_outside`` say which other files it may name.
+    """
 
     gravity: Sequence[float] | None = None
     base: str | None = None
     cut: tuple[str, ...] = ()
+    mesh_dirs: tuple[str | Path, ...] = ()
+    allow_outside: bool = False
 
 
 def _gravity(value: Any) -> tuple[float, float, float]:
@@ -73,9 +80,10 @@ def _translated(
     found: Format,
     model: Document,
     overrides: Overrides,
+    reach: Reach,
 ) -> Reading:
     """Translate ``model``, the file that the description names, and merge the two."""
-    options = Options(overrides.cut or tuple(description.cut), entries)
+    options = Options(overrides.cut or tuple(description.cut), entries, reach)
     translation = found.translate(model, options)
     text = own.text
     if translation.entries or found.key != "urdf":
@@ -97,12 +105,15 @@ def _translated(
         base=base,
         gravity=_gravity(gravity),
         format=found.name,
+        reach=reach,
     )
     log.debug("%s: read as %s", model.file, found.name)
     return Reading(description, entries, translation.tree, source, translation.notes)
 
 
-def _of_description(own: Document, overrides: Overrides, urdf: str | None = None) -> Reading:
+def _of_description(
+    own: Document, overrides: Overrides, reach: Reach, urdf: str | None = None
+) -> Reading:
     """Read a description; its model file is read from disk unless ``urdf`` is its text."""
     description = check_description(own.toml, own.file)
     key, name = description.model_file
@@ -110,6 +121,8 @@ def _of_description(own: Document, overrides: Overrides, urdf: str | None = None
     if urdf is not None:
         model = Document(urdf, str(path))
     else:
+        with naming(file=own.file, element=key):
+            reach.check(path, "file")
         try:
             model = Document.read(path)
         except InputError as error:
@@ -118,23 +131,24 @@ def _of_description(own: Document, overrides: Overrides, urdf: str | None = None
                 f"the {key.upper()} {name!r} cannot be read ({error.problem}: {str(path)!r})",
                 file=own.file,
                 element=key,
-                remedy=error.remedy if os.path.isfile(path) else relative,
+                remedy=error.remedy if os.path.exists(path) else relative,
             ) from error
     found = of_key(key, path, model)
-    return _translated(own, own.toml, description, found, model, overrides)
+    return _translated(own, own.toml, description, found, model, overrides, reach)
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:
     if path.is_dir():
         raise InputError("it is a directory", remedy="Give a file in it")
+    reach = Reach.of(path, overrides.mesh_dirs, overrides.allow_outside)
     document = Document.read(path)
     found = find_format(path, document)
     if found is DESCRIPTION:
-        return _of_description(document, overrides)
+        return _of_description(document, overrides, reach)
     entries = {"format": 1, "urdf": path.name}
     own = Document(tomli_w.dumps(entries), document.file)
     description = check_description(entries, own.file)
-    return _translated(own, entries, description, found, document, overrides)
+    return _translated(own, entries, description, found, document, overrides, reach)
 
 
 def read(name: str | Path, overrides: Overrides) -> Reading:
@@ -174,6 +188,8 @@ def load(
     gravity: Sequence[float] | None = None,
     base: str | None = None,
     cut: Sequence[str] = (),
+    mesh_dirs: Sequence[str | Path] = (),
+    allow_outside: bool = False,
 ) -> Mechanism:
     """Load a mechanism and assemble its initial state.
 
@@ -190,6 +206,12 @@ def load(
     cut
         Names of the joints at which to cut the loops of a file whose joints form a graph: they
         become closures, the others stay joints.
+    mesh_dirs
+        Further folders in which files that it names (meshes, included files) are searched.
+    allow_outside
+        Whether it may name files anywhere.  By default they lie, symbolic links resolved, in its
+        folder, in its package, in packages found through the environment, or in ``mesh_dirs``
+        (``docs/formats.md``); the mechanism keeps the decision for its animations.
 
     Raises
     ------
@@ -198,7 +220,8 @@ def load(
     AssemblyError
         If the loops cannot close or held values contradict each other.
     """
-    reading = read(path, Overrides(gravity, base, name_list(cut, "cut")))
+    overrides = Overrides(gravity, base, name_list(cut, "cut"), tuple(mesh_dirs), allow_outside)
+    reading = read(path, overrides)
     with naming(file=reading.source.path):
         return assembled(reading)
 
@@ -244,7 +267,8 @@ def _generated(n: int, overrides: Overrides) -> Reading:
             + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
         )
     text, urdf = n_four_bar_texts(n)
-    return _of_description(Document(text, f"n_four_bar_{n}, generated"), overrides, urdf)
+    own = Document(text, f"n_four_bar_{n}, generated")
+    return _of_description(own, overrides, Reach(), urdf)
 
 
 def n_four_bar(n: int) -> Mechanism:

@@ -14,6 +14,7 @@ from pathlib import Path
 from srm_mbs.errors import InputError
 from srm_mbs.formats import gepetto
 from srm_mbs.formats.document import Document
+from srm_mbs.formats.files import shortened
 from srm_mbs.formats.mjcf import reader as mjcf
 from srm_mbs.formats.sdf import reader as sdf
 from srm_mbs.formats.translation import Options, Translation
@@ -53,7 +54,7 @@ def _rooted(tag: str) -> Callable[[Document], bool]:
 
 
 def _is_description(document: Document) -> bool:
-    if not re.search(r"^\s*format\s*=", document.text, re.MULTILINE):
+    if not re.search(r"^[ \t]*+format[ \t]*+=", document.text, re.MULTILINE):
         return False
     try:
         return "format" in document.toml
@@ -96,7 +97,10 @@ def find_format(path: Path, document: Document) -> Format:
     if found is not None:
         return found
     tag = document.root_tag
-    what = f"a file with the root element <{tag}>" if tag else f"a file of type {path.suffix!r}"
+    suffix = shortened(path.suffix)
+    what = (
+        f"a file with the root element <{shortened(tag)}>" if tag else f"a file of type {suffix!r}"
+    )
     raise InputError(
         f"{what} is not of a format that is read",
         file=str(path),
@@ -124,7 +128,7 @@ def of_key(key: str, path: Path, document: Document) -> Format:
         )
     if tag is not None and key != "urdf":  # the URDF reader names the fault
         raise InputError(
-            f"the root element of {path.name!r} is <{tag}>: it is not a {wanted.name}",
+            f"the root element of {path.name!r} is <{shortened(tag)}>: it is not a {wanted.name}",
             element=key,
             remedy=remedy,
         )

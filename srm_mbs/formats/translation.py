@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 from xml.etree.ElementTree import Element, indent, tostring
 
+from srm_mbs.model.reach import Reach
+
 
 @dataclass(frozen=True)
 class Options:
@@ -22,10 +24,13 @@ class Options:
         Names of the joints at which loops of a graph of joints are to be cut.
     own
         The tables of the description that names the file; empty if none does.
+    reach
+        Where files that the file names may lie.
     """
 
     cut: tuple[str, ...] = ()
     own: Mapping[str, Any] = field(default_factory=dict)
+    reach: Reach = field(default_factory=Reach)
 
 
 @dataclass(frozen=True, eq=False)

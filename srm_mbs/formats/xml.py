@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 
 import numpy as np
 from defusedxml import DefusedXmlException
 from defusedxml import ElementTree as SafeTree
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
+from srm_mbs.formats.files import LARGEST_FILE, LONGEST_NAME, check_name, shortened
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 
@@ -31,6 +32,18 @@ LARGEST_NESTING = 300
 """Largest depth of nested elements."""
 LARGEST_INCLUDE_DEPTH = 20
 """Largest number of files that include each other."""
+MOST_INCLUDES = 1000
+"""Number of files that a file includes, directly and indirectly."""
+MOST_ELEMENTS = 10**6
+"""Number of elements, and of attributes, in a file."""
+NAMING = ("name", "link", "joint", "body", "site", "body1", "body2", "joint1", "joint2", "frame")
+"""Attributes that hold names."""
+PIECE = 4 * 10**6
+"""Characters that the parser gets at once."""
+LARGEST_TAG = 4 * 10**6
+"""Bytes of a tag with its attributes, or of a comment."""
+BLANK = re.compile(r"\s*+")
+ROOT = re.compile(r"<([^\s/><!?]++)")
 NAMESPACED = re.compile(r"\{[^}]*\}")
 
 
@@ -123,6 +136,7 @@ class XmlValues(XmlFile):
     def __init__(self, file: str) -> None:
         super().__init__(file)
         self._remarks: dict[str, list[str]] = {}
+        self._included = self._included_size = 0
 
     def remark(self, what: str, where: str) -> None:
         """Note an assumption or approximation at ``where``; one sentence lists all places."""
@@ -164,24 +178,29 @@ class XmlValues(XmlFile):
         out: FloatArray = values / length
         return out
 
-    def check_depth(self, root: Element) -> None:
-        """Refuse elements in each other deeper than the readers, which recurse, can follow."""
-        level, depth = [root], 0
-        while level:
-            if depth > LARGEST_NESTING:
-                raise self.fault(
-                    f"<{level[0].tag}>",
-                    f"more than {LARGEST_NESTING} elements are nested",
-                    "Write such a long chain as a URDF, which is flat",
-                )
-            level = [child for node in level for child in node]
-            depth += 1
-
     def check_include(self, depth: int, where: str) -> None:
         """Refuse the include ``where``, which is in ``depth`` others, if that are too many."""
         if depth >= LARGEST_INCLUDE_DEPTH:
             raise self.fault(
                 where, f"more than {LARGEST_INCLUDE_DEPTH} files include each other", "Break it"
+            )
+
+    def count_included(self, text: str, where: str) -> None:
+        """Count an included file with this ``text``, and refuse it, if it is one too many or they
+        are too large together."""
+        self._included += 1
+        self._included_size += len(text)
+        if self._included > MOST_INCLUDES:
+            raise self.fault(
+                where,
+                f"more than {MOST_INCLUDES} files are included",
+                "Include fewer, and none in a circle",
+            )
+        if self._included_size > LARGEST_FILE:
+            raise self.fault(
+                where,
+                f"the included files have more than {LARGEST_FILE / 1e6:.0f} MB together",
+                "Include fewer or smaller ones",
             )
 
     def children(
@@ -239,15 +258,36 @@ class XmlValues(XmlFile):
         self.only(node, where, read, foreign)
 
 
-_PROLOG = re.compile(
-    r"(?:\s+|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*(?:\[[^\]]*\])?[^>]*>)*<([^\s/><!?]+)", re.DOTALL
-)
+def _root(text: str) -> tuple[str, int] | None:
+    """Name of the root element of ``text``, prefix included, and where it ends; None if ``text``
+    does not look like XML."""
+    at = 1 if text.startswith("\ufeff") else 0
+    while True:
+        at = BLANK.match(text, at).end()  # type: ignore[union-attr]
+        if text.startswith("<!--", at):
+            at = _after(text, "-->", at + 4)
+        elif text.startswith("<?", at):
+            at = _after(text, "?>", at + 2)
+        elif text.startswith("<!DOCTYPE", at):
+            subset, end = text.find("[", at), text.find(">", at)
+            if 0 <= subset < end:
+                at = _after(text, "]", subset)
+            at = _after(text, ">", at)
+        else:
+            name = ROOT.match(text, at)
+            return (name[1], name.end()) if name else None
+
+
+def _after(text: str, mark: str, start: int) -> int:
+    """Where the next ``mark`` ends; the end of ``text`` without one."""
+    found = text.find(mark, start)
+    return len(text) if found < 0 else found + len(mark)
 
 
 def root_tag(text: str) -> str | None:
     """Name of the root element, prefix included; None if ``text`` does not look like XML."""
-    match = _PROLOG.match(text.lstrip("\ufeff"))
-    return match[1] if match else None
+    root = _root(text)
+    return None if root is None else root[0]
 
 
 def parse_xml(text: str, file: str) -> Element:
@@ -256,32 +296,98 @@ def parse_xml(text: str, file: str) -> Element:
     Raises
     ------
     InputError
-        If it is not well-formed XML, or uses entities or external references.
+        If it is not well-formed XML, uses entities or external references, has more than
+        :data:`MOST_ELEMENTS` elements or attributes, more than :data:`LARGEST_NESTING` nested ones,
+        or a name that is no name.
     """
+    if max(text.count("<") // 2, text.count('="') + text.count("='")) > MOST_ELEMENTS:
+        raise InputError(
+            f"the XML has more than {MOST_ELEMENTS} elements or attributes",
+            file=file,
+            remedy="Split the file, or remove what is not needed",
+        )
     try:
-        return SafeTree.fromstring(text)  # type: ignore[no-any-return]
+        root = _parsed(text)
     except ParseError as error:
         # Drake's own reader takes <drake:...> without a declaration; expat does not.
         declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
         if declared != text:
             return parse_xml(declared, file)
         raise InputError(
-            f"this is not well-formed XML: {error}", file=file, remedy="Correct the file there"
+            f"this is not well-formed XML: {_explained(error)}",
+            file=file,
+            remedy="Correct the file there",
         ) from error
     except DefusedXmlException as error:
         raise InputError(
-            f"the XML uses entities or external references: {error}",
+            f"the XML uses entities or external references: {shortened(str(error))}",
             file=file,
             remedy="Remove them; they are refused for safety",
         ) from error
+    except ValueError as error:  # a surrogate, which no encoding has
+        raise InputError(
+            f"this is not well-formed XML: {shortened(str(error))}",
+            file=file,
+            remedy="Correct the file",
+        ) from error
+    with naming(file=file):
+        check_tree(root)
+    return root
+
+
+def _parsed(text: str) -> Element:
+    """Root element of ``text``, which is handed over in pieces: the time of the parser would grow
+    without bound with the length of an attribute or a comment."""
+    parser = SafeTree.DefusedXMLParser(target=TreeBuilder())
+    size = 0
+    for start in range(0, len(text), PIECE):
+        piece = text[start : start + PIECE].encode()
+        parser.feed(piece)
+        size += len(piece)
+        if size - parser.parser.CurrentByteIndex > LARGEST_TAG + PIECE:
+            raise ValueError(f"a tag or comment has more than {LARGEST_TAG / 1e6:.0f} MB")
+    root: Element = parser.close()
+    return root
+
+
+def _explained(error: ParseError) -> str:
+    """The message of expat, which may quote the file, with the position."""
+    words, _, position = str(error).rpartition(": ")
+    return f"{shortened(words)}: {position}"
+
+
+def check_tree(root: Element) -> None:
+    """Refuse elements nested deeper than the readers, which recurse, can follow, and names that
+    :func:`~srm_mbs.formats.files.check_name` refuses."""
+    level, depth = [root], 0
+    while level:
+        if depth > LARGEST_NESTING:
+            raise InputError(
+                f"more than {LARGEST_NESTING} elements are nested",
+                element=f"<{shortened(local_name(level[0]))}>",
+                remedy="Write such a long chain as a URDF, which is flat",
+            )
+        for node in level:
+            for text in (str(node.tag), *node.attrib):
+                if len(text) > LONGEST_NAME:
+                    raise InputError(
+                        f"the name {shortened(text)!r} of an element or attribute has {len(text)} "
+                        "characters",
+                        remedy=f"Give at most {LONGEST_NAME} characters",
+                    )
+            for key in NAMING:
+                if key in node.attrib:
+                    check_name(node.attrib[key], f"<{local_name(node)} {key}>")
+        level = [child for node in level for child in node]
+        depth += 1
 
 
 def _with_prefixes(text: str) -> str:
     """``text`` with every namespace prefix that it uses and does not declare declared."""
-    root = _PROLOG.match(text)
+    root = _root(text)
     if root is None:
         return text
     used = set(re.findall(r"[<\s/]([A-Za-z_][\w.-]*):[A-Za-z_]", text))
     missing = used - set(re.findall(r"\sxmlns:([\w.-]+)\s*=", text)) - {"xml", "xmlns"}
     declarations = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(missing))
-    return text[: root.end()] + declarations + text[root.end() :]
+    return text[: root[1]] + declarations + text[root[1] :]

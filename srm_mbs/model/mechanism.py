@@ -29,6 +29,7 @@ from srm_mbs.model.pinocchio_constraints import (
     closures_from_pinocchio,
     to_pinocchio,
 )
+from srm_mbs.model.reach import Reach
 from srm_mbs.model.validation import (
     check_tree,
     checked_elements,
@@ -56,6 +57,8 @@ class Source:
         As used: the description's, unless the caller gave others.
     format
         Format of the file that held the links and joints.
+    reach
+        Which files its meshes may be, as the caller who loaded it decided; never saved.
     """
 
     description: str
@@ -65,6 +68,19 @@ class Source:
     base: str
     gravity: tuple[float, float, float]
     format: str = "URDF"
+    reach: Reach = field(default_factory=Reach, compare=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.reach, Reach):
+            raise InputError(
+                "the reach of a mechanism is not saved in files",
+                element="reach",
+                remedy="Give allow_outside to the function that loads it",
+            )
+
+    def entries(self) -> dict[str, Any]:
+        """The fields that are saved: all but the reach."""
+        return {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
 
 
 @dataclass(frozen=True)

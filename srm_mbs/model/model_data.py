@@ -12,13 +12,23 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
-LARGEST_COUNT = 100_000
-"""Joints or frames of a model."""
+MOST_JOINTS = 5_000
+"""Joints of a model: Pinocchio's matrices of it have as many rows and columns."""
+MOST_FRAMES = 20_000
+"""Frames or bodies of a model."""
 LONGEST_NAME = 1000
 """Characters of a name."""
 ORTHONORMAL = 1e-9
@@ -40,46 +50,76 @@ _PLAIN = (
 """Types of joints made without an axis; H joints have a pitch."""
 
 
+def plain_numbers(values: list[Any]) -> list[Any]:
+    """``values``, from JSON, if they are numbers; infinite ones and NaN among them.
+
+    One check of the list: pydantic would make an error of each of a million wrong items.
+    """
+    if not all(
+        type(value) is float or (type(value) is int and abs(value) < 2**63) for value in values
+    ):
+        raise ValueError("it does not consist of numbers")
+    return values
+
+
+def finite_numbers(values: list[Any]) -> list[Any]:
+    """``values``, from JSON, if they are finite numbers."""
+    if not np.isfinite(np.array(plain_numbers(values), dtype=float)).all():
+        raise ValueError("it has numbers that are no finite number")
+    return values
+
+
 def _orthonormal(numbers: list[float]) -> list[float]:
-    R = np.reshape(numbers[:9], (3, 3))
+    R = np.reshape(finite_numbers(numbers)[:9], (3, 3)).astype(float)
     if not np.allclose(R @ R.T, np.eye(3), atol=ORTHONORMAL, rtol=0) or np.linalg.det(R) < 0.0:
         raise ValueError("the first nine numbers are not a rotation")
     return numbers
 
 
 Name = Annotated[str, Field(max_length=LONGEST_NAME)]
-Index = Annotated[int, Field(ge=0, lt=LARGEST_COUNT, strict=True)]
+Index = Annotated[int, Field(ge=0, le=MOST_FRAMES, strict=True)]
 Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-Placement = Annotated[
-    list[FiniteFloat], Field(min_length=12, max_length=12), AfterValidator(_orthonormal)
-]
+Placement = Annotated[list[Any], Field(min_length=12, max_length=12), AfterValidator(_orthonormal)]
 """Rotation row by row, and translation."""
-InertiaNumbers = Annotated[list[FiniteFloat], Field(min_length=10, max_length=10)]
+InertiaNumbers = Annotated[
+    list[Any], Field(min_length=10, max_length=10), AfterValidator(finite_numbers)
+]
 """Mass, centre of mass (3), and I_xx, I_xy, I_xz, I_yy, I_yz, I_zz about it."""
-Numbers = list[Annotated[float, Field(allow_inf_nan=True)]]
+Numbers = Annotated[list[Any], AfterValidator(plain_numbers)]
+MOST_KEYS = 100
+"""Entries of an object, many more than any has: each wrong one makes an error of its own."""
 
 
-class _Data(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
+class StrictData(BaseModel):
+    """Data of strangers: no further entries, no other types, and few errors at a time."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_many(cls, values: Any) -> Any:
+        if isinstance(values, dict) and len(values) > MOST_KEYS:
+            raise ValueError(f"it has {len(values)} entries")
+        return values
 
 
-class JointTypeData(_Data):
+class JointTypeData(StrictData):
     """Type of a joint, and the numbers that it is made with."""
 
     type: str
-    axes: list[Vector3] = []
-    numbers: list[FiniteFloat] = []
-    parts: list[PartData] = []
+    axes: Annotated[list[Vector3], Field(max_length=2)] = []
+    numbers: Annotated[list[FiniteFloat], Field(max_length=3)] = []
+    parts: Annotated[list[PartData], Field(max_length=MOST_JOINTS)] = []
 
 
-class PartData(_Data):
+class PartData(StrictData):
     """A joint inside a composite joint."""
 
     kind: JointTypeData
     placement: Placement
 
 
-class JointData(_Data):
+class JointData(StrictData):
     """A joint, its parent, and the inertia that it carries."""
 
     name: Name
@@ -89,7 +129,7 @@ class JointData(_Data):
     inertia: InertiaNumbers
 
 
-class FrameData(_Data):
+class FrameData(StrictData):
     """A frame on a joint; ``inertia`` is its share of the joint's."""
 
     name: Name
@@ -100,15 +140,17 @@ class FrameData(_Data):
     inertia: InertiaNumbers
 
 
-class ModelData(_Data):
+class ModelData(StrictData):
     """A model: joints without the universe, frames without its first one, and vectors."""
 
     name: Name
     gravity: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
     base_inertia: InertiaNumbers
-    joints: Annotated[list[JointData], Field(max_length=LARGEST_COUNT)]
-    frames: Annotated[list[FrameData], Field(max_length=LARGEST_COUNT)]
-    vectors: dict[str, Numbers]
+    joints: Annotated[list[JointData], Field(max_length=MOST_JOINTS)]
+    frames: Annotated[list[FrameData], Field(max_length=MOST_FRAMES)]
+    bodies: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
+    """Pinocchio's count of bodies, the universe included; no computation reads it."""
+    vectors: Annotated[dict[Name, Numbers], Field(max_length=MOST_KEYS)]
 
 
 def _placement_numbers(placement: pin.SE3) -> list[float]:
@@ -183,6 +225,7 @@ def model_to_data(model: pin.Model) -> dict[str, Any]:
             }
             for frame in list(model.frames)[1:]
         ],
+        "bodies": int(model.nbodies),
         "vectors": {name: getattr(model, name).tolist() for name in VECTORS},
     }
 
@@ -250,7 +293,8 @@ def model_from_data(data: Any) -> pin.Model:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise _no_model(f"{where}: {first['msg']}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        raise _no_model(f"{where[:100]}: {message}" if where else message) from error
     except ValueError as error:
         raise _no_model(str(error)) from error
 
@@ -278,6 +322,8 @@ def _built(data: ModelData) -> pin.Model:
         kind = pin.FrameType.names[frame.type]
         at, share = _placement(frame.placement), _inertia(frame.inertia)
         model.addFrame(pin.Frame(frame.name, frame.joint, frame.parent, at, kind, share), False)
+    for _ in range(data.bodies - model.nbodies):
+        model.appendBodyToJoint(0, pin.Inertia.Zero(), pin.SE3.Identity())
     for i, inertia in enumerate([data.base_inertia, *(joint.inertia for joint in data.joints)]):
         model.inertias[i] = _inertia(inertia)
     if set(data.vectors) != set(VECTORS):

@@ -3,56 +3,70 @@
 Arrays are stored as they are; the rest (description, URDF, closures, settings, options of the run
 but Python functions) as one JSON text.  Nothing is pickled.  A run of several segments is one
 archive of the files of its segments.
+
+Format 5 holds a model made in Python as data (:mod:`srm_mbs.model.model_data`); format 4, which is
+read as well, as Pinocchio's archive.  :mod:`srm_mbs.simulation.saved_run` checks what is read.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import os
+import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.rows import Elimination
-from srm_mbs.dynamics.constraints.structure import Structure, row_names
-from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import InputError, get_logger
+from srm_mbs.formats.archive import (
+    LARGEST_CONTENT,
+    LARGEST_RATIO,
+    MOST_MEMBERS,
+    USUAL_CONTENT,
+    Archive,
+    content_of,
+    json_object,
+)
 from srm_mbs.formats.build import rebuild
-from srm_mbs.formats.files import write_bytes, writing
+from srm_mbs.formats.files import open_regular, writing
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import acting
 from srm_mbs.integration.kernel.dense_output import dense_output
-from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
-from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
-from srm_mbs.model.laws import LAW_TYPES, Curve, Law
+from srm_mbs.model.laws import Curve, Law
 from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.model.model_data import model_from_data, model_to_data
+from srm_mbs.model.pinocchio_archive import model_from_archive
+from srm_mbs.model.reach import Reach
+from srm_mbs.simulation import saved_run
 from srm_mbs.simulation.options import REPEATED, RunOptions
-from srm_mbs.simulation.result import ATTEMPT, Settings, SimulationResult, Statistics
+from srm_mbs.simulation.result import Settings, SimulationResult, Statistics
+from srm_mbs.simulation.saved_run import Arrays
 from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
 log = get_logger(__name__)
 
-FORMAT = 4
+FORMAT = 5
+ARCHIVED_MODEL_FORMAT = 4
+"""The format that holds models made in Python as archives of Pinocchio."""
 SEGMENTS_FORMAT = 1
+NO_REACH = Reach()
+"""No meshes are read but those that come with the package."""
 CONTENTS = "segments.json"
 """Entry of an archive of segments that describes the whole run."""
 SAVED_BY = "Give a file written by solution.save or srm-mbs simulate --out"
@@ -61,13 +75,9 @@ SAVE_ARRAYS = "Save the arrays t, q and v instead"
 LOST_CONTROLLER = "the controller"
 METHODS = {"PSRM": PSRM, "SRM": SRM}
 """Methods that are saved, by their kind."""
-ELEMENT_TYPES: dict[str, Any] = {**LAW_TYPES, **FORCE_TYPES}
-"""Elements that are saved with their type; the others follow from where they are."""
 STEP_ARRAYS = tuple(key.name for key in fields(StepData) if key.name not in ("zones", "stop"))
 STRUCTURE_VALUES = ("rank", "loop_rank", "sigma_ref", "samples", "notes")
 """Fields of :class:`Structure` that are neither arrays nor names of rows."""
-
-Arrays = dict[str, NDArray[Any]]
 
 
 # -- elements: closures, forces, drives, laws and anchors as JSON -----------------------------
@@ -79,21 +89,6 @@ def _plain(value: Any) -> Any:
         kind: dict[str, Any] = {"type": value.type} if isinstance(value, Law | ForceElement) else {}
         return kind | {key.name: _plain(getattr(value, key.name)) for key in fields(value)}
     return [_plain(part) for part in value] if isinstance(value, tuple) else value
-
-
-def _element(kind: Any, values: dict[str, Any]) -> Any:
-    """The element of the class ``kind`` from what :func:`_plain` made of it."""
-    return kind(**{key: _value(value) for key, value in values.items()})
-
-
-def _value(plain: Any) -> Any:
-    """A value of an element: an object is a law or force with its type, or else an anchor."""
-    if isinstance(plain, list):
-        return tuple(map(_value, plain))
-    if not isinstance(plain, dict):
-        return plain
-    values = dict(plain)
-    return _element(ELEMENT_TYPES[values.pop("type")] if "type" in values else Anchor, values)
 
 
 # -- options of the run -----------------------------------------------------------------------
@@ -128,37 +123,40 @@ def _request_entry(solution: SimulationResult) -> dict[str, Any] | None:
     return {"t_end": end, "options": options, "lost": lost}
 
 
-def _request(entry: dict[str, Any] | None) -> RunOptions | None:
+def _request(entry: saved_run.RequestEntry | None) -> RunOptions | None:
     """The options in a saved run; None if it has none."""
     if entry is None:
         return None
-    options = dict(entry["options"])
-    if LOST_CONTROLLER in entry["lost"]:
+    options = entry.options.model_dump()
+    if LOST_CONTROLLER in entry.lost:
         options["sample_time"] = None
     if isinstance(options["method"], dict):
         values = dict(options["method"])
         options["method"] = METHODS[values.pop("kind")](**values)
-    return RunOptions(entry["t_end"], **options, lost=tuple(entry["lost"]))
+    return RunOptions(entry.t_end, **options, lost=tuple(entry.lost))
 
 
 # -- writing ----------------------------------------------------------------------------------
 
 
-def save_solution(solution: SimulationResult, path: Path) -> None:
+def save_solution(solution: SimulationResult, path: Path, full_paths: bool = False) -> None:
     """Write a run of one segment to ``path``; see :meth:`srm_mbs.Solution.save`.
 
     Raises
     ------
     InputError
-        If the run used a tableau that is not in TABLEAUS, or a closure type of one's own.
+        If the run used a tableau that is not in TABLEAUS, or a closure type of one's own; if it is
+        too large to be read again.
     OSError
-        If the file cannot be written.
+        If the file cannot be written; the file that was there is then as it was.
     """
-    write_bytes(path, _archive(solution, path))
+    (segment,) = _packed([_run_arrays(solution, path, full_paths)], path)
+    with writing(path) as file:
+        file.write(segment)
     log.info("written: %s", path)
 
 
-def save_segments(solution: SegmentedResult, path: Path) -> None:
+def save_segments(solution: SegmentedResult, path: Path, full_paths: bool = False) -> None:
     """Write a run of several segments to ``path``.
 
     Raises
@@ -174,16 +172,77 @@ def save_segments(solution: SegmentedResult, path: Path) -> None:
         "request": _request_entry(solution),
         "t_eval": None if solution.t_eval is None else solution.t_eval.tolist(),
     }
-    segments = [_archive(segment, path) for segment in solution.segments]
+    segments = _packed(
+        [_run_arrays(segment, path, full_paths) for segment in solution.segments], path
+    )
     with writing(path) as file, zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(CONTENTS, json.dumps(contents))
+        archive.writestr(CONTENTS, json.dumps(contents, default=float))
         for k, segment in enumerate(segments):
             archive.writestr(f"{k}.npz", segment)
     log.info("written: %s", path)
 
 
-def _archive(solution: SimulationResult, path: Path) -> bytes:
-    """The ``.npz`` of a run of one segment; messages call it ``path``."""
+def _packed(segments: Sequence[dict[str, Any]], path: Path) -> list[bytes]:
+    """The ``.npz`` of each segment, from its arrays; compressed, unless they compress so far that
+    reading takes them for an attack."""
+    # What is in an archive inside another counts twice.
+    content = 2 * sum(map(content_of, segments))
+    if content > LARGEST_CONTENT or max(map(len, (*segments, segments))) > MOST_MEMBERS:
+        raise InputError(
+            f"the run has {content / 2e6:.0f} MB in {len(segments)} segments, more than is read",
+            file=str(path),
+            remedy=SAVE_ARRAYS,
+        )
+    packed = [_npz(arrays, np.savez_compressed) for arrays in segments]
+    if content > max(USUAL_CONTENT, LARGEST_RATIO * sum(map(len, packed))):
+        packed = [_npz(arrays, np.savez) for arrays in segments]
+    return packed
+
+
+def _npz(arrays: dict[str, Any], write: Any) -> bytes:
+    file = io.BytesIO()
+    write(file, **arrays)
+    return file.getvalue()
+
+
+_FOLDER = r"(?:file://)?(?:/|[A-Za-z]:[\\/])(?:[^\"'<>\n]*[\\/])?"
+_FILE_KEYS = "urdf|sdf|mjcf|gepetto|table|file|filename"
+_FULL_NAME = re.compile(rf"""(\b(?:{_FILE_KEYS})\s*=\s*["']){_FOLDER}(?=[^"'/\\])""")
+
+
+def _file_name(path: str) -> str:
+    return re.split(r"[\\/]", path)[-1]
+
+
+def _without_folders(text: str, source: Source) -> str:
+    """``text`` with the files of the model named relative to its folders, and other files by their
+    name alone."""
+    for file in (source.urdf_path, source.path):
+        folder = os.path.dirname(file)
+        for absolute in {folder, os.path.abspath(folder), os.path.realpath(folder)}:
+            if os.path.isabs(absolute) and absolute != os.path.dirname(absolute):
+                text = text.replace(f"file://{absolute}/", "").replace(f"{absolute}{os.sep}", "")
+    return _FULL_NAME.sub(r"\1", text)
+
+
+def _source_entry(source: Source, full_paths: bool) -> dict[str, Any]:
+    """``source`` as JSON, without the folders that its files lay in unless asked for."""
+    entry = source.entries()
+    if not full_paths:
+        entry |= {key: _without_folders(entry[key], source) for key in ("description", "urdf")}
+        entry |= {key: _file_name(entry[key]) for key in ("path", "urdf_path")}
+    return entry
+
+
+def _notes(mechanism: Mechanism, full_paths: bool) -> list[str]:
+    source = mechanism.source
+    if source is None or full_paths:
+        return list(mechanism.notes)
+    return [_without_folders(note, source) for note in mechanism.notes]
+
+
+def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dict[str, Any]:
+    """The arrays of a run of one segment, its JSON text among them; messages call it ``path``."""
     mechanism = solution.mechanism
     own = [loop.type_name for loop in mechanism.loops if not isinstance(loop.type, str)]
     refused = [f"closure type {name!r}" for name in own]
@@ -195,22 +254,22 @@ def _archive(solution: SimulationResult, path: Path) -> bytes:
             file=str(path),
             remedy=SAVE_ARRAYS,
         )
-    structure = mechanism.structure
+    structure, source = mechanism.structure, mechanism.source
     zones = solution.steps.zones
     meta = {
         "format": FORMAT,
         "pin": pin.__version__,
         "mechanism": {
             "name": mechanism.name,
-            "source": None if mechanism.source is None else asdict(mechanism.source),
-            "model": mechanism.model.saveToString() if mechanism.source is None else None,
+            "source": None if source is None else _source_entry(source, full_paths),
+            "model": model_to_data(mechanism.model) if source is None else None,
             "loops": [_plain(loop) for loop in mechanism.loops],
             "forces": [_plain(force) for force in mechanism.forces if force.type in FORCE_TYPES],
             "drives": [_plain(drive) for drive in mechanism.drives],
             "drive_starts": _drive_starts(solution),
             "friction_speed": mechanism.friction_speed,
             "defaults": asdict(mechanism.defaults),
-            "notes": mechanism.notes,
+            "notes": _notes(mechanism, full_paths),
         },
         "structure": {name: getattr(structure, name) for name in STRUCTURE_VALUES}
         | {"length": structure.units.length, "rate": structure.units.rate},
@@ -243,9 +302,7 @@ def _archive(solution: SimulationResult, path: Path) -> bytes:
         "eliminations": np.array(structure.eliminations, dtype=float).reshape(-1, 3),
         "coordinate_unit": structure.units.coordinate,
     }
-    file = io.BytesIO()
-    np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
-    return file.getvalue()
+    return {"meta": np.array(json.dumps(meta, default=float)), **arrays}
 
 
 def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
@@ -258,27 +315,34 @@ def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
 # -- reading ----------------------------------------------------------------------------------
 
 
-def load_result(path: Path, types: ResultTypes[R]) -> R:
+def load_result(path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
     """Read a saved run; see :func:`srm_mbs.load_solution`.
 
     Parameters
     ----------
     types
         Classes of the result.
+    reach
+        Where its animations may read meshes, which the file does not decide.
 
     Raises
     ------
     InputError
-        If the file is missing, is no saved run, or is of another format.
+        If the file is missing, is no saved run, is of another format, or unpacks to more than
+        :mod:`srm_mbs.formats.archive` allows.
     """
+    with _naming(str(path)), open_regular(path, LARGEST_CONTENT) as file:
+        return load_from(file, path, types, reach)
+
+
+def load_from(file: IO[bytes], path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
+    """As :func:`load_result`, from an open file; ``path`` names it, and its folder is searched for
+    meshes."""
     with _naming(str(path)):
-        file = io.BytesIO(path.read_bytes())
-        if not zipfile.is_zipfile(file):  # NumPy would speak of pickles, and how to trust them
-            raise ValueError("no archive of arrays")
-        with zipfile.ZipFile(file) as archive:
-            if CONTENTS in archive.namelist():
-                return _segments(archive, path, types)
-        return _one_segment(file, types.plain)
+        archive = Archive(file)
+        if CONTENTS in archive.names:
+            return _segments(archive, path, types, reach)
+        return run_from(archive.arrays(), path, types.plain, reach)
 
 
 @contextmanager
@@ -286,8 +350,6 @@ def _naming(name: str) -> Iterator[None]:
     """Turns every error of reading a saved run into an :class:`InputError` about ``name``."""
     try:
         yield
-    except FileNotFoundError as error:
-        raise InputError("there is no such file", file=name, remedy="Check the path") from error
     except OSError as error:
         raise InputError(
             f"it cannot be read: {error.strerror or error}", file=name, remedy=SAVED_BY
@@ -298,167 +360,155 @@ def _naming(name: str) -> Iterator[None]:
         raise InputError(f"it is not a saved run: {error}", file=name, remedy=SAVED_BY) from error
 
 
-def _check_format(what: str, found: int, known: int) -> None:
-    if found != known:
-        raise InputError(f"{what} format {found}, this version reads {known}", remedy=OTHER_VERSION)
+def _check_format(what: str, found: Any, known: tuple[int, ...]) -> None:
+    if type(found) is not int or found not in known:
+        raise InputError(
+            f"{what} format {str(found)[:20]}, this version reads {known[0]}", remedy=OTHER_VERSION
+        )
 
 
-def _segments(archive: zipfile.ZipFile, path: Path, types: ResultTypes[R]) -> R:
+def _segments(archive: Archive, path: Path, types: ResultTypes[R], reach: Reach) -> R:
     """A run of several segments."""
-    contents = json.loads(archive.read(CONTENTS))
-    _check_format("its segments have", contents["format"], SEGMENTS_FORMAT)
-    segments = []
-    for k in range(contents["count"]):
+    contents = json_object(archive.read(CONTENTS), CONTENTS)
+    _check_format("its segments have", contents.get("format"), (SEGMENTS_FORMAT,))
+    entry = saved_run.checked_entry(saved_run.SegmentsEntry, contents)
+    if entry.count != len(archive.names) - 1:
+        raise ValueError(f"it has {len(archive.names) - 1} segments, not {entry.count}")
+    budget = archive.budget - archive.content
+    segments: list[R] = []
+    for k in range(entry.count):
         with _naming(f"{path}, segment {k}"):
-            segments.append(_one_segment(io.BytesIO(archive.read(f"{k}.npz")), types.plain))
-    t_eval = contents["t_eval"]
-    whole = types.segmented(
-        segments,
-        t_eval=None if t_eval is None else np.array(t_eval),
-        status=contents["status"],
-        message=contents["message"],
-    )
-    whole.request = _request(contents.get("request"))
+            inner = Archive(io.BytesIO(archive.read(f"{k}.npz")), budget)
+            budget -= inner.content
+            segments.append(run_from(inner.arrays(), path, types.plain, reach))
+            _check_continues(segments)
+    start = float(segments[0].steps.times[0])
+    t_eval = None
+    if entry.t_eval is not None:
+        t_eval = saved_run.output_times_from({"t_eval": np.array(entry.t_eval, float)}, start)
+    whole = types.segmented(segments, t_eval=t_eval, status=entry.status, message=entry.message)
+    whole.request = _request(entry.request)
     return whole
 
 
-def _one_segment(file: io.BytesIO, result_type: type[R]) -> R:
-    """A run of one segment."""
-    with np.load(file, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    if "meta" not in arrays:
-        raise ValueError(f"it has the arrays {', '.join(arrays)} only")
-    meta = json.loads(str(arrays.pop("meta")))
-    _check_format("it has", meta["format"], FORMAT)
-    mechanism = _mechanism(meta["mechanism"], arrays)
-    # The analysis of the run itself, so that the dense output is the same to the last bit.
-    mechanism = mechanism.with_structure(_structure(mechanism, meta["structure"], arrays))
-    zones = {
-        int(index): (
-            float(threshold),
-            MultiplierHistory(arrays[f"zone_{k}_times"], arrays[f"zone_{k}_values"]),
+def _check_continues(segments: Sequence[SimulationResult]) -> None:
+    """Refuse a last segment that is not one of the same run as the first, after the one before."""
+    first, last = segments[0], segments[-1]
+    sizes = [
+        (
+            segment.mechanism.model.nq,
+            segment.mechanism.model.nv,
+            segment.scheme.name,
+            None if segment.t_events is None else len(segment.t_events),
         )
-        for k, (index, threshold) in enumerate(meta["zones"])
-    }
-    if arrays["attempts"].dtype != ATTEMPT:
-        raise ValueError(f"attempts has the fields {arrays['attempts'].dtype}")
-    steps = StepData(**{name: arrays[name] for name in STEP_ARRAYS}, zones=zones, stop=meta["stop"])
-    tuples = {key: tuple(meta["settings"][key]) for key in ("atol", "singular_times")}
-    settings = Settings(**meta["settings"] | tuples)
+        for segment in (first, last)
+    ]
+    if sizes[0] != sizes[1]:
+        raise ValueError("it has another model, tableau or number of events than the first segment")
+    if len(segments) > 1 and last.span[0] < segments[-2].span[1]:
+        raise ValueError("it begins before the end of the segment before it")
+
+
+def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach = NO_REACH) -> R:
+    """The run of one segment in the ``arrays`` of the file ``path``.
+
+    Raises
+    ------
+    InputError, ValueError
+        If they are none.
+    """
+    if "meta" not in arrays:
+        raise ValueError(f"it has the arrays {', '.join(arrays)[:200]} only")
+    text = arrays["meta"]
+    if text.dtype.kind != "U" or text.shape != ():
+        raise ValueError("meta is no text")
+    meta = json_object(str(text[()]), "meta")
+    _check_format("it has", meta.get("format"), (FORMAT, ARCHIVED_MODEL_FORMAT))
+    entry = saved_run.checked_entry(saved_run.RunEntry, meta)
+    mechanism = _mechanism(entry, arrays, path, reach)
+    # The analysis of the run itself, so that the dense output is the same to the last bit.
+    structure = saved_run.structure_from(mechanism, entry.structure, arrays)
+    mechanism = mechanism.with_structure(structure)
+    settings = Settings(
+        **entry.settings.model_dump()
+        | {key: tuple(getattr(entry.settings, key)) for key in ("atol", "singular_times")}
+    )
+    if len(settings.atol) not in (1, 2 * mechanism.model.nv):
+        raise ValueError(f"settings.atol has {len(settings.atol)} numbers")
     scheme = get_tableau(settings.tableau)
-    _check_shapes(mechanism, scheme, steps)
-    system = make_system(mechanism, _held(arrays, mechanism.model.nv))
+    steps = saved_run.steps_from(mechanism, scheme, entry, arrays)
+    events = saved_run.events_from(mechanism.model, entry.events, steps, arrays)
+    system = make_system(mechanism, saved_run.held_from(arrays, mechanism.model.nv))
     solution = result_type(
         mechanism,
         system,
         scheme,
         steps,
         dense=dense_output(system, scheme, steps, settings.backend),
-        t_eval=arrays.get("t_eval"),
-        attempts=arrays["attempts"],
-        events=_events(meta["events"], arrays),
-        status=meta["status"],
-        message=meta["message"],
-        stats=Statistics(**meta["stats"]),
+        t_eval=saved_run.output_times_from(arrays, float(steps.times[0])),
+        attempts=saved_run.attempts_from(arrays),
+        events=events,
+        status=entry.status,
+        message=entry.message,
+        stats=Statistics(**entry.stats.model_dump()),
         settings=settings,
     )
-    solution.request = _request(meta.get("request"))
+    solution.request = _request(entry.request)
     return solution
 
 
-def _mechanism(entry: dict[str, Any], arrays: Arrays) -> Mechanism:
-    if entry["source"] is not None:
-        source = Source(**entry["source"] | {"gravity": tuple(entry["source"]["gravity"])})
-        model = rebuild(source).model
-    else:
-        source, model = None, pin.Model()
-        model.loadFromString(entry["model"])
+def _model_of(entry: saved_run.RunEntry) -> pin.Model:
+    """The model of a mechanism made in Python."""
+    model = entry.mechanism.model
+    if entry.format == ARCHIVED_MODEL_FORMAT and isinstance(model, str):
+        return model_from_archive(model)
+    if entry.format == FORMAT and isinstance(model, dict):
+        return model_from_data(model)
+    raise ValueError("it has neither the source of its mechanism nor its model")
+
+
+def _source(entry: saved_run.SourceEntry, path: Path, reach: Reach) -> Source:
+    """The source of the mechanism in the file ``path``: its meshes are looked for beside that
+    file, wherever the URDF lay when it was written."""
+    values = entry.model_dump() | {
+        "gravity": tuple(entry.gravity),
+        "urdf_path": str(path.parent / _file_name(entry.urdf_path)),
+        "reach": reach,
+    }
+    return Source(**values)
+
+
+def _mechanism(run: saved_run.RunEntry, arrays: Arrays, path: Path, reach: Reach) -> Mechanism:
+    entry = run.mechanism
+    source = None if entry.source is None else _source(entry.source, path, reach)
+    model = _model_of(run) if source is None else rebuild(source).model
+    q0, v0 = saved_run.checked_start(arrays, model)
+    forces = tuple(map(saved_run.value_of, entry.forces))
+    if not all(isinstance(force, ForceElement) for force in forces):
+        raise ValueError("one of its forces is no force")
     mechanism = Mechanism(
         model,
-        tuple(_element(LoopClosure, loop) for loop in entry["loops"]),
-        q0=arrays["q0"],
-        v0=arrays["v0"],
-        forces=tuple(map(_value, entry["forces"])),
-        drives=tuple(_element(Drive, drive) for drive in entry["drives"]),
-        friction_speed=entry["friction_speed"],
-        name=entry["name"],
+        tuple(saved_run.element(LoopClosure, loop) for loop in entry.loops),
+        q0=q0,
+        v0=v0,
+        forces=forces,
+        drives=tuple(saved_run.element(Drive, drive) for drive in entry.drives),
+        friction_speed=entry.friction_speed,
+        name=entry.name,
         source=source,
-        defaults=SimulationDefaults(**entry["defaults"]),
-        notes=tuple(entry["notes"]),
+        defaults=SimulationDefaults(**entry.defaults.model_dump()),
+        notes=tuple(entry.notes),
     )
-    if entry.get("drive_starts"):
-        curves = _drive_curves(mechanism.drives, entry["drive_starts"])
-        return mechanism.with_drive_curves(curves)
+    if entry.drive_starts:
+        return mechanism.with_drive_curves(_drive_curves(mechanism.drives, entry.drive_starts))
     return mechanism
 
 
 def _drive_curves(drives: tuple[Drive, ...], starts: dict[str, float]) -> dict[str, Curve]:
     curves = {}
     for drive in drives:
+        if drive.name not in starts:
+            raise ValueError(f"drive_starts lacks the drive {drive.name!r}")
         curve = drive.curve(starts[drive.name])
         curves[drive.name] = curve.shifted(starts[drive.name] - curve(0.0)[0])
     return curves
-
-
-def _structure(mechanism: Mechanism, entry: dict[str, Any], arrays: Arrays) -> Structure:
-    eliminations = arrays.get("eliminations", np.zeros((0, 3))).tolist()
-    values = {name: entry[name] for name in STRUCTURE_VALUES}
-    return Structure(
-        row_names(mechanism),
-        arrays["row_scale"],
-        arrays["kept"],
-        **values | {"notes": tuple(entry["notes"])},
-        units=Units(entry["length"], arrays["coordinate_unit"], entry["rate"]),
-        eliminations=tuple(Elimination(int(i), int(j), factor) for i, j, factor in eliminations),
-    )
-
-
-def _events(count: int | None, arrays: Arrays) -> tuple[list[FloatArray], list[FloatArray]] | None:
-    if count is None:
-        return None
-    times = [arrays[f"event_{k}_times"] for k in range(count)]
-    states = [arrays[f"event_{k}_states"] for k in range(count)]
-    for k in range(count):
-        expected = (len(times[k]), arrays["states"].shape[1])
-        if times[k].ndim != 1 or states[k].shape != expected:
-            raise ValueError(f"event_{k}_states has shape {states[k].shape}, not {expected}")
-    return times, states
-
-
-def _held(arrays: Arrays, nv: int) -> HeldForce | None:
-    """The output of a sampled controller."""
-    if "held_times" not in arrays:
-        return None
-    times, values = arrays["held_times"], arrays["held_values"]
-    if values.shape != (len(times), nv) or not len(times):
-        raise ValueError(f"held_values has shape {values.shape}, not {(len(times), nv)}")
-    held = HeldForce()
-    for t, value in zip(times.tolist(), values):
-        held.hold(t, value)
-    return held
-
-
-def _check_shapes(mechanism: Mechanism, scheme: ButcherTableau, steps: StepData) -> None:
-    """Refuse arrays that do not belong together, before anything reads them."""
-    n, s = steps.count, scheme.n_stages
-    nq, m = mechanism.model.nq, 2 * mechanism.model.nv
-    expected = {
-        "states": (n + 1, nq + m // 2),
-        "sigmas": (n, s + 1),
-        "ranks": (n,),
-        "error_ratios": (n,),
-        "placements": (n,),
-        "held": (n,),
-        "end_rate": (m,),
-        "break_rates": (len(steps.breaks), m),
-    }
-    for name, shape in expected.items():
-        if getattr(steps, name).shape != shape:
-            raise ValueError(f"{name} has shape {getattr(steps, name).shape}, not {shape}")
-    # Methods with sweeps store the extra stages of the dense output as well.
-    if steps.rates.shape not in ((n, s + 1, m), (n, scheme.dense.n_rates, m)):
-        raise ValueError(f"rates has shape {steps.rates.shape}, not {(n, s + 1, m)}")
-    if steps.corrections.shape not in ((n, m), (n, 0)):
-        raise ValueError(f"corrections has shape {steps.corrections.shape}")
-    if steps.stop is not None and not (n and steps.times[-2] <= steps.stop <= steps.times[-1]):
-        raise ValueError(f"the run cannot have stopped at {steps.stop!r} s")

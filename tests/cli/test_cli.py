@@ -390,3 +390,31 @@ def test_rounding_of_the_assembly_is_shown_as_zero() -> None:
     noisy = srm.Mechanism(mechanism.model, q0=q, v0=np.array([1e-14, 0.5, -1e-20]))
     shown = [row[2:] for row in joint_rows(noisy)]
     assert shown == [("1 rad", "0 rad/s"), ("0 rad", "0.5 rad/s"), ("0 rad", "0 rad/s")]
+
+
+@pytest.mark.parametrize(
+    ("project", "packages"),
+    [
+        (None, True),
+        ('[project]\nname = "another"', True),
+        ('[project]\nname = "srm-mbs"', False),
+        ('project = "srm-mbs"', True),
+        ("[project", True),
+        ("a = " + "[" * 100_000, True),
+    ],
+)
+def test_the_benchmark_of_a_folder_that_is_no_checkout_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: str | None, packages: bool
+) -> None:
+    folder = tmp_path / "benchmarks" / "work_precision"
+    folder.mkdir(parents=True)
+    (folder / "__main__.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    if project is not None:
+        (tmp_path / "pyproject.toml").write_text(project)
+    if packages:
+        (tmp_path / "srm_mbs").mkdir()
+        for package in (folder, folder.parent, tmp_path / "srm_mbs"):
+            (package / "__init__.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    assert "Run it at the top of a checkout of the source" in run("benchmark", status=2)
+    assert not (tmp_path / "ran").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -336,7 +337,7 @@ def test_what_is_no_file_of_a_mechanism_is_named(
     def denied(*_: Any, **__: Any) -> str:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_text", denied)
+    monkeypatch.setattr(os, "open", denied)
     for name in ("secret.toml", "secret.urdf"):
         load(name, name)
     monkeypatch.undo()

@@ -141,7 +141,19 @@ def test_tables_are_found_from_the_new_place(tmp_path: Path) -> None:
     path.write_text(f'format = 1\nurdf = "robot.urdf"\n{drive}')
     (tmp_path / "deep").mkdir()
     description, _, _ = srm.convert(path, tmp_path / "deep" / "out.toml")
-    assert srm.load(description).drives == srm.load(path).drives != ()
+    copy = srm.load(description, allow_outside=True)
+    assert copy.drives == srm.load(path).drives != ()
+
+
+def test_files_that_stay_in_other_folders_are_noted(tmp_path: Path) -> None:
+    mesh = '<visual><geometry><mesh filename="a.stl"/></geometry></visual></link>'
+    (tmp_path / "robot.urdf").write_text(tree().replace("</link>", mesh, 1))
+    (tmp_path / "deep").mkdir()
+    notes = srm.convert(tmp_path / "robot.urdf", tmp_path / "deep" / "out.toml")[2]
+    assert any("../a.stl" in note and "allow_outside" in note for note in notes)
+    assert not any(
+        "a.stl" in n for n in srm.convert(tmp_path / "robot.urdf", tmp_path / "o.toml")[2]
+    )
 
 
 def test_nothing_is_overwritten_unless_asked_for(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from defusedxml import ElementTree as SafeTree
 
 import srm_mbs as srm
 from srm_mbs.formats import csv_table
+from srm_mbs.formats import files as reading
 from tests.support import sdf_files
 from tests.support.mjcf_files import FOUR_BAR
 from tests.support.urdf_files import tree
@@ -48,12 +49,12 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[Any]:
 
         monkeypatch.setattr(owner, name, counting)
 
-    count(Path, "read_text", lambda path, *_: path.name)
+    count(reading, "open_regular", lambda path, *_: Path(path).name)
     count(csv_table, "read_csv", lambda path: path.name)
     for owner, name, language in (
         (tomllib, "loads", "TOML"),
-        (SafeTree, "fromstring", "XML"),
-        (yaml, "safe_load", "YAML"),
+        (SafeTree.DefusedXMLParser, "close", "XML"),
+        (yaml, "load", "YAML"),
     ):
         count(owner, name, lambda *_, language=language: language)
     count(srm.Mechanism, "__post_init__", lambda *_: "mechanism")

@@ -46,7 +46,7 @@ def again(model: pin.Model) -> pin.Model:
 
 
 def assert_same(model: pin.Model, other: pin.Model) -> None:
-    """All but the count of bodies, which Pinocchio's dynamics do not read."""
+    assert model == other
     assert model_to_data(model) == model_to_data(other)
     for name in ("joints", "inertias", "jointPlacements", "frames", "names", "parents"):
         assert list(getattr(model, name)) == list(getattr(other, name)), name
@@ -114,6 +114,9 @@ def changed(change: Any) -> Any:
         (lambda d: d["joints"][0]["placement"].__setitem__(0, 2.0), "not a rotation"),
         (lambda d: d["joints"][0]["inertia"].__setitem__(0, -1.0), "negative mass"),
         (lambda d: d["joints"][0]["inertia"].__setitem__(0, float("nan")), "finite number"),
+        (lambda d: d["joints"][0]["inertia"].__setitem__(0, 10**400), "consist of numbers"),
+        (lambda d: d["joints"][0]["kind"].update(axes=[[None] * 10**6]), "at most 3 items"),
+        (lambda d: d.update({f"{k}": 0 for k in range(1000)}), "it has 1007 entries"),
         (lambda d: d["joints"][0].update(name="x" * 2000), "at most 1000 characters"),
         (lambda d: d["frames"][3].update(joint=9), "on no joint"),
         (lambda d: d["frames"][3].update(parent=7), "on no joint or frame before it"),

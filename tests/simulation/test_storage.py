@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import errno
+import json
+import os
 import pickle
+import re
 import shutil
+import tracemalloc
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.formats import archive
+from srm_mbs.simulation import storage
+from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
 from tests.support.mechanisms import floating_ring
 from tests.support.snapshots import check_messages, refused
 
@@ -47,7 +57,11 @@ def test_a_saved_run_interpolates_to_the_last_bit(name: str, tmp_path: Path) -> 
     assert loaded.crossings == solution.crossings
     assert np.array_equal(loaded.attempts, solution.attempts)
     assert loaded.t_events is None
-    assert loaded.mechanism.source == solution.mechanism.source
+    assert loaded.mechanism.source == replace(
+        solution.mechanism.source,
+        path=Path(solution.mechanism.source.path).name,
+        urdf_path=str(tmp_path / Path(solution.mechanism.source.urdf_path).name),
+    )
 
 
 def test_a_run_through_the_zone_interpolates_to_the_last_bit(tmp_path: Path) -> None:
@@ -175,7 +189,7 @@ def test_files_that_are_no_runs_are_refused_by_name(tmp_path: Path) -> None:
         "event_0_states": lambda array: array[:, 1:],
         "attempts": lambda array: np.zeros((2, 2)),
         "times": lambda array: array + 1.0,
-        "meta": lambda meta: np.array(str(meta).replace('{"format": 4,', '{"format": 1,')),
+        "meta": lambda meta: np.array(str(meta).replace('{"format": 5,', '{"format": 1,')),
     }.items():
         solution.save(tmp_path / "run.npz")
         with np.load(tmp_path / "run.npz") as file:
@@ -282,3 +296,296 @@ def test_a_pickled_segment_keeps_the_motion_of_its_drives() -> None:
     other = pickle.loads(pickle.dumps(run))
     assert other.drift.max() < 1e-9
     assert np.array_equal(other.drive_forces["crank"], run.drive_forces["crank"])
+
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+@pytest.mark.parametrize("name", ["four_bar", "ring"])
+def test_runs_of_format_4_still_load(name: str, tmp_path: Path) -> None:
+    old = srm.load_solution(DATA / f"{name}_format_4.npz")
+    assert old.status == "finished"
+    assert np.ptp(old.energy) < 1e-4 * np.abs(old.energy).max()
+    assert old.drift.max() < 1e-9
+    t = np.linspace(*old.span, 7)
+
+    new = reloaded(old, tmp_path)
+
+    for ours, theirs in zip(new(t), old(t)):
+        assert np.array_equal(ours, theirs)
+    assert new.mechanism.model == old.mechanism.model
+
+
+def changed_run(folder: Path, **changes: Any) -> Path:
+    """A saved run with other arrays; a change is a function of an array, or of the JSON text."""
+    srm.simulate(srm.load("four_bar"), 0.2, events=stop).save(folder / "run.npz")
+    with np.load(folder / "run.npz") as file:
+        arrays = dict(file)
+    for name, change in changes.items():
+        if name == "meta":
+            meta = json.loads(str(arrays["meta"]))
+            change(meta)
+            arrays["meta"] = np.array(json.dumps(meta))
+        else:
+            arrays[name] = change(arrays[name])
+    np.savez(folder / "changed.npz", **arrays)
+    return folder / "changed.npz"
+
+
+def setting(path: str, value: Any) -> Any:
+    """A change of one entry of the JSON text."""
+
+    def change(meta: Any) -> None:
+        *keys, last = path.split(".")
+        for key in keys:
+            meta = meta[int(key) if key.isdigit() else key]
+        meta[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        ("structure.rank", 10**6, "the ranks 2 of the loops and 1000000 of all rows"),
+        ("structure.rank", -1, "structure.rank: Input should be greater than or equal to 0"),
+        ("structure.rank", 1.5, "structure.rank"),
+        ("structure.loop_rank", 3, "the ranks 3"),
+        ("structure.sigma_ref", 0.0, "structure.sigma_ref"),
+        ("structure.sigma_ref", float("nan"), "structure.sigma_ref"),
+        ("structure.length", -1.0, "structure.length"),
+        ("settings.atol", [1e-6], None),
+        ("settings.atol", [1e-6, 1e-6], "settings.atol has 2 numbers"),
+        ("settings.atol", ["1e-6"], "settings.atol: .*does not consist of numbers"),
+        ("settings.tableau", "none", "there is no tableau"),
+        ("settings.backend", "other", "settings.backend"),
+        ("stats.steps", -1, "stats.steps"),
+        ("status", "perhaps", "status"),
+        ("stop", 1e9, "cannot have stopped"),
+        ("zones", [[0, 0.1]], "it has no zone_0_times"),
+        ("zones", [[-1, 0.1]], "zones: .*are negative"),
+        ("events", 2, "it has no event_1_times"),
+        ("events", 10**18, "it has no event_1_times"),
+        ("mechanism.loops.0.a.xyz", [1.0, float("inf"), 0.0], "not finite"),
+        ("mechanism.loops.0.a", {"link": 5}, "Anchor.link"),
+        ("mechanism.loops.0.name", 7, "LoopClosure.name"),
+        ("mechanism.loops.0.other", 7, "no field 'other'"),
+        ("mechanism.forces", [{"type": "user", "name": "f"}], "no element of the type 'user'"),
+        ("mechanism.forces", [{"link": "crank"}], "is no force"),
+        ("mechanism.friction_speed", 0.0, "friction_speed"),
+        ("mechanism.source", None, "neither the source of its mechanism nor its model"),
+        ("request.options.method", {"kind": "PSRM", "tableau": "none"}, "there is no tableau"),
+        ("request.options.backend", [], "request.options.backend"),
+        ("format", "5", "it has format 5"),
+        ("unknown", 1, "unknown: Extra inputs"),
+    ],
+)
+def test_entries_of_another_kind_or_size_are_refused(
+    tmp_path: Path, path: str, value: Any, says: str | None
+) -> None:
+    file = changed_run(tmp_path, meta=setting(path, value))
+    if says is None:
+        assert len(srm.load_solution(file).t) > 1
+        return
+    with pytest.raises(srm.InputError, match=says) as caught:
+        srm.load_solution(file)
+    assert caught.value.file == str(file)
+    assert "pydantic" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("row_scale", lambda a: a[:, None], "row_scale has shape"),
+        ("row_scale", lambda a: 0.0 * a, "row_scale has values that are not positive"),
+        ("row_scale", lambda a: a.astype("f4"), "items of the type float32"),
+        ("kept", lambda a: a.astype(float), "items of the type float64"),
+        ("kept", lambda a: ~a, "the ranks"),
+        ("coordinate_unit", lambda a: -a, "not positive"),
+        ("eliminations", lambda a: np.array([[0.0, 99.0, 1.0]]), "outside 0 to"),
+        ("eliminations", lambda a: np.array([[0.0, 0.5, 1.0]]), "no whole numbers"),
+        ("eliminations", lambda a: np.array([[1.0, 1.0, 1.0]]), "from itself"),
+        ("times", lambda a: a[::-1], "times does not increase"),
+        ("times", lambda a: a[:0], "times is empty"),
+        ("times", lambda a: a * np.nan, "not finite"),
+        ("states", lambda a: a + 1e200, "too large"),
+        ("rates", lambda a: a[:, :3], "rates has shape"),
+        ("breaks", lambda a: np.array([-1]), "outside 1 to"),
+        ("breaks", lambda a: np.array([1, 1]), "does not increase"),
+        ("placements", lambda a: a + 7.0, "placements has values outside 0 to 2"),
+        ("ranks", lambda a: a + 0.5, "no whole numbers"),
+        ("sigmas", lambda a: -a, "outside 0 to"),
+        ("event_0_times", lambda a: a + 9.0, "event_0_times has values outside"),
+        ("attempts", lambda a: np.zeros(1, a.dtype), "no attempt has"),
+        ("q0", lambda a: a[:-1], "q0 has shape"),
+    ],
+)
+def test_arrays_of_another_shape_type_or_range_are_refused(
+    tmp_path: Path, name: str, change: Any, says: str
+) -> None:
+    with pytest.raises(srm.InputError, match=says):
+        srm.load_solution(changed_run(tmp_path, **{name: change}))
+
+
+def test_saved_runs_name_no_folders_unless_asked_for(tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    (secret / "meshes").mkdir(parents=True)
+    source = srm.load("four_bar").source
+    assert source is not None
+    meshes = "".join(
+        f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+        for name in (
+            f"{secret}/meshes/a.stl",
+            f"file://{secret}/meshes/b.stl",
+            "/other/c.stl",
+            "meshes/d.stl",
+            "package://robot/e.stl",
+        )
+    )
+    (secret / "bar.urdf").write_text(
+        source.urdf.replace('<link name="crank">', f'<link name="crank">{meshes}')
+    )
+    text = source.description.replace("../urdf/four_bar.urdf", f"{secret}/bar.urdf")
+    (secret / "bar.toml").write_text(text)
+    solution = srm.simulate(srm.load(secret / "bar.toml"), 0.1)
+
+    def texts(**options: Any) -> str:
+        solution.save(tmp_path / "run.npz", **options)
+        with np.load(tmp_path / "run.npz") as file:
+            return str(file["meta"])
+
+    assert str(secret) in texts(full_paths=True)
+    kept = texts()
+    assert str(tmp_path) not in kept
+    assert "/other" not in kept
+    loaded = srm.load_solution(tmp_path / "run.npz").mechanism.source
+    assert loaded is not None
+    assert (loaded.path, loaded.urdf_path) == ("bar.toml", str(tmp_path / "bar.urdf"))
+    assert re.findall(r'<mesh filename="([^"]*)"', loaded.urdf) == [
+        *("meshes/a.stl", "meshes/b.stl", "c.stl", "meshes/d.stl", "package://robot/e.stl")
+    ]
+
+
+def test_a_loaded_run_is_played_with_the_meshes_beside_it(tmp_path: Path) -> None:
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    source = srm.load("four_bar").source
+    assert source is not None
+    mesh = '<visual><geometry><mesh filename="bar.stl"/></geometry></visual>'
+    (folder / "bar.urdf").write_text(
+        source.urdf.replace('<link name="crank">', f'<link name="crank">{mesh}')
+    )
+    corners = "vertex 0 0 0 vertex 1 0 0 vertex 0 1 0"
+    facet = f"facet normal 0 0 1 outer loop {corners} endloop endfacet"
+    (folder / "bar.stl").write_text(f"solid bar\n{facet}\nendsolid bar\n")
+    (folder / "bar.toml").write_text(
+        source.description.replace("../urdf/four_bar.urdf", "bar.urdf")
+    )
+    srm.simulate(srm.load(folder / "bar.toml"), 0.1).save(folder / "run.npz")
+    folder.rename(tmp_path / "elsewhere")
+
+    mechanism = srm.load_solution(tmp_path / "elsewhere" / "run.npz").mechanism
+
+    assert any(isinstance(visual.shape, Mesh) for visual in visuals_of(mechanism))
+
+
+def test_a_run_that_compresses_very_far_is_saved_so_that_it_loads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (archive, storage):
+        monkeypatch.setattr(module, "USUAL_CONTENT", 1000)
+        monkeypatch.setattr(module, "LARGEST_RATIO", 1)
+    solution = srm.simulate(srm.load("four_bar"), 0.2)
+
+    assert np.array_equal(reloaded(solution, tmp_path)(0.1)[0], solution(0.1)[0])
+
+
+def test_a_run_that_is_too_large_to_be_read_is_not_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solution = srm.simulate(srm.load("four_bar"), 0.2)
+    (tmp_path / "run.npz").write_text("before")
+    monkeypatch.setattr(storage, "LARGEST_CONTENT", 1000)
+
+    with pytest.raises(srm.InputError, match="more than is read"):
+        solution.save(tmp_path / "run.npz")
+    assert (tmp_path / "run.npz").read_text() == "before"
+
+
+def test_a_bomb_is_refused_in_little_time_and_memory(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as out:
+        out.writestr("meta.npy", b"\0" * 10**8)
+    tracemalloc.start()
+    try:
+        with pytest.raises(srm.InputError, match="unpacks to 100 MB"):
+            srm.load_solution(tmp_path / "bomb.npz")
+        assert tracemalloc.get_traced_memory()[1] < 10**7
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the platform has no pipes")
+def test_pipes_and_devices_are_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(srm.InputError, match="it is no regular file"):
+            srm.load_solution(path)
+
+
+def test_the_parts_of_a_run_of_segments_belong_together(tmp_path: Path) -> None:
+    event = srm.Event(late, action=nothing)
+    run = srm.simulate(srm.load("four_bar"), 0.6, events=event)
+    assert len(run.segments) == 2
+    other = srm.simulate(srm.load("slider_crank"), 0.6, events=event)
+    for solution, name in ((run, "run"), (other, "other")):
+        solution.save(tmp_path / f"{name}.npz")
+    with zipfile.ZipFile(tmp_path / "run.npz") as file:
+        parts = {name: file.read(name) for name in file.namelist()}
+    with zipfile.ZipFile(tmp_path / "other.npz") as file:
+        foreign = file.read("1.npz")
+    contents = json.loads(parts["segments.json"])
+    changes = {
+        "another model": {"1.npz": foreign},
+        "begins before the end": {"0.npz": parts["1.npz"], "1.npz": parts["0.npz"]},
+        "it has 2 segments, not 3": {"segments.json": json.dumps(contents | {"count": 3})},
+        "count: Input should be": {"segments.json": json.dumps(contents | {"count": 0})},
+        "t_eval has values outside": {"segments.json": json.dumps(contents | {"t_eval": [-1.0]})},
+    }
+    for says, change in changes.items():
+        with zipfile.ZipFile(tmp_path / "changed.npz", "w") as file:
+            for name, content in (parts | change).items():
+                file.writestr(name, content)
+        with pytest.raises(srm.InputError, match=says):
+            srm.load_solution(tmp_path / "changed.npz")
+
+
+def test_a_run_of_format_4_with_indices_of_another_model_is_refused(tmp_path: Path) -> None:
+    with np.load(DATA / "ring_format_4.npz") as file:
+        arrays = dict(file)
+    meta = json.loads(str(arrays["meta"]))
+    model = pin.Model()
+    model.loadFromString(meta["mechanism"]["model"])
+    model.idx_vs[3] = 10**6
+    meta["mechanism"]["model"] = model.saveToString()
+    np.savez(tmp_path / "changed.npz", **arrays | {"meta": np.array(json.dumps(meta))})
+
+    with pytest.raises(srm.InputError, match="the archive of its model is damaged") as caught:
+        srm.load_solution(tmp_path / "changed.npz")
+    assert caught.value.file == str(tmp_path / "changed.npz")
+
+
+def test_a_save_that_fails_leaves_the_file_that_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solution = srm.simulate(srm.load("four_bar"), 0.2)
+    solution.save(tmp_path / "run.npz")
+    before = (tmp_path / "run.npz").read_bytes()
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        srm.simulate(srm.load("four_bar"), 0.3).save(tmp_path / "run.npz")
+    assert (tmp_path / "run.npz").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]

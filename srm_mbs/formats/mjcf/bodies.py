@@ -21,6 +21,7 @@ from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
 from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.reach import Reach
 
 JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""
@@ -46,8 +47,8 @@ class BodyReader:
         ``ref`` of the joints, by name.
     """
 
-    def __init__(self, values: MjcfValues) -> None:
-        self.values = values
+    def __init__(self, values: MjcfValues, reach: Reach) -> None:
+        self.values, self.reach = values, reach
         self.bodies: dict[str, Body] = {}
         self.placements: dict[str, pin.SE3] = {WORLD: pin.SE3.Identity()}
         self.joints: list[Joint] = []
@@ -159,7 +160,9 @@ class BodyReader:
         elif use_geoms != "false":
             low, high = compiler.groups
             for geom in geoms:
-                part = inertia_of(geom, self.meshes) if low <= geom.group <= high else None
+                part = (
+                    inertia_of(geom, self.meshes, self.reach) if low <= geom.group <= high else None
+                )
                 if part is not None:
                     inertia = part if inertia is None else inertia + part
         return Body(name, self._bounded(inertia), tuple(visuals))

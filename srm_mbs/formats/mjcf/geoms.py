@@ -12,8 +12,11 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
+from srm_mbs.formats.meshes import enclosed, read_mesh
 from srm_mbs.formats.mjcf.attributes import GEOMS, Attributes, MjcfValues, z_along
+from srm_mbs.model.reach import Reach
 
 DENSITY = 1000.0
 """kg/m^3, MuJoCo's default."""
@@ -92,8 +95,10 @@ def read_geom(
     return Geom(kind, around * placement, sizes, mass, density, group, given)
 
 
-def inertia_of(geom: Geom, meshes: Mapping[str, Mesh]) -> pin.Inertia | None:
+def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], reach: Reach) -> pin.Inertia | None:
     """Inertia of a solid shape in its body's frame; None without mass.
+
+    ``reach`` says where mesh files may lie.
 
     Raises
     ------
@@ -103,7 +108,7 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh]) -> pin.Inertia | None:
     if geom.kind in MASSLESS or geom.mass == 0.0 or (geom.mass is None and geom.density == 0.0):
         return None
     if geom.kind == "mesh":
-        own = _enclosed(geom.given, meshes.get(geom.given.text("mesh")))
+        own = _enclosed(geom.given, meshes.get(geom.given.text("mesh")), reach)
     elif geom.kind in SIZES:
         volume, moments = _solid(geom.kind, geom.sizes)
         own = pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
@@ -115,26 +120,23 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh]) -> pin.Inertia | None:
     return geom.placement.act(pin.Inertia(density * own.mass, own.lever, density * own.inertia))
 
 
-def _enclosed(given: Attributes, mesh: Mesh | None) -> pin.Inertia:
+def _enclosed(given: Attributes, mesh: Mesh | None, reach: Reach) -> pin.Inertia:
     """Inertia of the solid of density 1 kg/m^3 that a mesh encloses: inertia="exact"."""
     if mesh is None or mesh.inertia != "exact":
         raise given.fault(
             "the inertia of a mesh is read from its triangles only, and only if MuJoCo does so too",
             f'{GIVE_INERTIAL}, or the <mesh file=...> inertia="exact"',
         )
-    import coal  # type: ignore[import-untyped]
-
-    path = Path(given.values.file).parent / mesh.file
+    with naming(file=given.values.file, element=given.where):
+        path = reach.find(mesh.file, Path(given.values.file).parent, "mesh file")
     try:
-        shape = coal.MeshLoader().load(str(path), mesh.scale)
-        volume = float(shape.computeVolume())
-        about = np.array(shape.computeMomentofInertiaRelatedToCOM())
-        centre = np.array(shape.computeCOM())
-    except Exception as error:  # Boost.Python raises whatever the C++ reader throws
-        problem = f"the mesh file {str(path)!r} cannot be read: {error}"
-        raise given.fault(problem, GIVE_INERTIAL) from error
+        vertices, faces = read_mesh(path)
+    except InputError as error:
+        problem = f"the mesh file {mesh.file!r} cannot be read: {error.problem}"
+        raise given.fault(problem, error.remedy) from error
+    volume, centre, about = enclosed(vertices * mesh.scale, faces)
     if not volume > 0.0:
-        raise given.fault(f"the triangles of {str(path)!r} enclose no volume", GIVE_INERTIAL)
+        raise given.fault(f"the triangles of {mesh.file!r} enclose no volume", GIVE_INERTIAL)
     return pin.Inertia(volume, centre, about)
 
 

@@ -14,41 +14,40 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.document import Document
+from srm_mbs.formats.files import read_text, shortened
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
 from srm_mbs.formats.mjcf.geoms import Mesh
 from srm_mbs.formats.translation import Options, Translation
-from srm_mbs.formats.xml import parse_xml
+from srm_mbs.formats.xml import check_tree, parse_xml
+from srm_mbs.model.reach import Reach
 
 GRAVITY = "0 0 -9.81"
 FORCES_OFF = ("passive", "spring", "damper", "frictionloss", "constraint")
 """Flags that would disable forces that this package applies."""
 
 
-def _expanded(values: MjcfValues, node: Element, folder: Path, depth: int = 0) -> None:
+def _expanded(
+    values: MjcfValues, node: Element, folder: Path, reach: Reach, depth: int = 0
+) -> None:
     """Replace each ``<include>`` by the contents of its file."""
     for i, child in reversed(list(enumerate(node))):
         if child.tag != "include":
-            _expanded(values, child, folder, depth)
+            _expanded(values, child, folder, reach, depth)
             continue
         name = child.get("file", "")
-        where = f"<include> {name!r}"
+        where = f"<include> {shortened(name)!r}"
         values.check_include(depth, where)
-        try:
-            text = (folder / name).read_text(encoding="utf-8-sig")
-        except (OSError, ValueError) as error:
-            raise values.fault(
-                where,
-                f"it cannot be read: {error}",
-                "Check the path, which is relative to the model",
-            ) from error
-        root = parse_xml(text, str(folder / name))
-        values.check_depth(root)
-        _expanded(values, root, folder, depth + 1)
+        with naming(file=values.file, element=where):
+            path = reach.find(name, folder, "included file")
+        text = read_text(path)
+        values.count_included(text, where)
+        root = parse_xml(text, str(path))
+        _expanded(values, root, folder, reach, depth + 1)
         node.remove(child)
         for k, inner in enumerate(root):
             node.insert(i + k, inner)
@@ -156,9 +155,9 @@ def translate(document: Document, options: Options) -> Translation:
             f"the root element is <{root.tag}>, not <mujoco>", file=file, remedy="Give an MJCF file"
         )
     values.attributes(root, "<mujoco>", ("model",))
-    values.check_depth(root)
-    _expanded(values, root, Path(file).parent)
-    values.check_depth(root)
+    _expanded(values, root, Path(file).parent, options.reach)
+    with naming(file=file):
+        check_tree(root)
     if options.cut:
         raise values.fault(
             "cut", "the joints of an MJCF file are a tree: nothing is to be cut", "Remove cut"
@@ -171,7 +170,7 @@ def translate(document: Document, options: Options) -> Translation:
     for node in root.findall("default"):
         values.read_defaults(node)
     gravity, disabled = _option(values, root.findall("option"))
-    tree = BodyReader(values)
+    tree = BodyReader(values, options.reach)
     for node in root.findall("asset"):
         _assets(values, tree, node)
     for node in root.findall("worldbody"):

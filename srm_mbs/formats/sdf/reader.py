@@ -9,13 +9,13 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
 from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.document import Document
+from srm_mbs.formats.files import read_text, shortened
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.sdf.joints import JointReader
@@ -32,6 +32,7 @@ from srm_mbs.formats.sdf.links import (
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.xml import XmlValues, parse_xml, words
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.reach import Reach
 
 OLDEST, NEWEST = (1, 3), (1, 12)
 MODEL_READ = ("pose", "link", "joint", "frame", "model", "include", "static")
@@ -48,7 +49,8 @@ GRAVITY = "0 0 -9.8"
 class SdfReader:
     """Collects links, joints and frames of one file and those it includes."""
 
-    def __init__(self, file: str) -> None:
+    def __init__(self, file: str, reach: Reach) -> None:
+        self.reach = reach
         self.values = XmlValues(file)
         self.frames = Frames(self.values)
         self.bodies: dict[str, Body] = {}
@@ -151,14 +153,16 @@ class SdfReader:
     def include(self, node: Element, scope: Scope) -> str:
         """A model in another file, beside this one."""
         uri = (node.findtext("uri") or "").strip()
-        where = f"<include> {uri!r}"
+        where = f"<include> {shortened(uri)!r}"
         values = self.values
         values.attributes(node, where, ("merge",))
         values.children(node, where, ("uri", "name", "pose", "static"), ("plugin",))
         if node.get("merge") is not None:
             raise values.fault(where, "merge is not read by this version", "Remove it")
         values.check_include(scope.depth, where)
-        path, text = self._included(uri, scope.file, where)
+        path = self._included(uri, scope.file, where)
+        text = read_text(path)
+        values.count_included(text, where)
         root = parse_xml(text, str(path))
         version = self.version(root, str(path))
         model = root.find("model")
@@ -179,37 +183,29 @@ class SdfReader:
         inner = Scope(name + SEPARATOR, str(path), version, scope.depth + 1)
         return self.model(model, inner, scope.prefix, placed)
 
-    def _included(self, uri: str, file: str, where: str) -> tuple[Path, str]:
-        """Path and text of an included file; a folder means the model in it."""
-        parts = urlsplit(uri)
-        if parts.scheme not in ("", "model", "file") or not uri:
+    def _included(self, uri: str, file: str, where: str) -> Path:
+        """Path of an included file; a folder means the model in it."""
+        if uri.partition("://")[0] not in ("model", "file", uri) or not uri:
             raise self.values.fault(
                 where, "files are read from this machine only", "Put the model beside the file"
             )
-        folder = Path(file).parent
-        below = unquote(f"{parts.netloc}{parts.path}")
-        tried = [folder / below]
-        if parts.scheme == "model":
-            tried += [above / below for above in folder.absolute().parents]
-        for path in tried:
-            try:
-                if path.is_dir():
-                    path = _of_folder(path)
-                if path.is_file():
-                    return path, path.read_text(encoding="utf-8-sig")
-            except (OSError, ValueError):
-                continue
-        raise self.values.fault(
-            where,
-            "there is no such model beside the file or in the folders above it",
-            "Put it there, or write the path",
-        )
+        with naming(file=self.values.file, element=where):
+            return self.reach.find(uri, Path(file).parent, "included model", self._of_folder)
+
+    def _of_folder(self, folder: Path) -> Path:
+        """The SDF file of a model's folder: that of ``model.config``, or ``model.sdf``."""
+        config = folder / "model.config"
+        if config.is_file():
+            root = parse_xml(read_text(self.reach.check(config, "file")), str(config))
+            found = [(node.text or "").strip() for node in root.iter("sdf")]
+            if found and found[-1]:
+                return folder / found[-1]
+        return folder / "model.sdf"
 
     # Files ----------------------------------------------------------------------------------
 
     def version(self, root: Element, file: str) -> tuple[int, int]:
         """Major and minor version of an SDF file with this root element."""
-        self.values.check_depth(root)
         if root.tag != "sdf":
             raise InputError(
                 f"the root element is <{root.tag}>, not <sdf>", file=file, remedy="Give an SDF file"
@@ -268,16 +264,6 @@ class SdfReader:
         ]
 
 
-def _of_folder(folder: Path) -> Path:
-    """The SDF file of a model's folder: the one that ``model.config`` names, or ``model.sdf``."""
-    config = folder / "model.config"
-    if config.is_file():
-        found = re.findall(r"<sdf[^>]*>\s*([^<\s]+)\s*</sdf>", config.read_text(encoding="utf-8"))
-        if found:
-            return folder / str(found[-1])
-    return folder / "model.sdf"
-
-
 def translate(document: Document, options: Options) -> Translation:
     """Translate an SDF file.
 
@@ -293,7 +279,7 @@ def translate(document: Document, options: Options) -> Translation:
     InputError
         Naming the file, the element and the remedy.
     """
-    reader = SdfReader(document.file)
+    reader = SdfReader(document.file, options.reach)
     name, root, gravity = reader.read(document.xml)
     couplings = reader.joints.couplings()
     reader.static()

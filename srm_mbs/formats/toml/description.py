@@ -6,6 +6,7 @@ the file, the key and the remedy.  The keys themselves are in :mod:`srm_mbs.form
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
@@ -14,8 +15,9 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.csv_table import CsvFolder
+from srm_mbs.formats.files import check_name, shortened
 from srm_mbs.formats.toml.schema import (
     CSV_KEYS,
     FORCE_ENTRIES,
@@ -31,6 +33,7 @@ from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import LAW_TYPES, Law, Polynomial, Table
+from srm_mbs.model.reach import Reach
 
 Element = TypeVar("Element")
 
@@ -55,6 +58,25 @@ class Description(TopEntry):
             For an unknown type, a wrong axis, or an anchor without link or frame.
         """
         return self._elements("loop", lambda values: LoopClosure(**values))
+
+    def refuse_identical_closures(self) -> None:
+        """Refuse two closures that are the same but for their names, before any analysis.
+
+        Raises
+        ------
+        InputError
+            Naming both.
+        """
+        first: dict[str, tuple[str, str]] = {}
+        for i, entry in enumerate(self.loop):
+            label = f"loop {entry.name!r}" if entry.name else f"loop[{i}]"
+            same = repr([value for key, value in entry if key != "name"])
+            other, name = first.setdefault(same, (label, entry.name))
+            # Equal names are another error.
+            if other != label and not (name and name == entry.name):
+                raise InputError(
+                    f"it is the same closure as {other}", element=label, remedy="Remove one of them"
+                )
 
     def coupled_joints(self) -> frozenset[str]:
         """Names of the joints that take part in a coupling."""
@@ -83,7 +105,7 @@ class Description(TopEntry):
             if kind in CSV_KEYS:
                 if tables is None and (values["law"] or values["table"]):
                     return None
-                values = _with_law(kind, values, tables or CsvFolder(Path()))
+                values = _with_law(kind, values, tables or CsvFolder(Path(), Reach()))
             made: ForceElement = FORCE_TYPES[kind](**values)
             return made
 
@@ -183,7 +205,7 @@ def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
 def _table_law(keys: Mapping[str, Any], tables: CsvFolder) -> Table:
     """The law of the columns, by default t and value, of a table in a CSV file."""
     names = (keys.get("time") or "t", keys.get("value") or "value")
-    return Table(*tables.table(keys["table"]).columns(names).T.tolist())
+    return Table(*tables.table(keys["table"]).columns(names).T)
 
 
 def _refuse_columns(given: Mapping[str, Any]) -> None:
@@ -229,10 +251,20 @@ def _wrench_laws(file: str, time: str | None, tables: CsvFolder) -> tuple[Law, .
             file=table.file,
             remedy="Name the columns of force and moment in the first line",
         )
-    t, *columns = table.columns((time or "t", *there)).T.tolist()
+    t, *columns = table.columns((time or "t", *there)).T
     laws: dict[str, Law] = {name: Table(t, column) for name, column in zip(there, columns)}
     return tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
 
+
+LARGEST_DESCRIPTION = 16 * 10**6
+"""Characters of a description."""
+LARGEST_KEY_DEPTH = 50
+"""Parts of a dotted key."""
+LARGEST_VALUE_DEPTH = 50
+"""Tables and lists in each other."""
+_KEY_PART = r"""(?>[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?>{_KEY_PART}[ \t]*+\.[ \t]*+){{{LARGEST_KEY_DEPTH}}}")
+"""Keys with more parts than that, for which the time of tomllib grows as their square."""
 
 # -- text to tables --------------------------------------------------------------------------
 
@@ -245,14 +277,61 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
     InputError
         If it is not valid TOML.
     """
+    if len(text) > LARGEST_DESCRIPTION:
+        raise InputError(
+            f"the description has more than {LARGEST_DESCRIPTION / 1e6:.0f} MB",
+            file=file,
+            remedy='Put long tables of numbers into CSV files: table = "file.csv"',
+        )
+    if DEEP_KEY.search(text):
+        raise InputError(
+            f"a key has more than {LARGEST_KEY_DEPTH} parts",
+            file=file,
+            remedy="Give a key of a description",
+        )
     try:
-        return tomllib.loads(text)
+        entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
         raise InputError(
-            f"this is not valid TOML: {error}",
+            f"this is not valid TOML: {_without_quotes(error)}",
             file=file,
             remedy="Correct it there; text stands in quotes, lists in [ ]",
         ) from error
+    with naming(file=file):
+        _check_texts(entries)
+    return entries
+
+
+def _without_quotes(error: Exception) -> str:
+    """The message of ``tomllib``, which may quote the file, with the position."""
+    words, at, position = str(error).rpartition(" (at ")
+    return f"{shortened(words)}{at}{position}" if at else shortened(position)
+
+
+def _check_texts(entries: Mapping[str, Any]) -> None:
+    """Refuse keys and texts that :func:`~srm_mbs.formats.files.check_name` refuses (all texts are
+    names or paths), and values nested deeper than :data:`LARGEST_VALUE_DEPTH`."""
+    level: list[tuple[str, Any]] = list(entries.items())
+    for key in entries:
+        check_name(key, "a key")
+    for _ in range(LARGEST_VALUE_DEPTH):
+        inner: list[tuple[str, Any]] = []
+        for name, value in level:
+            if isinstance(value, str):
+                check_name(value, name)
+            elif isinstance(value, dict):
+                for key in value:
+                    check_name(key, name)
+                inner.extend((name, part) for part in value.values())
+            elif isinstance(value, list):
+                inner.extend((name, part) for part in value)
+        level = inner
+    if level:
+        raise InputError(
+            f"more than {LARGEST_VALUE_DEPTH} values are nested",
+            element=level[0][0],
+            remedy="Remove what no description has",
+        )
 
 
 def check_description(entries: Mapping[str, Any], file: str) -> Description:

@@ -42,13 +42,14 @@ class Graph:
 
     def ancestors(self, link: str) -> list[str]:
         """``link`` and those that carry it, up to the root."""
-        out = [link]
-        while (joint := self.above.get(out[-1])) is not None:
-            parent = link_of(joint, "parent")
-            if parent in out:  # a ring, which the check of the tree names
+        out = {link: None}
+        at = link
+        while (joint := self.above.get(at)) is not None:
+            at = link_of(joint, "parent")
+            if at in out:  # a ring, which the check of the tree names
                 break
-            out.append(parent)
-        return out
+            out[at] = None
+        return list(out)
 
     def chains(self, first: str, second: str) -> tuple[list[str], list[str]]:
         """Moving joints from the nearest common ancestor to either link.
@@ -58,7 +59,7 @@ class Graph:
         InputError
             If there is none, a chain does not move, or has a joint of several degrees of freedom.
         """
-        above = self.ancestors(second)
+        above = set(self.ancestors(second))
         common = next((link for link in self.ancestors(first) if link in above), None)
         if common is None:
             raise InputError(

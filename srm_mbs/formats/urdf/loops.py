@@ -108,16 +108,16 @@ def translate(document: Document, options: Options) -> Translation:
 def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
     """The entries, with names made for those without: from the type and the links."""
     taken = {str(entry.get("name")) for entry in (*entries, *own)}
+    counts: dict[str, int] = {}
     out = []
     for entry in entries:
         name = entry.get("name", "")
         if not name:
             ends = entry.get("joints") or [entry[side].get("link") for side in "ab"]
             name = stem = "_".join([entry["type"], *ends])
-            count = 1
             while name in taken:
-                count += 1
-                name = f"{stem}_{count}"
+                counts[stem] = counts.get(stem, 1) + 1
+                name = f"{stem}_{counts[stem]}"
             taken.add(name)
         out.append({**entry, "name": name})
     return out

@@ -29,7 +29,6 @@ from srm_mbs.visualization.animation.page import (
 )
 from srm_mbs.visualization.animation.playback import (
     REPLY_TIME,
-    answered,
     close,
     serve,
     show,
@@ -164,7 +163,7 @@ class LiveView:
         head[:3, 0] = t, np.linalg.norm(g), energy - self._energy
         # One command for all bodies, because each waits for the server's answer.
         places = [self._data.oMi[joint].homogeneous for joint in self._joints]
-        with answered(self.visualizer.window, patience, SERVER_GONE_REMEDY):
+        with self.visualizer.window.answering(patience, SERVER_GONE_REMEDY):
             self._node.set_transform(np.hstack([head, *places]))
         self.shown += 1
 
@@ -186,7 +185,7 @@ class LiveView:
         """
         picture = make_picture(solution, 60.0, OverlayOptions(**drawn))
         data = page_data(solution, picture)
-        with answered(self.visualizer.window, REPLY_TIME, SERVER_GONE_REMEDY):
+        with self.visualizer.window.answering(REPLY_TIME, SERVER_GONE_REMEDY):
             self.visualizer["/about"].set_property("about", json.dumps(data, allow_nan=False))
             draw_picture(self.visualizer, picture)
 
@@ -202,5 +201,5 @@ class LiveView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self.visualizer.window.zmq_socket.closed:
+        if not self.visualizer.window.closed:
             self.close()

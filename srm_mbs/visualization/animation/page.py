@@ -194,7 +194,7 @@ def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a page, image or video; an existing file is replaced.
+    """Write a page, image or video, whole or not at all; an existing file is replaced.
 
     Raises
     ------

@@ -11,8 +11,7 @@ import math
 import sys
 import time
 import webbrowser
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,13 +28,13 @@ from srm_mbs.visualization.animation.page import (
     write_file,
 )
 from srm_mbs.visualization.animation.scene import Picture, make_picture
-from srm_mbs.visualization.animation.server import SERVERLESS, start_server
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
+from srm_mbs.visualization.animation.window import Window
 
 log = get_logger(__name__)
 
 REPLY_TIME = 30.0
-"""Time (s) for meshcat's server to accept one command."""
+"""Time (s) for the server of the page to accept one command."""
 
 # Playing ------------------------------------------------------------------------------------
 
@@ -76,7 +75,8 @@ def play(
 ) -> Any:
     """Play a run in the browser, in real time and repeatedly.
 
-    The page is that of :func:`export_html`, served by a local process.
+    The page is that of :func:`export_html`, served by a local process to this machine only, under
+    an address that has a random part.
 
     Parameters
     ----------
@@ -131,49 +131,15 @@ def close(visualizer: Any) -> None:
     visualizer
         Returned by :func:`play`; closing it twice is harmless.
     """
-    window = visualizer.window
     if visualizer in _open_visualizers:
         _open_visualizers.remove(visualizer)
-    process = window.server_proc
-    process.kill()
-    process.wait()
-    for stream in (process.stdout, process.stderr):
-        stream.close()
-    if window.zmq_socket is not None:
-        window.zmq_socket.close(linger=0)
+    visualizer.window.close()
 
 
 @atexit.register
 def _close_all() -> None:
     while _open_visualizers:
         close(_open_visualizers[-1])
-
-
-@contextmanager
-def answered(window: Any, seconds: float, remedy: str = SERVERLESS) -> Iterator[None]:
-    """Context in which the server has ``seconds`` to accept each command.
-
-    Raises
-    ------
-    InputError
-        If the server does not accept a command in time, or has stopped.
-    """
-    import zmq
-
-    if window.server_proc.poll() is not None:
-        raise InputError("meshcat's server has stopped", remedy=remedy)
-    try:
-        if window.zmq_socket is None:
-            window.connect_zmq()
-        window.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000.0 * seconds))
-        yield
-        window.zmq_socket.setsockopt(zmq.RCVTIMEO, -1)
-    except zmq.ZMQError as error:
-        if window.zmq_socket is not None:
-            # A socket that waits for an answer accepts no other command.
-            window.zmq_socket.close(linger=0)
-            window.connect_zmq()
-        raise InputError(f"meshcat's server does not answer: {error}", remedy=remedy) from error
 
 
 def serve(page: str, picture: Picture) -> Any:
@@ -190,16 +156,12 @@ def serve(page: str, picture: Picture) -> Any:
         If the server does not start, or does not answer.
     """
     meshcat = import_meshcat()
-    process, commands, address = start_server(page)
-    kind = meshcat.visualizer.ViewerWindow
-    window = kind.__new__(kind)  # the constructor would start another server
-    window.server_proc, window.zmq_url, window.web_url = process, commands, address
-    window.zmq_socket = None
+    window = Window(page)
     visualizer = meshcat.Visualizer(window=window)
     # Kept until closed: garbage collection of an open process or socket gives a warning.
     _open_visualizers.append(visualizer)
     try:
-        with answered(window, REPLY_TIME):
+        with window.answering(REPLY_TIME):
             draw_picture(visualizer, picture)
     except BaseException:
         close(visualizer)

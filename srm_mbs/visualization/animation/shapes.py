@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -21,8 +20,10 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, get_logger
+from srm_mbs.formats.meshes import read_mesh
 from srm_mbs.formats.xml import parse_numbers, parse_xml
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.mechanism import Source
 from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
 log = get_logger(__name__)
@@ -133,8 +134,8 @@ def visuals_of(
         Closures with their active intervals: bars end at their anchors, which are marked.  Those
         of ``mechanism`` by default.
 
-    Mesh files are searched beside the URDF, in the folders above it (``package://``), and in the
-    data of ``example-robot-data``; one that cannot be read is left out with a warning.
+    Mesh files are searched where :class:`~srm_mbs.model.reach.Reach` says; one that cannot be read
+    is left out with a warning.
     """
     found = list(_urdf_visuals(mechanism))
     if found:
@@ -157,7 +158,6 @@ def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
     for material in root.iter("material"):
         if (colour := material.find("color")) is not None:
             colours.setdefault(material.get("name", ""), colour)
-    meshes = _MeshFiles(Path(source.urdf_path))
     for link in root.findall("link"):
         for element in link.findall("visual"):
             name = link.get("name")
@@ -167,7 +167,7 @@ def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
                 yield Visual(
                     joint,
                     frame.placement * _origin(element),
-                    _shape(element, meshes),
+                    _shape(element, source),
                     _colour(element, colours) or _default_colour(joint),
                 )
             except InputError as error:
@@ -211,7 +211,7 @@ def _origin(visual: Element) -> pin.SE3:
     return pin.SE3(pin.rpy.rpyToMatrix(rpy), np.array(_numbers(origin, "xyz", "0 0 0")))
 
 
-def _shape(visual: Element, meshes: _MeshFiles) -> Shape:
+def _shape(visual: Element, source: Source) -> Shape:
     """The shape of a ``<visual>``; raises InputError if it cannot be drawn."""
     element = visual.find("geometry/*")
     if element is None:
@@ -228,65 +228,29 @@ def _shape(visual: Element, meshes: _MeshFiles) -> Shape:
             return Sphere(radius)
         case "mesh":
             scale = np.array(_numbers(element, "scale", "1 1 1"))
-            return meshes.read(element.get("filename", ""), scale)
+            return _mesh(element.get("filename", ""), scale, source)
         case tag:
             raise InputError(
                 f"there is no geometry {tag!r}", remedy="Known: box, cylinder, sphere, mesh"
             )
 
 
-class _MeshFiles:
-    """Finds and reads the mesh files that a URDF names."""
+def _mesh(name: str, scale: FloatArray, source: Source) -> Mesh:
+    """Triangles in metres of the mesh file that a URDF names.
 
-    def __init__(self, urdf: Path) -> None:
-        self.folder = urdf.parent
-        # example-robot-data is installed under the same prefix as Pinocchio.
-        shared = (prefix / "share" for prefix in Path(pin.__file__).parents)
-        data = [folder for folder in shared if (folder / "example-robot-data").is_dir()]
-        self.packages = [self.folder, *self.folder.absolute().parents, *data]
-
-    def find(self, name: str) -> Path:
-        """Path of the mesh ``name``; raises InputError if there is no such file."""
-        url = urlsplit(name)
-        if url.scheme == "package":
-            below = unquote(f"{url.netloc}{url.path}")
-            candidates = [folder / below for folder in self.packages]
-        elif url.scheme == "file":
-            candidates = [Path(unquote(url.path))]
-        else:
-            candidates = [self.folder / name]
-        for candidate in candidates:
-            if candidate.is_file():
-                return candidate
-        raise InputError(f"there is no mesh file {name!r}", remedy="Check the path")
-
-    def read(self, name: str, scale: FloatArray) -> Mesh:
-        """Triangles of the mesh ``name`` in metres.
-
-        Raises
-        ------
-        InputError
-            If the file does not exist or is no mesh.
-        """
-        path = self.find(name)
-        # Pinocchio's own reader applies the units and the up axis that a file declares.
-        import coal  # type: ignore[import-untyped]
-
-        try:
-            mesh = coal.MeshLoader().load(str(path), scale)
-            triangles = (mesh.tri_indices(i) for i in range(mesh.num_tris))
-            faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.uint32)
-            vertices = np.array(mesh.vertices(), dtype=float)
-        except Exception as error:  # Boost.Python raises whatever the C++ reader throws
-            raise InputError(
-                f"the mesh file {str(path)!r} cannot be read: {error}",
-                remedy="Give an STL, OBJ or DAE file",
-            ) from error
-        if not len(faces):
-            raise InputError(
-                f"the mesh file {str(path)!r} holds no triangles", remedy="Give one with triangles"
-            )
-        return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3))
+    Raises
+    ------
+    InputError
+        If there is no such file, it is out of reach, or it is no mesh.
+    """
+    path = source.reach.find(name, Path(source.urdf_path).parent, "mesh file")
+    try:
+        vertices, faces = read_mesh(path)
+    except InputError as error:
+        raise InputError(
+            f"the mesh file {name!r} cannot be read: {error.problem}", remedy=error.remedy
+        ) from error
+    return Mesh(vertices * scale, faces)
 
 
 # Bars ---------------------------------------------------------------------------------------

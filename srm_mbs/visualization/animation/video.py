@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
+from srm_mbs.formats.files import whole_file
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import write_file
 from srm_mbs.visualization.animation.playback import check_fps, page_of
@@ -32,11 +35,15 @@ SIZE = (900, 600)
 FILMS = (".gif", ".mp4")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER_OPTIONS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--headless", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
-"""Options of Chromium as root, without a graphics card and without a network."""
+"""Options of Chromium without a graphics card and without a network."""
+TEMPORARY_PREFIX = "srm-mbs-"
+"""Of the names of temporary folders, which have the page and the profile of the browser."""
+LOCKING_TIME = 60.0
+"""Age (s) of a temporary folder above which its program has locked it, unless it was killed."""
 _SEEK = """async t => {
   viewer.animator.pause();
   viewer.animator.seek(t);
@@ -55,17 +62,22 @@ def browser() -> Iterator[Any]:
     Raises
     ------
     InputError
-        If playwright or Chromium is missing.
+        If playwright or Chromium is missing, or Chromium does not start.
     """
     try:
-        from playwright.sync_api import sync_playwright
+        from playwright.sync_api import Error, sync_playwright
     except ImportError as error:
         raise InputError(
             "pictures and films need playwright, which is not installed",
             remedy='Install it: pip install "srm-mbs[render]"; or use solution.export_html(path)',
         ) from error
-    with sync_playwright() as playwright:
-        found = [shutil.which(name) for name in BROWSERS]
+    # Chromium refuses its sandbox to root, whose files it would not protect.
+    root = hasattr(os, "geteuid") and os.geteuid() == 0
+    with ExitStack() as stack:
+        folder = stack.enter_context(private_folder())
+        with _temporary_files_in(folder):  # those of playwright: the profile
+            playwright = stack.enter_context(sync_playwright())
+        found = [_program(name) for name in BROWSERS]
         found.append(playwright.chromium.executable_path)
         path = next((path for path in found if path and Path(path).exists()), None)
         if path is None:
@@ -73,11 +85,89 @@ def browser() -> Iterator[Any]:
                 "pictures and films need Chromium, which is not installed",
                 remedy="Install chromium from your system, or run: playwright install chromium",
             )
-        chromium = playwright.chromium.launch(executable_path=path, args=list(BROWSER_OPTIONS))
         try:
-            yield chromium
-        finally:
-            chromium.close()
+            chromium = playwright.chromium.launch(
+                executable_path=path,
+                args=[*BROWSER_OPTIONS, *(["--no-sandbox"] if root else [])],
+                chromium_sandbox=not root,
+                env=dict(os.environ),
+            )
+        except Error as error:
+            reason = (error.message.strip().splitlines() or ["it gives no reason"])[0]
+            if "sandboxing failed" in error.message:
+                reason = "its sandbox does not work here"
+            raise InputError(
+                f"the browser does not start: {reason}",
+                file=path,
+                remedy="Use the Chromium of your system, and check that user namespaces are "
+                "allowed; or use solution.export_html(path)",
+            ) from error
+        stack.callback(chromium.close)
+        yield chromium
+
+
+def _program(name: str) -> str | None:
+    """Absolute path of a program, None if there is none; not one of the working folder."""
+    found = shutil.which(name)
+    return found if found is not None and os.path.isabs(found) else None
+
+
+@contextmanager
+def private_folder() -> Iterator[Path]:
+    """A temporary folder that only its user can read, removed at the end of a ``with`` block.
+
+    The next one removes what killed programs of the same user have left: folders that no living
+    program has locked.
+    """
+    _remove_left_folders()
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX) as name, _locked(name):
+        yield Path(name)
+
+
+@contextmanager
+def _locked(folder: str) -> Iterator[bool]:
+    """Whether this program has the lock of ``folder``, which it loses when it ends in any way;
+    False also where folders cannot be locked."""
+    if os.name != "posix":
+        yield False
+        return
+    import fcntl
+
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield os.fstat(opened).st_uid == os.geteuid()
+    finally:
+        os.close(opened)
+
+
+def _remove_left_folders() -> None:
+    oldest = time.time() - LOCKING_TIME
+    for entry in Path(tempfile.gettempdir()).glob(f"{TEMPORARY_PREFIX}*"):
+        with suppress(OSError):  # it is somebody else's, or is gone
+            if entry.lstat().st_mtime > oldest:
+                continue
+            with _locked(str(entry)) as left:
+                if left:
+                    shutil.rmtree(entry, ignore_errors=True)
+
+
+@contextmanager
+def _temporary_files_in(folder: Path) -> Iterator[None]:
+    """Processes that are started within make their temporary files in ``folder``."""
+    before = os.environ.get("TMPDIR")
+    os.environ["TMPDIR"] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["TMPDIR"]
+        else:
+            os.environ["TMPDIR"] = before
 
 
 @contextmanager
@@ -123,10 +213,10 @@ def photographer(
             remedy="Give for example size=(900, 600)",
         )
     own = browser() if chromium is None else nullcontext(chromium)
-    with tempfile.TemporaryDirectory() as folder, own as opened:
-        file = Path(folder) / "page.html"
+    with private_folder() as folder, own as opened:
+        file = folder / "page.html"
         options = OverlayOptions(**drawn)
-        write_file(file, page_of(solution, fps, options, panel=False, extra=times).encode())
+        file.write_bytes(page_of(solution, fps, options, panel=False, extra=times).encode())
         page = opened.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
@@ -261,7 +351,7 @@ def encoder_of(film: Path) -> str | None:
     """
     if film.suffix.lower() == ".gif":
         return None
-    found = shutil.which("ffmpeg")
+    found = _program("ffmpeg")
     if found is None:
         try:
             import imageio_ffmpeg
@@ -292,18 +382,36 @@ def _gif(pictures: Sequence[bytes], fps: float) -> bytes:
 
 
 def _encode(encoder: str, pictures: Sequence[bytes], fps: float, path: Path) -> None:
-    """Encode the pictures with ffmpeg as H.264 in the pixel format that every player supports."""
-    command = [
-        *(encoder, "-loglevel", "error", "-y", "-f", "image2pipe", "-framerate", f"{fps:g}"),
-        # H.264 needs an even width and height.
-        *("-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", str(path)),
-    ]
-    done = subprocess.run(command, input=b"".join(pictures), capture_output=True, check=False)
-    if done.returncode:
-        words = done.stderr.decode(errors="replace").strip().splitlines()
+    """Encode the pictures with ffmpeg as H.264 in the pixel format that every player supports.
+
+    Raises
+    ------
+    InputError
+        If ffmpeg does not write the file; an existing one is left as it is.
+    """
+    try:
+        with whole_file(path) as film:
+            command = [
+                *(encoder, "-loglevel", "error", "-y"),
+                *("-f", "image2pipe", "-framerate", f"{fps:g}", "-i", "-"),
+                # H.264 needs an even width and height.
+                *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"),
+                # A name is neither an option nor an address.
+                *("-f", "mp4", f"file:{film}"),
+            ]
+            done = subprocess.run(
+                command, input=b"".join(pictures), capture_output=True, check=False
+            )
+            if done.returncode:
+                words = done.stderr.decode(errors="replace").replace(str(film), str(path))
+                lines = words.strip().splitlines()
+                raise InputError(
+                    f"ffmpeg cannot write it: {lines[-1] if lines else done.returncode}",
+                    file=str(path),
+                    remedy="Write a .gif, which needs no encoder",
+                )
+    except OSError as error:
         raise InputError(
-            f"ffmpeg cannot write it: {words[-1] if words else done.returncode}",
-            file=str(path),
-            remedy="Write a .gif, which needs no encoder",
-        )
+            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
+        ) from error
     log.info("written: %s", path)

@@ -121,7 +121,7 @@ def check_suffix(path: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write ``figure`` in the format that the suffix of ``path`` names.
+    """Write ``figure`` in the format that the suffix of ``path`` names, whole or not at all.
 
     Raises
     ------

@@ -458,7 +458,7 @@ def test_play_serves_until_it_is_interrupted_and_leaves_nothing_behind(
     with caplog.at_level(logging.INFO, logger="srm_mbs"):
         visualizer = play(spatial_four_bar, block=True)
     assert visualizer.window.server_proc.poll() is not None
-    assert visualizer.window.zmq_socket.closed
+    assert visualizer.window.closed
     assert opened == [visualizer.url()]
     assert opened[0] in caplog.text
     assert capsys.readouterr() == ("", "")

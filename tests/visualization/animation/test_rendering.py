@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
+import resource
 import subprocess
 import sys
-from contextlib import nullcontext
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -207,3 +213,203 @@ def test_the_colour_of_a_closure_is_seen_although_it_lies_within_a_body(tmp_path
     column, row = seen_at(solution, place, 60.0, (900, 600)).round().astype(int)
     here = (slice(row - 3, row + 4), slice(column - 3, column + 4))
     assert np.abs(pictures[0][here] - pictures[1][here]).max(axis=2).min() > 0.1
+
+
+def test_chromium_has_its_sandbox_unless_the_user_is_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    launched: list[dict[str, Any]] = []
+
+    def launch(**options: Any) -> Any:
+        launched.append(options)
+        return SimpleNamespace(close=lambda: None)
+
+    chromium = SimpleNamespace(executable_path=sys.executable, launch=launch)
+    playwright = nullcontext(SimpleNamespace(chromium=chromium))
+    monkeypatch.setattr("playwright.sync_api.sync_playwright", lambda: playwright)
+    for user in (1000, 0):
+        monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+        with rendering.browser():
+            pass
+    sandboxed, bare = launched
+    assert "--no-sandbox" not in sandboxed["args"]
+    assert sandboxed["chromium_sandbox"] is True  # playwright's default is False
+    assert "--no-sandbox" in bare["args"]
+    assert bare["chromium_sandbox"] is False
+
+
+def test_a_chromium_that_does_not_start_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    from playwright.sync_api import Error
+
+    def launch(**_: Any) -> Any:
+        raise Error("closed\nBrowser logs:\nChromium sandboxing failed!")
+
+    chromium = SimpleNamespace(executable_path=sys.executable, launch=launch)
+    playwright = nullcontext(SimpleNamespace(chromium=chromium))
+    monkeypatch.setattr("playwright.sync_api.sync_playwright", lambda: playwright)
+    with (
+        pytest.raises(
+            srm.InputError, match=r"its sandbox does not work here\. Use the Chromium of"
+        ),
+        rendering.browser(),
+    ):
+        pass
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["-y.mp4", "-version.mp4", "http:x.mp4", "-y.gif", "-.png"])
+def test_a_name_is_neither_an_option_nor_an_address(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name.endswith(".png"):
+        run().export_image(name, size=(60, 40))
+    else:
+        run().export_video(name, fps=2.0, size=(60, 40))
+    (written,) = tmp_path.iterdir()
+    assert written.name == name
+    start = written.read_bytes()[:8]
+    assert start[4:8] == b"ftyp" or start[:4] in (b"GIF8", b"\x89PNG")
+
+
+@cache
+def photograph() -> bytes:
+    """A PNG."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.new("RGB", (60, 40)).save(out, "PNG")
+    return out.getvalue()
+
+
+@pytest.fixture
+def without_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every photograph is the same."""
+    taken = nullcontext(lambda t: photograph())
+    monkeypatch.setattr(rendering, "photographer", lambda *_, **__: taken)
+
+
+@contextmanager
+def files_up_to(size: int) -> Iterator[None]:
+    """No file of this process can be longer than ``size`` bytes, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+WRITERS = {
+    ".png": srm.Solution.export_image,
+    ".gif": srm.Solution.export_video,
+    ".mp4": srm.Solution.export_video,
+    ".html": srm.Solution.export_html,
+    " plot.png": srm.Solution.plot,
+    ".svg": srm.Solution.plot,
+    ".pdf": srm.Solution.plot,
+}
+
+
+@pytest.mark.usefixtures("without_browser")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, name: str) -> None:
+    path = tmp_path / f"run{name}"
+    path.write_bytes(b"of yesterday")
+    with pytest.raises((srm.InputError, OSError)), files_up_to(64):
+        WRITERS[name](run(), path)
+    assert path.read_bytes() == b"of yesterday"
+    assert list(tmp_path.iterdir()) == [path]
+    WRITERS[name](run(), path)
+    assert path.stat().st_size > 64
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.usefixtures("without_browser")
+def test_an_encoder_that_fails_leaves_the_old_film_and_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoder, film = tmp_path / "ffmpeg", tmp_path / "film.mp4"
+    encoder.write_text(
+        '#!/bin/sh\nfor last; do :; done\necho half > "${last#file:}"\n'
+        'cat > /dev/null\necho "no space for $last" >&2\nexit 1\n'
+    )
+    encoder.chmod(0o755)
+    film.write_bytes(b"of yesterday")
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with pytest.raises(srm.InputError, match=r"no space for file:\S*/film\.mp4\. Write a \.gif"):
+        run().export_video(film)
+    assert film.read_bytes() == b"of yesterday"
+    assert {path.name for path in tmp_path.iterdir()} == {"ffmpeg", "film.mp4"}
+
+
+def test_no_program_of_the_working_folder_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ffmpeg").write_text("#!/bin/sh\n")
+    (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", os.pathsep.join([".", ""]))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(srm.InputError, match="ffmpeg, which is not installed"):
+        rendering.encoder_of(Path("film.mp4"))
+
+
+def age(folder: Path) -> None:
+    """Make ``folder`` older than any program takes to lock it."""
+    before = time.time() - 2.0 * rendering.LOCKING_TIME
+    os.utime(folder, (before, before))
+
+
+def test_what_a_killed_program_left_is_removed_by_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = (
+        "import time\nfrom srm_mbs.visualization.animation.video import private_folder\n"
+        "with private_folder() as folder:\n"
+        "    (folder / 'page.html').write_text('')\n"
+        "    print(folder, flush=True)\n    time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        cwd=Path(__file__).parents[3],
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    ) as killed:
+        assert killed.stdout is not None
+        left = Path(killed.stdout.readline().decode().strip())
+        assert left.parent == tmp_path
+        assert left.stat().st_mode & 0o777 == 0o700
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+        age(left)
+        with rendering.private_folder():
+            assert (left / "page.html").exists()  # its program lives
+        killed.kill()
+    with rendering.private_folder() as own:
+        assert list(tmp_path.iterdir()) == [own]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_old_folders_of_its_own_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = tmp_path / "kept"
+    new, other, linked = (*(kept / "srm-mbs-new", kept / "another", tmp_path / "linked"),)
+    for folder in (kept, new, other, linked):
+        folder.mkdir()
+    (linked / "thesis.tex").write_text("")
+    (kept / "srm-mbs-link").symlink_to(linked)
+    (kept / "srm-mbs-notes.txt").write_text("")
+    age(other)
+    age(kept / "srm-mbs-notes.txt")
+    before = set(kept.iterdir())
+    monkeypatch.setattr(tempfile, "tempdir", str(kept))
+    monkeypatch.setattr(rendering, "LOCKING_TIME", 0.0)  # links have no age of their own
+    age_of_new = new.stat().st_mtime
+    monkeypatch.setattr(rendering.time, "time", lambda: age_of_new - 1.0)
+    with rendering.private_folder():
+        pass
+    assert set(kept.iterdir()) == before
+    monkeypatch.setattr(rendering.time, "time", lambda: age_of_new + 1e6)
+    with rendering.private_folder():
+        pass
+    assert set(kept.iterdir()) == before - {new}
+    assert (linked / "thesis.tex").exists()

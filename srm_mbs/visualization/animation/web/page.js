@@ -15,7 +15,7 @@ viewer.set_transform = (path, matrix) => {
   });
 };
 
-if (scene === null) viewer.connect();
+if (scene === null) viewer.connect(`ws://${location.host}${location.pathname}socket`);
 else for (const text of scene) {
   const bytes = atob(text), buffer = new Uint8Array(bytes.length);
   for (let i = 0; i < bytes.length; i++) buffer[i] = bytes.charCodeAt(i);

@@ -90,8 +90,8 @@ def _stl(content: bytes) -> Triangles:
             return _binary_stl(content, count)
     if b"\0" in content or not content[:512].lstrip().lower().startswith(b"solid"):
         raise ValueError("its size does not agree with its number of triangles")
-    words = map(bytes.split, content.splitlines())
-    found = [line[1:] for line in words if line and line[0].lower() == b"vertex"]
+    words = content.lstrip().partition(b"\n")[2].lower().split()  # the first line has the name
+    found = [words[k + 1 : k + 4] for k, word in enumerate(words) if word == b"vertex"]
     if len(found) % 3:
         raise ValueError(f"{len(found)} vertices make no triangles")
     return _merged(np.array(found, dtype=float).reshape(len(found), 3))

@@ -52,7 +52,8 @@ class Machine:
         compiled = shutil.ignore_patterns("__pycache__", "_core*.so", "_core*.pyd", "built.py")
         for name in ("srm_mbs", "models", "urdf", "benchmarks", "tests"):
             shutil.copytree(ROOT / name, self.checkout / name, ignore=compiled)
-        shutil.copy(ROOT / "CMakeLists.txt", self.checkout)
+        for name in ("CMakeLists.txt", "pyproject.toml"):
+            shutil.copy(ROOT / name, self.checkout)
 
         package = self.site / "srm_mbs"
         shutil.copytree(self.checkout / "srm_mbs", package)

@@ -258,7 +258,8 @@ def test_garbage_does_not_disturb_the_server(visualizer: Any, request_: bytes) -
         socket.create_connection(("127.0.0.1", port_of(visualizer)), timeout=20.0) as connection,
     ):
         connection.sendall(request_)
-        connection.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(OSError):  # the server may have hung up
+            connection.shutdown(socket.SHUT_WR)
         answer = connection.recv(4096)
         assert not answer.startswith((b"HTTP/1.1 2", b"HTTP/1.1 1"))
     assert still_draws(visualizer)

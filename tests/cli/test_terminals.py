@@ -98,7 +98,13 @@ def test_an_output_that_is_full_is_an_error_of_one_line(arguments: tuple[str, ..
 
 
 @posix
-@pytest.mark.parametrize("closed", ["1>&-", "2>&-", "1>&- 2>&-", "0<&-"])
+@pytest.mark.parametrize(
+    "closed",
+    [
+        "1>&- 2>&-",
+        *(pytest.param(one, marks=pytest.mark.stress) for one in ("1>&-", "2>&-", "0<&-")),
+    ],
+)
 def test_streams_may_be_closed(closed: str) -> None:
     for arguments, status in ((["info", "four_bar"], 0), (["info", "no such"], 2)):
         line = subprocess.list2cmdline(command(*arguments))
@@ -115,7 +121,13 @@ def test_streams_may_be_closed(closed: str) -> None:
 
 @pytest.mark.parametrize(
     ("columns", "term"),
-    [("0", "dumb"), ("1", "unknown"), ("-5", ""), ("x", "dumb"), ("100000", "xterm-256color")],
+    [
+        ("0", "dumb"),
+        *(
+            pytest.param(*case, marks=pytest.mark.stress)
+            for case in (("1", "unknown"), ("-5", ""), ("x", "dumb"), ("100000", "xterm-256color"))
+        ),
+    ],
 )
 def test_odd_terminals_show_tables(columns: str, term: str) -> None:
     pty = pytest.importorskip("pty")

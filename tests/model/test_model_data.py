@@ -11,6 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.model.model_data import model_from_data, model_to_data
+from tests.support.bundled import load
 
 AXIS = np.array([0.6, 0.0, 0.8])
 JOINTS = {
@@ -93,7 +94,7 @@ def test_a_continuous_joint_about_any_axis_turns_about_it_after_json() -> None:
 
 @pytest.mark.parametrize("name", srm.bundled_models())
 def test_bundled_models_are_the_same_after_json(name: str) -> None:
-    model = srm.load(name).model
+    model = load(name).model
 
     assert_same(again(model), model)
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from tests.integration.test_singular_passages import PERIOD, crank_at, error_at_end, run
+from tests.integration.test_singular_passages import crank_at, error_at_end, run
+from tests.support.slider_crank import PERIOD
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
 

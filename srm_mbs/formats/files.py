@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator, Mapping
@@ -260,3 +261,8 @@ def checked_path(path: object, element: str = "path") -> Path:
             f"{name!r} is not a file name", element=element, remedy="Give the path of a file"
         )
     return Path(name)
+
+
+def file_name(path: str) -> str:
+    """The last part of a path of any operating system."""
+    return re.split(r"[\\/]", path)[-1]

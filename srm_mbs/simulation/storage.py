@@ -37,7 +37,7 @@ from srm_mbs.formats.archive import (
     json_object,
 )
 from srm_mbs.formats.build import rebuild
-from srm_mbs.formats.files import open_regular, writing
+from srm_mbs.formats.files import file_name, open_regular, writing
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import acting
@@ -210,10 +210,6 @@ _FILE_KEYS = "urdf|sdf|mjcf|gepetto|table|file|filename"
 _FULL_NAME = re.compile(rf"""(\b(?:{_FILE_KEYS})\s*=\s*["']){_FOLDER}(?=[^"'/\\])""")
 
 
-def _file_name(path: str) -> str:
-    return re.split(r"[\\/]", path)[-1]
-
-
 def _without_folders(text: str, source: Source) -> str:
     """``text`` with the files of the model named relative to its folders, and other files by their
     name alone."""
@@ -230,7 +226,7 @@ def _source_entry(source: Source, full_paths: bool) -> dict[str, Any]:
     entry = source.entries()
     if not full_paths:
         entry |= {key: _without_folders(entry[key], source) for key in ("description", "urdf")}
-        entry |= {key: _file_name(entry[key]) for key in ("path", "urdf_path")}
+        entry |= {key: file_name(entry[key]) for key in ("path", "urdf_path")}
     return entry
 
 
@@ -472,7 +468,7 @@ def _source(entry: saved_run.SourceEntry, path: Path, reach: Reach) -> Source:
     file, wherever the URDF lay when it was written."""
     values = entry.model_dump() | {
         "gravity": tuple(entry.gravity),
-        "urdf_path": str(path.parent / _file_name(entry.urdf_path)),
+        "urdf_path": str(path.parent / file_name(entry.urdf_path)),
         "reach": reach,
     }
     return Source(**values)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import os
-import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ from srm_mbs.analysis.summary import (
 )
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError
+from srm_mbs.formats.files import file_name
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
@@ -117,11 +117,6 @@ def _image(data: bytes, media_type: str, description: str, caption: str) -> dict
     return {"source": source, "description": description, "caption": caption}
 
 
-def _file_name(path: str) -> str:
-    """The last part of a path of any operating system."""
-    return re.split(r"[\\/]", path)[-1]
-
-
 def without_folders(text: object, mechanism: Mechanism, full_paths: bool) -> str:
     """``text`` about ``mechanism``, without the folders of its files unless ``full_paths``."""
     words = str(text)
@@ -129,7 +124,7 @@ def without_folders(text: object, mechanism: Mechanism, full_paths: bool) -> str
     if full_paths or source is None:
         return words
     for path in (source.path, source.urdf_path):
-        folder = path.removesuffix(_file_name(path))
+        folder = path.removesuffix(file_name(path))
         for name in {folder, os.path.abspath(folder) + os.sep} if folder else ():
             if len(name) > 1:
                 words = words.replace(name, "")
@@ -145,7 +140,7 @@ def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict
     if source is None:
         rows.append(("read from", "built in Python"))
     else:
-        path = source.path if full_paths else _file_name(source.path)
+        path = source.path if full_paths else file_name(source.path)
         rows += [("read from", path), ("format", source.format), ("base", source.base)]
     gravity = ", ".join(f"{g:.6g}" for g in model.gravity.linear)
     mass = sum(inertia.mass for inertia in list(model.inertias)[1:])

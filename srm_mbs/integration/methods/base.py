@@ -6,6 +6,7 @@ control decides whether the step is accepted, and only :meth:`Method.accept` cha
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -212,7 +213,7 @@ class Method(Protocol):
         """
 
 
-class DelegatingMethod:
+class DelegatingMethod(ABC):
     """A method whose steps are those of another one, its ``stepper``."""
 
     tableau: str | ButcherTableau
@@ -223,9 +224,9 @@ class DelegatingMethod:
         return get_tableau(self.tableau)
 
     @property
+    @abstractmethod
     def stepper(self) -> Method:
         """The method that makes the steps."""
-        raise NotImplementedError
 
     def start(
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm

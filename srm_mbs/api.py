@@ -25,7 +25,7 @@ from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.dae_run import run_dae
-from srm_mbs.simulation.options import RunOptions
+from srm_mbs.simulation.options import SINGULAR_TOLERANCE, RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.segmented_result import ResultTypes, SegmentedResult
 from srm_mbs.simulation.segmented_run import run
@@ -195,6 +195,7 @@ def simulate(
     progress: bool | Tick = False,
     backend: str = "auto",
     raise_on_failure: bool = False,
+    singular_tolerance: float = SINGULAR_TOLERANCE,
 ) -> Solution:
     """Simulate ``mechanism`` from ``t0`` to ``t_end`` (s).
 
@@ -228,14 +229,18 @@ def simulate(
     first_step, max_step
         First and longest step (s) of the step-size control.
     t_eval : (n,)
-        Times (s) at which the solution is given; by default the ends of the steps.
+        Times (s) at which the solution is given; by default the ends of the steps.  With them,
+        steps of more than 8 MB are not kept: what needs them (dense output, crossings, pictures,
+        saving) makes the run again, or is refused if it called a controller or forces of the user.
     events
         A function (t, q, v) -> float or a list of them; an event is where it passes zero.  As in
         ``scipy.integrate.solve_ivp``, the attribute ``terminal`` of the function (a bool, or a
         number of occurrences) ends the run there with status ``event``, and ``direction`` (> 0
-        or < 0) counts only zeros passed upwards or downwards.  Zeros at the start are no events.
-        Located on the dense output (:mod:`srm_mbs.integration.events`).  The attribute ``action``
-        changes the state or the mechanism there (:class:`srm_mbs.Event`).
+        or < 0) counts only zeros passed upwards or downwards.  Located on the dense output
+        (:mod:`srm_mbs.integration.events`).  The attribute ``action`` changes the state or the
+        mechanism there (:class:`srm_mbs.Event`).  Zeros at the start are no events, but for those
+        of events with an action and a direction that leave to the forbidden side, which act at once
+        (:mod:`srm_mbs.integration.contacts`).
     controller
         (t, q, v) -> generalised forces (nv,), N and N m, called at every stage; with
         ``sample_time`` at 0, T, 2 T, ... only, and what it returned is held in between.
@@ -260,6 +265,11 @@ def simulate(
         wherever it can be used (:func:`srm_mbs.backend`).
     raise_on_failure
         Raise :class:`SimulationError` instead of returning a partial solution.
+    singular_tolerance
+        Residual, over the size of the mechanism (scene diagonal, rad), up to which the closures
+        count as exactly singular where branches almost cross: data rounded to ten digits then go
+        straight on.  Above it the motion follows the data, and avoids the singular configuration.
+        0 follows the data always (docs/singular_configurations.md).
 
     Returns
     -------

@@ -14,7 +14,7 @@ import re
 import sys
 import unicodedata
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -24,12 +24,29 @@ __version__ = "0.1.0"
 CHECK_WRITING = "Check the folder, its permissions and the space on the disk"
 """Remedy for a file that cannot be written."""
 
+LONGEST_SHOWN = 300
+"""Characters of the representation of a value that a message shows."""
+MOST_LISTED = 24
+"""Names that a message lists: those of the keys of any table or element, not of a large model."""
 
 _PRINTABLE_ASCII = re.compile(r"[\x20-\x7e]*")
 _ESCAPED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Unicode categories: control, format (bidirectional overrides among them), surrogate, line and
 paragraph separator."""
 _SHORT = {"\t": r"\t", "\n": r"\n", "\r": r"\r"}
+
+
+def safe_repr(value: object) -> str:
+    """The representation of ``value`` for a message, of at most LONGEST_SHOWN characters.
+
+    It exists for every value: the representation of an object may raise anything, and Python
+    writes no integer of more than 4300 digits.
+    """
+    try:
+        text = str.__str__(repr(value))
+    except Exception:
+        return f"<{type(value).__name__} without representation>"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
 
 
 def printable(text: object, keep: str = "") -> str:
@@ -43,7 +60,10 @@ def printable(text: object, keep: str = "") -> str:
     keep
         Characters that stay as they are, such as the ends of lines.
     """
-    words = str(text)
+    try:
+        words = str.__str__(str(text))  # a subclass of str formats itself as it likes
+    except Exception:  # of the text of an exception, for example
+        words = safe_repr(text)
     if _PRINTABLE_ASCII.fullmatch(words):
         return words
     return "".join(
@@ -52,6 +72,14 @@ def printable(text: object, keep: str = "") -> str:
         else _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")
         for character in words
     )
+
+
+def known_names(names: Iterable[str]) -> str:
+    """The remedy that lists ``names``: the first MOST_LISTED, and how many more there are."""
+    every = tuple(names)
+    more = len(every) - MOST_LISTED
+    listed = ", ".join(every[:MOST_LISTED]) or "none"
+    return f"Known: {listed} and {more} more" if more > 0 else f"Known: {listed}"
 
 
 class _Printable(logging.Filter):

@@ -20,7 +20,7 @@ from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
 from srm_mbs.model.numbers import name_list, named_values
 
@@ -133,13 +133,15 @@ def assembly_modes(
     """
     if not isinstance(starts, Integral) or starts < 1:
         raise InputError(
-            f"starts = {starts!r} is not a positive whole number",
+            f"starts = {safe_repr(starts)} is not a positive whole number",
             element="starts",
             remedy="Give a positive number, for example 200",
         )
     if not isinstance(seed, Integral) or seed < 0:
         raise InputError(
-            f"seed = {seed!r} is not a natural number", element="seed", remedy="Give 0, 1, 2 ..."
+            f"seed = {safe_repr(seed)} is not a natural number",
+            element="seed",
+            remedy="Give 0, 1, 2 ...",
         )
     check_mechanism(mechanism)
     positions = named_values(q, "q")

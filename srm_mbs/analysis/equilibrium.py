@@ -35,7 +35,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
     smallest_singular_value,
 )
-from srm_mbs.errors import AnalysisError, InputError, get_logger
+from srm_mbs.errors import AnalysisError, InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
 from srm_mbs.model.numbers import name_list
 
@@ -331,7 +331,7 @@ def equilibrium(
     check_mechanism(mechanism)
     if not isinstance(search, str) or search not in ("stable", "nearest"):
         raise InputError(
-            f"search = {search!r} is not known",
+            f"search = {safe_repr(search)} is not known",
             element="search",
             remedy='Give "stable" or "nearest"',
         )

@@ -108,8 +108,8 @@ def _motion(
         elif states is not None:
             motion = [times, np.zeros((0, nq)), np.zeros((0, nv)), np.zeros((0, nv))]
         parts = [np.array(part, dtype=float) for part in motion]
-    except (TypeError, ValueError):
-        parts = []  # not numeric
+    except Exception:  # objects may raise anything
+        parts = []
     n = len(parts[0]) if parts and parts[0].ndim == 1 else 0
     shapes = [part.shape for part in parts]
     if shapes != [(n,), (n, nq), (n, nv), (n, nv)] or not all(

@@ -27,7 +27,7 @@ from srm_mbs.dynamics.controllers import Controller
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.simulation.options import positive
 from srm_mbs.visualization.animation.joint_motion import JointMotion
@@ -147,14 +147,16 @@ class Linearisation:
         """
         if not isinstance(frames, Integral) or frames < 1:
             raise InputError(
-                f"frames = {frames!r} is not a positive whole number",
+                f"frames = {safe_repr(frames)} is not a positive whole number",
                 element="frames",
                 remedy=f"Give a positive number, for example {FRAMES}",
             )
         count = len(self.eigenvalues)
         if not isinstance(mode, Integral) or not -count <= mode < count:
             raise InputError(
-                f"there is no mode {mode!r}", element="mode", remedy=f"Give 0 to {count - 1}"
+                f"there is no mode {safe_repr(mode)}",
+                element="mode",
+                remedy=f"Give 0 to {count - 1}",
             )
         mode = int(mode)
         turning = abs(float(self.eigenvalues[mode].imag))

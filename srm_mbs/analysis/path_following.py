@@ -18,7 +18,7 @@ from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import position_of
 from srm_mbs.model.numbers import finite_array, named_values
 from srm_mbs.visualization.animation.joint_motion import JointMotion
@@ -84,7 +84,7 @@ class FollowedPath:
         number = finite_array(duration, ())
         if number is None or not number > 0.0:
             raise InputError(
-                f"duration = {duration!r} is not positive",
+                f"duration = {safe_repr(duration)} is not positive",
                 element="duration",
                 remedy="Give a positive number of seconds",
             )
@@ -102,7 +102,7 @@ def _dragged(mechanism: Mechanism, values: Mapping[str, Any]) -> FloatArray:
         array = finite_array(given)
         if joint.nv != 1 or array is None or array.ndim > 1 or not array.size:
             raise InputError(
-                f"joint {name!r} cannot be dragged along {given!r}",
+                f"joint {name!r} cannot be dragged along {safe_repr(given)}",
                 element="values",
                 remedy="Give finite numbers (rad, m) for a joint of one degree of freedom",
             )

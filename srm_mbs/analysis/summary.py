@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import groupby
 from operator import itemgetter
@@ -237,10 +237,10 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
         values = []
         for key in fields(drive.law):  # type: ignore[arg-type]
             value = getattr(drive.law, key.name)
-            if isinstance(value, tuple) and len(value) > MAX_LISTED:
+            if isinstance(value, Sequence) and len(value) > MAX_LISTED:
                 values.append(f"{key.name} {value[0]:.6g} .. {value[-1]:.6g} ({len(value)})")
             elif value is not None:
-                text = vector_text(value) if isinstance(value, tuple) else f"{value:.6g}"
+                text = vector_text(value) if isinstance(value, Sequence) else f"{value:.6g}"
                 values.append(f"{key.name} {text}")
         values += ["absolute"] if drive.absolute else []
         yield drive.name, drive.law.type, place, ", ".join(values)

@@ -7,11 +7,13 @@ Exit status: 0; 1 when a run or a search did not reach its end; 2 for bad input;
 from __future__ import annotations
 
 import io
+import json
 import logging
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -49,8 +51,6 @@ T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
 HARNESS = Path("benchmarks", "work_precision", "__main__.py")
 """The benchmark in a checkout of the source."""
-LARGEST_PROJECT_FILE = 10**6
-"""Bytes of a project file that is read to recognise a checkout."""
 
 app = typer.Typer(
     name="srm-mbs",
@@ -135,6 +135,15 @@ def simulate(
     backend: Annotated[
         str, option("auto|python|kernel", "Backend that computes the run.")
     ] = "auto",
+    singular_tolerance: Annotated[
+        float | None,
+        option(
+            "S",
+            "Residual, over the size of the mechanism, up to which closures count as exactly "
+            "singular; 0 follows the data.",
+            show_default="1e-9",
+        ),
+    ] = None,
     out: Annotated[Path | None, option("RUN.npz", "Save the run, for plot and play.")] = None,
     plot: Annotated[Path | None, option("FILE", "Plot the run as .png, .pdf or .svg.")] = None,
     csv: Annotated[
@@ -147,6 +156,12 @@ def simulate(
     trace: playback.Trace = None,
     gaps: playback.Gaps = False,
     reactions: playback.Reactions = False,
+    full_paths: Annotated[
+        bool,
+        typer.Option(
+            "--full-paths", help="Name the folders of the mechanism's files in the saved run."
+        ),
+    ] = False,
     balance: Annotated[
         bool, typer.Option("--balance", help="Print the energy balance of the run.")
     ] = False,
@@ -160,6 +175,7 @@ def simulate(
     are written and the exit status is 1. Of an interrupted run singular passages are not counted.
     """
     from srm_mbs.analysis.summary import run_rows
+    from srm_mbs.simulation.options import SINGULAR_TOLERANCE
 
     check_output(out, "--out", (".npz",))
     if plot is not None:
@@ -173,6 +189,12 @@ def simulate(
     mechanism = srm_mbs.load(model, allow_outside=allow_outside)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
+    if full_paths and out is None:
+        raise InputError(
+            "it is about the saved run, and none is asked for",
+            element="--full-paths",
+            remedy="Give --out too",
+        )
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
     playback.check_time(at, t_end)
@@ -187,10 +209,11 @@ def simulate(
         step=step,
         progress=True if view is None else view,
         backend=backend,
+        singular_tolerance=_first(singular_tolerance, None, SINGULAR_TOLERANCE),
     )
     written, failed = write_files(
         [
-            (out, solution.save),
+            (out, partial(solution.save, full_paths=full_paths)),
             (plot, solution.plot),
             (csv, solution.to_csv),
             (html, partial(solution.export_html, **overlays)),
@@ -311,8 +334,9 @@ for command in (
 def benchmark(context: typer.Context) -> None:
     """Compare run time and error with other simulators.
 
-    In a checkout of the source only, and with the compiled kernel unless --backend python asks
-    for the Python reference.  The options are those of 'python -m benchmarks.work_precision'.
+    In the checkout that the package comes from only, and with the compiled kernel unless --backend
+    python asks for the Python reference.  The options are those of
+    'python -m benchmarks.work_precision'.
     """
     folder = Path.cwd()
     if not _is_checkout(folder):
@@ -320,11 +344,11 @@ def benchmark(context: typer.Context) -> None:
             typer.echo(context.get_help())
             raise typer.Exit
         raise InputError(
-            "the benchmark is not installed with the package, and this folder is not a checkout "
-            "of its source",
+            "the benchmark is not installed with the package, and this folder is not the checkout "
+            "that the package comes from",
             file=str(HARNESS),
             element="benchmark",
-            remedy="Run it at the top of a checkout of the source",
+            remedy="Run it at the top of a checkout of the source, after 'pip install .' there",
         )
     # A new process, which reads the number of threads before it loads NumPy.  It finds the modules
     # of the checkout before those of other folders.
@@ -335,25 +359,29 @@ def benchmark(context: typer.Context) -> None:
 
 
 def _is_checkout(folder: Path) -> bool:
-    """Whether a folder is the top of a checkout of this project.
+    """Whether a folder is the checkout that this package runs in or was installed from.
 
-    Its project file names the package, and it has the package and the benchmark as regular
-    packages, which precede those of the same name in other folders.
+    It has the package and the benchmark as regular packages, which precede those of the same name
+    in other folders.  Names alone would not do: any folder may have them.
     """
-    from srm_mbs.formats.files import read_text
-    from srm_mbs.formats.toml.description import parse_toml
-
-    try:
-        text = read_text(folder / "pyproject.toml", LARGEST_PROJECT_FILE)
-        project = parse_toml(text, "pyproject.toml").get("project")
-    except InputError:
-        return False
     needed = (HARNESS, Path("benchmarks", "__init__.py"), HARNESS.with_name("__init__.py"))
-    return (
-        isinstance(project, dict)
-        and project.get("name") == "srm-mbs"
-        and all((folder / file).is_file() for file in (*needed, Path("srm_mbs", "__init__.py")))
+    own = (Path(srm_mbs.__file__).parents[1], *_installed_from())
+    return any(place.is_dir() and place.samefile(folder) for place in own) and all(
+        (folder / file).is_file() for file in (*needed, Path("srm_mbs", "__init__.py"))
     )
+
+
+def _installed_from() -> Iterator[Path]:
+    """Folders from which the package was installed (PEP 610)."""
+    from urllib.parse import urlsplit
+    from urllib.request import url2pathname
+
+    from srm_mbs._kernel.build_hash import installation_records
+
+    for record in installation_records(sys.path):
+        origin = json.loads(record) if record else {}
+        if "dir_info" in origin:
+            yield Path(url2pathname(urlsplit(origin["url"]).path))
 
 
 def main() -> None:

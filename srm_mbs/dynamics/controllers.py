@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import ControllerError
+from srm_mbs.errors import ControllerError, safe_repr
 
 
 class HeldForce:
@@ -76,7 +76,7 @@ def evaluate_callback(
     try:
         result = np.array(function(t, q.copy(), v.copy()), dtype=float, order="C")
     except Exception as error:
-        raise ControllerError(f"{name} raised {error!r} at t = {t:.6g} s") from error
+        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s") from error
     if result.shape != (size,):
         problem = f"an array of shape {result.shape}"
     elif not np.isfinite(result).all():

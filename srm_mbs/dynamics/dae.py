@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_columns, whiten
 from srm_mbs.dynamics.system import Zone
-from srm_mbs.errors import CallbackError, EvaluationError, InputError
+from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr
 from srm_mbs.model.dae import SemiExplicitDAE
 
 
@@ -285,7 +285,7 @@ class DaeSystem:
                 raise TypeError("complex values")
             value = np.array(returned, dtype=float)
         except Exception as error:
-            raise CallbackError(f"{name} raised {error!r} at t = {t:.6g}") from error
+            raise CallbackError(f"{name} raised {safe_repr(error)} at t = {t:.6g}") from error
         if value.shape not in self._accepted(name):
             raise CallbackError(
                 f"{name} returned shape {value.shape} at t = {t:.6g}; "
@@ -304,7 +304,7 @@ class DaeSystem:
             value = np.asarray(self.problem.g(t, x.copy()), dtype=float)
         except Exception as error:
             raise InputError(
-                f"g raised {error!r} at the start",
+                f"g raised {safe_repr(error)} at the start",
                 element="g",
                 remedy="Give a function of (t, x) that returns (ny,) values",
             ) from error

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import (
     COINCIDENT,
@@ -205,10 +206,21 @@ class BushingEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Bushing) -> None:
+        self.name = force.name
         self.a, self.b = ResolvedAnchor(model, force.a), ResolvedAnchor(model, force.b)
         self.support = self.a.support - self.b.support
         self.stiffness = np.array(force.stiffness, dtype=float)
         self.damping = np.array(force.damping, dtype=float)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it has a moment."""
+        return bool(self.stiffness[3:].any() or self.damping[3:].any())
+
+    def rotation(self, data: pin.Data) -> FloatArray:
+        """Rotation vector (3,) rad of a's axes relative to b's, up to half a turn."""
+        relative = self.b.placement(data).actInv(self.a.placement(data))
+        return pin.log3(relative.rotation)  # type: ignore[no-any-return]
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         Ta, Tb = self.a.placement(data), self.b.placement(data)
@@ -361,6 +373,14 @@ def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
     return ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None
 
 
+def over_half_turn(mechanism: MechanismData, q: FloatArray) -> tuple[str, ...]:
+    """See :meth:`ForceKinematics.over_half_turn`."""
+    forces = resolved_forces(mechanism)
+    if forces is None or not forces.bushings:
+        return ()
+    return forces.over_half_turn(workspace(mechanism.model), q)
+
+
 class ForceKinematics:
     """All force elements of a mechanism: ``forces`` on the tree ``model``."""
 
@@ -369,6 +389,42 @@ class ForceKinematics:
         self._elements: list[Evaluator] = [
             _EVALUATORS[type(force)](model, force) for force in forces
         ]
+
+    @property
+    def bushings(self) -> list[BushingEvaluator]:
+        """The bushings that have a moment."""
+        return [e for e in self._elements if isinstance(e, BushingEvaluator) and e.turns]
+
+    def over_half_turn(self, data: pin.Data, q: FloatArray) -> tuple[str, ...]:
+        """Names of the bushings that turn by more than half a turn along the configurations q
+        (n, nq): there their rotation vector, and with it their moment, jumps to the opposite."""
+        pin.forwardKinematics(self._model, data, q[0])
+        before = {
+            bushing: turn
+            for bushing, turn in ((e, e.rotation(data)) for e in self.bushings)
+            if float(np.linalg.norm(turn)) + self._largest_motion(bushing, q) >= np.pi
+        }
+        found: dict[str, None] = {}
+        for row in q if before else ():
+            pin.forwardKinematics(self._model, data, row)
+            for bushing, last in before.items():
+                turn = bushing.rotation(data)
+                far = min(float(turn @ turn), float(last @ last)) > (0.5 * np.pi) ** 2
+                if far and float(turn @ last) < 0.0:
+                    found[bushing.name] = None
+                before[bushing] = turn
+        return tuple(found)
+
+    def _largest_motion(self, bushing: BushingEvaluator, q: FloatArray) -> float:
+        """Sum of the ranges (rad) of the joints between its links; infinite with others than
+        those of one bounded coordinate."""
+        total = 0.0
+        for joint in list(self._model.joints)[1:]:
+            if bushing.support[joint.idx_v : joint.idx_v + joint.nv].any():
+                if (joint.nq, joint.nv) != (1, 1):
+                    return np.inf
+                total += float(np.ptp(q[:, joint.idx_q]))
+        return total
 
     def generalised(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
         """tau (nv,) in N and N m at q (nq,), v (nv,) and t (s).

@@ -12,7 +12,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.mobility import Mobility, mobility
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.constraints.structure import Structure, structure_of
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.mechanism import MechanismData, per_start
 
@@ -88,6 +88,13 @@ class Mechanism(MechanismData):
             structure_of.keep(changed, structure.at(changed))
         return changed
 
+    def continued(self, q: Any, v: Any) -> Self:
+        """The same mechanism at another state, q (nq,) and v (nv,), of a run from its own: drives
+        continue their motion, and the units remain those of the run."""
+        changed = super().with_state(q, v)
+        structure_of.keep(changed, self.structure)
+        return changed.with_drive_curves(self.drive_curves) if self.drives else changed
+
     def with_drive_curves(self, curves: dict[str, Curve]) -> Self:
         """The same mechanism, whose driven coordinates follow ``curves`` (by the drive's name)
         instead of beginning at q0: a motion that began before the initial state."""
@@ -129,7 +136,7 @@ def check_mechanism(mechanism: Any) -> None:
     """
     if not isinstance(mechanism, Mechanism):
         raise InputError(
-            f"{mechanism!r} is not a mechanism",
+            f"{safe_repr(mechanism)} is not a mechanism",
             element="mechanism",
             remedy="Give srm.load(...) or srm.Mechanism(...)",
         )

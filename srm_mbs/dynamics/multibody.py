@@ -13,6 +13,8 @@ joint damping and friction, and force elements.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property, partial
 from typing import Any
 
@@ -150,6 +152,42 @@ class ClosedTerms:
         position = p.normal(self._loops.g[p.order])
         return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self._v))])
 
+    def free_acceleration(self) -> FloatArray:
+        """M^-1 f (nv,)."""
+        return self._p.unwhiten(self._p.white_force)
+
+    def multiplier_of(self, a: FloatArray) -> FloatArray:
+        """E (G a + Gdot v - s'') (nv,) of the free acceleration ``a`` (nv,)."""
+        p = self._p
+        return p.unwhiten(p.white_project(a) + p.normal(self._loops.bias[p.order]))
+
+    def driven_residuals(self) -> FloatArray:
+        """g - s of the rows of the drives."""
+        return self._loops.g[self._loops.driven_rows].copy()
+
+    def closing(self, allowed: FloatArray) -> FloatArray:
+        """E g (nv,), without ``allowed`` of the rows of the drives."""
+        g = self._loops.g.copy()
+        g[self._loops.driven_rows] -= allowed
+        return self._p.unwhiten(self._p.normal(g[self._p.order]))
+
+    def branch_tangents(self) -> FloatArray:
+        """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives."""
+        p, rows = self._p, self._loops.driven_rows
+        units = np.eye(len(self._loops.g))[:, rows]
+        driven = np.array([p.normal(unit[p.order]) for unit in units.T]).reshape(-1, len(self._v))
+        whole = np.linalg.norm(driven, axis=1)
+        own: list[FloatArray] = []
+        for white, size in zip(driven, whole):
+            for _ in range(2):
+                for other in own:
+                    white = white - other * (other @ white)
+            left = np.linalg.norm(white)
+            if left > DEPENDENT_DRIVE * size:
+                own.append(white / left)
+        white = np.column_stack([p.complement(), *own])
+        return p.unwhiten(white)
+
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         p = self._p
         position = p.unwhiten(p.normal(self._loops.g[p.order]))
@@ -213,10 +251,24 @@ class Mechanics(Manifold):
         """Add the work of the compiled kernel for this system to the counters."""
         self.evaluations += evaluations
 
+    def restart(self) -> None:
+        """Begin another run: the counters are zero."""
+        self.evaluations = 0
+
     def between(self, first: float, last: float) -> None:
         """Limit the times of evaluations to [``first``, ``last``] (s): the equations on one side of
         a breakpoint, where its other side would be evaluated otherwise."""
         self._first, self._last = first, last
+
+    @contextmanager
+    def everywhere(self) -> Iterator[None]:
+        """Within this context, evaluations are not limited to any times."""
+        limits = self._first, self._last
+        self.between(-np.inf, np.inf)
+        try:
+            yield
+        finally:
+            self.between(*limits)
 
     def controlled_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) of the controller; 0 without one."""
@@ -238,6 +290,23 @@ class Mechanics(Manifold):
         """Controller, joint damping and joint friction (nv,)."""
         passive = self.damping_force(v) + self.friction_force(v)
         return self.controlled_force(t, q, v) + passive
+
+    def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
+        t = min(max(t, self._first), self._last)
+        force = self.applied_force(t, q, v)
+        if self._forces is not None:
+            pin.forwardKinematics(self.model, self.data, q, v)
+            pin.computeJointJacobians(self.model, self.data)
+            force = force + self._forces.generalised(self.data, q, v, t)
+        gravity: FloatArray = pin.computeGeneralizedGravity(self.model, self.data, q)
+        return force - gravity
+
+    def inertial_force(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """-C(q, v) v (nv,): Coriolis and centrifugal forces."""
+        gravity: FloatArray = pin.computeGeneralizedGravity(self.model, self.data, q).copy()
+        effects: FloatArray = pin.nonLinearEffects(self.model, self.data, q, v)
+        return gravity - effects
 
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel
@@ -286,6 +355,8 @@ class Mechanics(Manifold):
         return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 
+DEPENDENT_DRIVE = 1e-10
+"""Part of a drive's motion without those of others below which it is one of theirs."""
 _OVERFLOW = 1e100
 """Largest |x_i| of a state above which products of its rates may overflow."""
 
@@ -397,6 +468,11 @@ class ClosedSystem(Mechanics):
         super().count(evaluations, factorisations)
         self.projection.factorisations += factorisations
 
+    def restart(self) -> None:
+        """Begin another run: the counters are zero."""
+        super().restart()
+        self.projection.factorisations = 0
+
     @cached_property
     def singularities(self) -> SingularityAnalysis:
         """Data for the analysis of singular configurations."""
@@ -415,7 +491,7 @@ class ClosedSystem(Mechanics):
         """How often the constraint algebra was factorised."""
         return self.projection.factorisations
 
-    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> ClosedTerms:
         """Factorise M and G at ``state``; see :class:`~srm_mbs.dynamics.system.System`.
 
         crba in the WORLD convention leaves placements and the world Jacobian in ``data``,

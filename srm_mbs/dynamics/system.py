@@ -15,6 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.errors import EvaluationError
@@ -39,6 +41,12 @@ class Zone:
     threshold: float
     predict: Callable[[float], FloatArray | None]
     normals: FloatArray | None = None
+
+    @classmethod
+    def without_prediction(cls, threshold: float, nv: int) -> Zone:
+        """The zone whose dropped rows have no multiplier."""
+        nothing = np.zeros(nv)
+        return cls(threshold, lambda _: nothing)
 
 
 class Terms(Protocol):

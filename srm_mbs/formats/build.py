@@ -18,7 +18,14 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import AssemblyError, EvaluationError, InputError, get_logger, naming
+from srm_mbs.errors import (
+    AssemblyError,
+    EvaluationError,
+    InputError,
+    get_logger,
+    known_names,
+    naming,
+)
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
@@ -53,7 +60,7 @@ def _check_joint_names(description: Description, model: pin.Model) -> None:
             raise InputError(
                 f"there is no moving joint {name!r}",
                 element=where,
-                remedy=f"Known: {', '.join(known)}",
+                remedy=known_names(known),
             )
     for where, name in acting:
         if name in description.lock:

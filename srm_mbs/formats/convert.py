@@ -59,7 +59,9 @@ def convert(
     flag(force, "force")
     if description.suffix.lower() != ".toml":
         raise InputError(
-            f"the suffix {description.suffix!r} is not .toml", file=str(out), remedy="Use .toml"
+            f"the suffix {description.suffix!r} is not .toml",
+            file=str(description),
+            remedy="Use .toml",
         )
     urdf = description.with_suffix(".urdf")
     overrides = Overrides(

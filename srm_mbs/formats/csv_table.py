@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, naming
+from srm_mbs.errors import InputError, known_names, naming
 from srm_mbs.formats.files import check_name, open_regular, shortened
 from srm_mbs.model.reach import Reach
 
@@ -83,7 +83,7 @@ class CsvTable:
                     f"there is no column {name!r}" if missing else f"two columns {name!r}",
                     file=self.file,
                     element="first line",
-                    remedy=f"Known: {', '.join(self.names) or 'none'}",
+                    remedy=known_names(self.names),
                 )
         wanted = [self.names.index(name) for name in names]
         wrong = [self.faults[k] for k in (-1, *wanted) if k in self.faults]
@@ -94,7 +94,8 @@ class CsvTable:
                 file=self.file,
                 remedy=GIVE_NUMBERS,
             )
-        return self.values[:, wanted]
+        everything = wanted == list(range(len(self.names)))
+        return self.values if everything else self.values[:, wanted]
 
 
 def read_csv(path: Path) -> CsvTable:
@@ -122,7 +123,8 @@ class _Reader:
     def __init__(self, file: str) -> None:
         self.file = file
         self.names: tuple[str, ...] = ()
-        self.blocks: list[FloatArray] = []
+        # Grows where it is: a list of blocks and their concatenation would take twice the memory.
+        self.numbers = bytearray()
         self.count = 0
         self.faults: dict[int, tuple[int, str]] = {}
 
@@ -141,9 +143,8 @@ class _Reader:
                 self.rows(csv.reader(lines.decode("utf-8").split("\n")))
         if quoted:
             self.rows(csv.reader(_lines(chain(quoted, chunks))))
-        width = len(self.names)
-        values = np.concatenate(self.blocks) if self.blocks else np.empty((0, width))
-        self.blocks.clear()
+        found = np.frombuffer(self.numbers) if self.count else np.empty(0)
+        values = found.reshape(self.count, len(self.names))
         return CsvTable(self.file, self.names, values, self.faults)
 
     def header(self, cells: Iterable[str]) -> None:
@@ -179,7 +180,7 @@ class _Reader:
         return True
 
     def append(self, block: FloatArray) -> None:
-        self.blocks.append(block)
+        self.numbers += block.tobytes()
         self.count += len(block)
         if self.count * len(self.names) > MOST_NUMBERS:
             raise self.fault(f"it has more than {MOST_NUMBERS} cells", "Leave out columns or rows")

@@ -14,14 +14,24 @@ import stat
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import ModuleType
 from typing import IO
 
 from srm_mbs.errors import InputError
+
+fcntl: ModuleType | None
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 LARGEST_FILE = 64 * 10**6
 """Bytes of a file that is read, unless the caller allows more."""
 LONGEST_SUFFIX = 12
 """Characters of a suffix that the name of a temporary file keeps: programs choose formats by it."""
+
+_TEMPORARY = re.compile(r"\.srm-[0-9a-f]{16}(?:\..*)?")
+"""Names of temporary files."""
 
 # Without O_NONBLOCK, opening a pipe waits for somebody to write; O_BINARY is of Windows.
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -144,14 +154,17 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     the place of ``path`` at the end of a ``with`` block that raises nothing.
 
     Until then ``path`` is what it was, whatever interrupts the program.  A device or a pipe is
-    written to as it is.
+    written to as it is.  The temporary file is locked while it is written, where locks of files
+    exist (``flock``); those that killed programs left in the folder, which nobody holds, are
+    removed.
 
     Raises
     ------
     InputError
         If ``path`` is not a file name.
     OSError
-        If the file cannot be written, or is write-protected; it names ``path``.
+        If the file cannot be written, is write-protected, or nothing was written; it names
+        ``path``.
     """
     path = checked_path(path)
     target = Path(os.path.realpath(path))  # a link stays a link
@@ -161,16 +174,59 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.exists() and not os.access(target, os.W_OK):
         # Replacing it needs permissions of the folder only.
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(path))
-    suffix = target.suffix if len(target.suffix) <= LONGEST_SUFFIX else ""
-    temporary = target.with_name(f".srm-{secrets.token_hex(8)}{suffix}")
+    temporary: Path | None = None
+    held: int | None = None
     try:
+        temporary, held = _locked_beside(target)
+        _remove_abandoned(target.parent)
         yield temporary
         _finish(temporary, target)
     except OSError as error:
         raise _about(error, path, temporary) from error
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        # In this order: others may remove what nobody holds.
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+        if held is not None:
+            os.close(held)
+
+
+def _locked_beside(target: Path) -> tuple[Path, int | None]:
+    """An empty file in the folder of ``target``, and its locked descriptor; where there are no
+    locks, a path without a file and None."""
+    suffix = target.suffix if len(target.suffix) <= LONGEST_SUFFIX else ""
+    while True:
+        path = target.with_name(f".srm-{secrets.token_hex(8)}{suffix}")
+        if fcntl is None:
+            return path, None
+        opened = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.fstat(opened).st_nlink:
+                return path, opened
+        except BlockingIOError:
+            pass
+        except OSError:  # not every file system can
+            return path, opened
+        # Another writer took it for abandoned before it was locked.
+        os.close(opened)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove the temporary files in ``folder`` that no writer holds: those of killed programs."""
+    if fcntl is None:
+        return
+    with suppress(OSError):  # the folder cannot be listed
+        for path in [folder / name for name in os.listdir(folder) if _TEMPORARY.fullmatch(name)]:
+            with suppress(OSError):  # held, removed by another writer, or somebody else's
+                opened = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    if stat.S_ISREG(os.fstat(opened).st_mode):
+                        path.unlink()
+                finally:
+                    os.close(opened)
 
 
 def _finish(temporary: Path, target: Path) -> None:
@@ -178,6 +234,8 @@ def _finish(temporary: Path, target: Path) -> None:
     with suppress(OSError):  # a new file has the mode that open() gives it
         temporary.chmod(stat.S_IMODE(target.stat().st_mode))
     with temporary.open("rb+") as file:
+        if not os.fstat(file.fileno()).st_size:  # the program that was to write it did not
+            raise OSError(errno.EIO, "nothing was written")
         os.fsync(file.fileno())
     os.replace(temporary, target)
     if os.name == "posix":
@@ -189,9 +247,10 @@ def _finish(temporary: Path, target: Path) -> None:
             os.close(folder)
 
 
-def _about(error: OSError, path: str | os.PathLike[str], temporary: Path) -> OSError:
+def _about(error: OSError, path: str | os.PathLike[str], temporary: Path | None) -> OSError:
     """``error``, naming ``path`` in place of the temporary file."""
-    if error.errno is None or error.filename not in (None, str(temporary), temporary):
+    made = temporary is not None
+    if error.errno is None or (made and error.filename not in (None, str(temporary), temporary)):
         return error
     return OSError(error.errno, error.strerror or os.strerror(error.errno), os.fspath(path))
 
@@ -245,6 +304,8 @@ def checked_path(path: object, element: str = "path") -> Path:
     """
     try:
         name = os.fspath(path)  # type: ignore[call-overload]
+        if isinstance(name, str):
+            name = str.__str__(name)  # a subclass formats itself as it likes
         os.fsencode(name)  # lone surrogates have no bytes
     except UnicodeEncodeError as error:
         raise InputError(

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import check_name, shortened
 from srm_mbs.formats.translation import Options, Translation
@@ -95,7 +95,7 @@ def _fault(element: str, problem: str, remedy: str) -> InputError:
 
 
 def _unknown(key: str, what: str, name: str, known: Iterable[str]) -> InputError:
-    return _fault(key, f"the URDF has no {what} {name!r}", f"Known: {', '.join(sorted(known))}")
+    return _fault(key, f"the URDF has no {what} {name!r}", known_names(sorted(known)))
 
 
 def _read(text: str) -> dict[str, list[Any]]:

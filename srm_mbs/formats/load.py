@@ -14,7 +14,7 @@ import numpy as np
 import tomli_w
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, get_logger, naming
+from srm_mbs.errors import InputError, get_logger, naming, safe_repr
 from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
@@ -65,7 +65,7 @@ def _gravity(value: Any) -> tuple[float, float, float]:
     array = finite_array(value, (3,))
     if array is None or not (np.abs(array) <= LARGEST_MAGNITUDE).all():
         raise InputError(
-            f"gravity = {value!r} is not three finite numbers",
+            f"gravity = {safe_repr(value)} is not three finite numbers",
             element="gravity",
             remedy="Give [x, y, z] in m/s^2",
         )
@@ -94,7 +94,9 @@ def _translated(
     base = description.base if overrides.base is None else overrides.base
     if not isinstance(base, str) or base not in ROOT_JOINTS:
         raise InputError(
-            f"there is no base {base!r}", element="base", remedy=f"Known: {', '.join(ROOT_JOINTS)}"
+            f"there is no base {safe_repr(base)}",
+            element="base",
+            remedy=f"Known: {', '.join(ROOT_JOINTS)}",
         )
     gravity = description.gravity if overrides.gravity is None else overrides.gravity
     source = Source(
@@ -174,7 +176,7 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
         generated = GENERATED.match(name)
         if generated is None:
             raise InputError(
-                f"there is no bundled mechanism {name!r}",
+                f"there is no bundled mechanism {safe_repr(name)}",
                 remedy=f"Known: {', '.join(bundled_models())}; or give the path of a file",
             )
         return _generated(int(generated[1]), overrides)
@@ -261,7 +263,7 @@ def _generated(n: int, overrides: Overrides) -> Reading:
     largest = largest_n()
     if n > largest:
         raise InputError(
-            f"an N-four-bar with N = {n} is too large for the memory of its load-time analysis",
+            f"an N-four-bar with N = {safe_repr(n)} is too large for the memory of its analysis",
             element="n",
             remedy=f"Take N <= {largest}"
             + (f", or N <= {LARGEST_N} with the compiled kernel" if largest < LARGEST_N else ""),
@@ -293,6 +295,8 @@ def n_four_bar(n: int) -> Mechanism:
     """
     if not isinstance(n, Integral) or n < 1:
         raise InputError(
-            f"an N-four-bar needs n >= 1, not {n!r}", element="n", remedy="Give a positive integer"
+            f"an N-four-bar needs n >= 1, not {safe_repr(n)}",
+            element="n",
+            remedy="Give a positive integer",
         )
     return assembled(_generated(int(n), Overrides()))

@@ -14,7 +14,7 @@ from defusedxml import DefusedXmlException
 from defusedxml import ElementTree as SafeTree
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, naming
+from srm_mbs.errors import InputError, known_names, naming
 from srm_mbs.formats.files import LARGEST_FILE, LONGEST_NAME, check_name, shortened
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
@@ -81,7 +81,7 @@ class XmlFile:
 
     def unknown(self, where: str, problem: str, known: Iterable[str]) -> InputError:
         """The error to raise about a name in ``where`` that is none of those ``known``."""
-        return self.fault(where, problem, f"Known: {', '.join(known) or 'none'}")
+        return self.fault(where, problem, known_names(known))
 
     def ignore(self, what: str) -> None:
         """Count something that is left out knowingly, as ``<sensor> element``."""

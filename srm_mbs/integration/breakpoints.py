@@ -226,6 +226,12 @@ class BreakpointHandler:
         self._index = index
         self._evaluate_within(index)
 
+    def follow(self, index: int) -> None:
+        """Follow the kernel into the interval ``index``, if it entered that by itself."""
+        if index != self._index:
+            self._index = index
+            self._evaluate_within(index)
+
     def next(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
         """Enter the next interval; ``memory`` with its first stage.
 
@@ -270,10 +276,11 @@ class BreakpointHandler:
 
         ``index``: of that interval, if the kernel entered it by itself.
         """
-        if index is not None and index != self._index:
-            self._index = index
-            self._evaluate_within(index)
-        return singular_arrival(self._system, t, state, memory, self._norm, self.end)
+        if index is not None:
+            self.follow(index)
+        return singular_arrival(
+            self._system, t, state, memory, self._norm, self.end, self._evaluator
+        )
 
     def done(self) -> None:
         """The run is over: the system may be evaluated at any time."""

@@ -27,8 +27,9 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.system import System, Zone
-from srm_mbs.errors import InputError
+from srm_mbs.errors import EvaluationError, InputError, safe_repr
 from srm_mbs.integration.methods.base import StepResult
+from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 
@@ -44,9 +45,10 @@ CLOSE_SIGMA = 1.0
 a singular configuration."""
 COMPARED_AT = np.array([0.25, 0.5, 0.75])
 """Fractions of the step at which polynomials are compared."""
-STEP_PLACEMENTS = ("", "a priori", "redone")
+STEP_PLACEMENTS = ("", "a priori", "redone", "critical")
 """How steps are placed around singular configurations; see
 :class:`~srm_mbs.integration.methods.base.StepResult`."""
+CRITICAL = STEP_PLACEMENTS.index("critical")
 
 
 def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
@@ -61,7 +63,7 @@ def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
         times = np.array(t, dtype=float)
     except Exception:  # objects may raise anything
         raise InputError(
-            f"t = {t!r} does not consist of numbers", element="t", remedy="Give times (s)"
+            f"t = {safe_repr(t)} does not consist of numbers", element="t", remedy="Give times (s)"
         ) from None
     if times.ndim != 1 and not (scalar and times.ndim == 0):
         kinds = "a scalar or a vector of times" if scalar else "a vector of times"
@@ -88,11 +90,12 @@ def check_within(t: FloatArray, start: float, end: float) -> None:
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
-    """Whether stages of the step (abscissae and sigma, (s + 1,)) lie close to a zero of sigma."""
+    """Whether stages of the step (abscissae and sigma, (s + 1,)) lie close to a zero of sigma,
+    compared with its change, or so close that only nodes of the branch solve them."""
     if not np.isfinite(sigmas).all():
         return False
     change = float(np.max(np.abs(sigmas[1:] - sigmas[0]) / abscissae[1:]))
-    return bool(sigmas.min() < CLOSE_SIGMA * change)
+    return bool(sigmas.min() < max(CLOSE_SIGMA * change, BRANCH_SIGMA))
 
 
 class HermiteStep:
@@ -237,9 +240,21 @@ class StepData:
         return float(self.times[-1]) if self.stop is None else self.stop
 
     @property
+    def last_length(self) -> float:
+        """Length (s) of the last step, 0 without any."""
+        return float(self.times[-1] - self.times[-2]) if self.count else 0.0
+
+    @property
     def count(self) -> int:
         """Number of steps."""
         return len(self.times) - 1
+
+    @property
+    def between_nodes(self) -> list[int]:
+        """The steps, ascending, that are known by the states and rates at their ends alone: those
+        with a stage in the zone, and those past a critical configuration."""
+        critical = np.flatnonzero(self.placements == CRITICAL).tolist()
+        return sorted({*self.zones, *critical})
 
     def smooth_interval(self, step: int) -> tuple[int, int]:
         """First and last end of a step, as indices into ``times``, of the smooth interval around
@@ -315,10 +330,26 @@ class DenseOutput:
         The tableau of the run.
     steps
         The accepted steps.
+    end_state : (nx,)
+        State at the end of the run, if it is known.
+
+    Attributes
+    ----------
+    file
+        The file that the steps are from; empty for a run of this program.
     """
 
-    def __init__(self, system: System, scheme: ButcherTableau, steps: StepData) -> None:
+    file = ""
+
+    def __init__(
+        self,
+        system: System,
+        scheme: ButcherTableau,
+        steps: StepData,
+        end_state: FloatArray | None = None,
+    ) -> None:
         self._system = system
+        self._end_state = end_state
         self._extension = scheme.dense
         self._abscissae = scheme.abscissae
         self._smooth: dict[int, HermiteStep] = {}
@@ -330,8 +361,11 @@ class DenseOutput:
 
         Raises
         ------
-        ValueError
-            If a time lies outside the run.
+        InputError
+            If a time lies outside the run; of a run from a file also if a stage of its steps cannot
+            be evaluated.
+        EvaluationError
+            If a stage cannot be evaluated.
         """
         self.check(t)
         times = self._steps.times
@@ -340,10 +374,20 @@ class DenseOutput:
             out[:] = self._steps.states[0]
             return out
         index = np.clip(np.searchsorted(times, t, side="right") - 1, 0, self._steps.count - 1)
-        for step in np.unique(index):
+        # np.unique is slower, and aborts a program that ends while a daemon thread is in it.
+        for step in sorted(set(index.tolist())):
             here = index == step
             h = times[step + 1] - times[step]
-            out[here] = self._in_step(int(step), (t[here] - times[step]) / h)
+            try:
+                out[here] = self._in_step(step, (t[here] - times[step]) / h)
+            except EvaluationError as error:
+                if not self.file:
+                    raise
+                raise InputError(
+                    f"the run cannot be read in the step from t = {times[step]:.9g} s: {error}",
+                    file=self.file,
+                    remedy="Run the simulation again: the numbers in the file disagree",
+                ) from error
         return out
 
     def check(self, t: FloatArray) -> None:
@@ -356,8 +400,10 @@ class DenseOutput:
         data = self._steps
         if data.stop is None:
             return data.times, data.states
+        if self._end_state is None:
+            self._end_state = self(np.array([data.stop]))[0]
         times, states = data.times.copy(), data.states.copy()
-        times[-1], states[-1] = data.stop, self(np.array([data.stop]))[0]
+        times[-1], states[-1] = data.stop, self._end_state
         return times, states
 
     def complete(self) -> StepData:
@@ -384,6 +430,8 @@ class DenseOutput:
         """Whether a step is interpolated between ends of steps (:class:`HermiteStep`)."""
         data = self._steps
         first, last = data.smooth_interval(step)
+        if data.placements[step] == CRITICAL:
+            return True
         return last - first > 1 and (
             step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
         )

@@ -6,16 +6,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import ControllerError, EvaluationError, EventError
+from srm_mbs.errors import ControllerError, EvaluationError, EventError, safe_repr
 from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
+from srm_mbs.integration.critical_passages import CriticalPassages
 from srm_mbs.integration.dense_output import StepData, step_data
-from srm_mbs.integration.events import EventWatch, Stop
+from srm_mbs.integration.events import EventWatch, Stop, step_dense
 from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, RunFailure, StopReason
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -86,10 +88,18 @@ class RunRecord:
         raised.
     message
         When, why, and what to try.
-    stop
-        Where a terminal event ended the run (s), within the last step; None without one.
+    stop, stop_state
+        Time (s) and state (nx,) where a terminal event ended the run, within the last step; None
+        without one.
     breaks
         Numbers of the steps after which a breakpoint lies.
+    made
+        Number of accepted steps, also of those that a :class:`StepSink` took.
+    watched_time
+        End (s) of the first of the last WATCHED_STEPS of them.
+    rest
+        Time (s) and state (nx,) at the start of the steps that are still here; None if none was
+        taken.
     """
 
     t0: float
@@ -101,8 +111,12 @@ class RunRecord:
     stop_reason: StopReason | None = None
     message: str = ""
     stop: float | None = None
+    stop_state: FloatArray | None = None
     wall_time: float = 0.0
     breaks: list[int] = field(default_factory=list)
+    made: int = 0
+    watched_time: float = 0.0
+    rest: tuple[float, FloatArray] | None = None
 
     def mark_finished(self, t_end: float) -> None:
         """Mark it as complete."""
@@ -112,6 +126,7 @@ class RunRecord:
     def mark_stopped(self, stop: Stop) -> None:
         """Mark it as ended by a terminal event."""
         self.status, self.stop, self.message = RunStatus.EVENT, stop.time, stop.message
+        self.stop_state = stop.state
 
     def mark_aborted(self, t: float, error: BaseException) -> None:
         """Mark it as interrupted, or failed because a function of the user raised, at ``t``."""
@@ -154,9 +169,10 @@ class RunRecord:
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
+        t0, x0 = (self.t0, self.x0) if self.rest is None else self.rest
         return step_data(
-            self.t0,
-            self.x0,
+            t0,
+            x0,
             self.times,
             self.steps,
             scheme,
@@ -164,6 +180,17 @@ class RunRecord:
             self.stop,
             self.breaks,
         )
+
+
+class StepSink(Protocol):
+    """Takes the steps of a run from its record, so that they need no memory."""
+
+    @property
+    def block(self) -> int:
+        """Number of steps that it takes at once."""
+
+    def take(self, data: StepData) -> None:
+        """Take the next steps."""
 
 
 Tick = Callable[[float, float, FloatArray], None]
@@ -184,7 +211,9 @@ def integrate(
     tick: Tick | None = None,
     events: EventWatch | None = None,
     breakpoints: BreakpointHandler | None = None,
+    passages: CriticalPassages | None = None,
     words: ProblemVocabulary = MECHANISM,
+    sink: StepSink | None = None,
 ) -> RunRecord:
     """Integrate from ``t0`` to ``t_end``; errors on the way end the run, and are not raised.
 
@@ -204,8 +233,13 @@ def integrate(
         Finds events in every accepted step.
     breakpoints
         Where the right-hand side is not smooth; None if it is.
+    passages
+        Makes the passages of critical configurations that steps cannot make; None for systems
+        whose steps are to make them all.
     words
         How the message of a failure names the problem.
+    sink
+        Takes the steps; they remain in the record without one.
 
     Returns
     -------
@@ -221,12 +255,45 @@ def integrate(
     redone = False
     if breakpoints is not None:
         control.set_target_time(breakpoints.end)
+
+    def accept(result: StepResult, t_new: float) -> bool:
+        """Move to the end of a step; whether a terminal event ends the run there."""
+        nonlocal t, x
+        method.accept(memory, result)
+        start, t, x = x, t_new, result.state
+        record.times.append(t)
+        record.steps.append(result)
+        if record.made % WATCHED_STEPS == 0:
+            record.watched_time = t
+        record.made += 1
+        stop = None
+        if events is not None:
+            dense = step_dense(system, method.scheme, start, result, t)
+            stop = events.after_step(result.t, start, t, x, dense)
+        if stop is not None:
+            record.mark_stopped(stop)
+            return True
+        if tick is not None:
+            call_progress(tick, t, result.h, x)
+        return False
+
+    def pass_critical(zero: float | None) -> bool:
+        """Make the passage expected at ``zero`` (s), if steps cannot; whether it was made."""
+        if zero is None or passages is None:
+            return False
+        end = t_end if breakpoints is None else breakpoints.end
+        past = passages.steps_past(t, x, memory.rate, zero, end)
+        if past and not any(accept(step, t_new) for step, t_new in past):
+            control.moved(t)
+        return bool(past)
+
     try:
         if events is not None:
             events.begin(t, x)
         while t < t_end:
             if breakpoints is not None and t >= breakpoints.end:
-                record.breaks.append(len(record.times))
+                if record.times:
+                    record.breaks.append(len(record.times))
                 memory = breakpoints.next(t, x, memory)
                 control.set_target_time(breakpoints.end)
             proposal = control.propose(t, min(max_step, system.step_limit(x)), memory)
@@ -234,6 +301,11 @@ def integrate(
                 memory = breakpoints.singular_arrival(t, x, memory)
                 continue
             h = proposal.h
+            expected = control.next_zero()
+            if pass_critical(None if passages is None else passages.unexamined(expected, t)):
+                if record.stop is not None:
+                    break
+                continue
             failure = _no_further_step(record, t, h, t_end, unevaluated, words)
             if failure is not None:
                 record.mark_failed(failure, t, h, memory.sigma, control.adaptive, words)
@@ -244,6 +316,12 @@ def integrate(
             except EvaluationError as error:
                 result = None
                 unevaluated = RunFailure(StopReason.NOT_EVALUATED, str(error))
+            if result is not None and pass_critical(
+                None if passages is None else passages.crossing(result)
+            ):
+                if record.stop is not None:
+                    break
+                continue
             decision = control.decide(proposal, result)
             placement = "redone" if redone else "a priori" if proposal.placed else ""
             redone = decision is StepDecision.REPLACED
@@ -261,16 +339,15 @@ def integrate(
                 record.mark_failed(failure, t, h, memory.sigma, control.adaptive, words)
                 break
             result.placement = placement
-            method.accept(memory, result)
-            start, t, x = x, proposal.t_new, result.state
-            record.times.append(t)
-            record.steps.append(result)
-            stop = None if events is None else events.after_step(start, result, t)
-            if stop is not None:
-                record.mark_stopped(stop)
+            if passages is not None:
+                passages.accepted(result)
+            if accept(result, proposal.t_new):
                 break
-            if tick is not None:
-                call_progress(tick, t, h, x)
+            if sink is not None and len(record.steps) >= sink.block:
+                sink.take(record.data(method.scheme, system.tangent_size))
+                record.rest = t, x
+                for taken in (record.steps, record.times, record.breaks):
+                    taken.clear()
         else:
             record.mark_finished(t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
@@ -298,9 +375,8 @@ def _no_further_step(
         if not (record.attempts and record.attempts[-1].t == t):
             return RunFailure.of(StopReason.ROUND_OFF)
         return unevaluated or RunFailure.of(StopReason.ERROR_ESTIMATE)
-    made = len(record.times)
-    if made >= WATCHED_STEPS and made % WATCHED_STEPS == 0:
-        covered = t - record.times[-WATCHED_STEPS]
+    if record.made >= WATCHED_STEPS and record.made % WATCHED_STEPS == 0:
+        covered = t - record.watched_time
         if covered < STANDSTILL * (t_end - record.t0):
             return standstill(covered, words)
     return None
@@ -320,7 +396,9 @@ def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
     try:
         tick(t, h, x.copy())
     except Exception as error:
-        raise ControllerError(f"the progress callback raised {error!r} at t = {t:.6g} s") from error
+        raise ControllerError(
+            f"the progress callback raised {safe_repr(error)} at t = {t:.6g} s"
+        ) from error
 
 
 class Closures:

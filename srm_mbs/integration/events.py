@@ -13,7 +13,8 @@ where SciPy leaves them open:
   vertex: a step of dop853 is long enough to hold several zeros.  Two zeros closer to each other
   than that may still be missed; ``max_step`` helps.
 * A zero at the start of the run is not an event, nor is one within round-off of it, so that a run
-  can be continued from an event.
+  can be continued from an event.  Events that act there at once are found before
+  (:mod:`srm_mbs.integration.contacts`).
 * A zero on the boundary of two steps is one event, passed in the direction in which it was
   reached.
 * A terminal event ends the run with the state of the dense output there; other events are kept up
@@ -23,7 +24,7 @@ where SciPy leaves them open:
 
 The search works on states, for mechanisms and DAEs alike::
 
-    watch = EventWatch(system, scheme, prepare_events(events, adapt), state.size)
+    watch = EventWatch(scheme, prepare_events(events, adapt), state.size)
     record = integrate(..., events=watch)
     times, states = watch.found()
 
@@ -36,7 +37,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -44,7 +46,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import EvaluationError, EventError, InputError
+from srm_mbs.errors import EvaluationError, EventError, InputError, safe_repr
 from srm_mbs.integration.dense_output import DenseOutput, step_data
 from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -56,6 +58,13 @@ SAME_TIME_ROUNDING = 16.0 * float(np.finfo(float).eps)
 """The same, over the time itself: the search finds each of two equal zeros to 8 eps."""
 MAX_HALVINGS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
+MAX_BISECTIONS = 40
+"""Halvings of the time in which a value leaves zero."""
+MAX_ROOT_STEPS = 200
+"""Steps of the search for a zero; bisection alone takes 60."""
+CONVERGED_STEP, FAST_CONVERGENCE = 1e-9, 1e-3
+"""Step of that search, over the first bracket and over the step before, after which the next one is
+below rounding: the error falls with the power 1.8."""
 VERTEX_VALUE = 0.5
 """Value of a parabola's vertex, over the smallest of its three values, below which the event is
 evaluated there."""
@@ -79,7 +88,7 @@ class EventFunction:
     name
         Its name in messages: the function's own, or its place in the list.
     function
-        Of (t, state); before :func:`prepare_events` adapts it, as the user gives it.
+        Of (t, state).
     occurrences
         Number of occurrences that ends the run; infinite if it is not terminal.
     direction
@@ -91,6 +100,9 @@ class EventFunction:
         Whether every occurrence ends the run, or its segment, for the sake of an action.
     departs
         Whether the run starts at an occurrence, from where the value moves away.
+    rests
+        Of a contact that touches where the run starts, and does not leave at once: the rounding of
+        its value at a time and a state.  It occurs where its value leaves zero in its direction.
     floor
         Size of values that count as zero: of an event that closures hold at zero, the rounding.
     start_tolerance
@@ -106,6 +118,7 @@ class EventFunction:
     action: Callable[..., Any] | None = None
     acts: bool = False
     departs: bool = False
+    rests: Callable[[float, FloatArray], float] | None = None
     floor: float = 0.0
     start_tolerance: float | None = None
 
@@ -118,9 +131,14 @@ class EventFunction:
             If the function raises, or returns anything but one finite number.
         """
         try:
-            value = np.asarray(self.function(t, state), dtype=float)
+            found = self.function(t, state)
+            if isinstance(found, float) and math.isfinite(found):
+                return float(found)
+            value = np.asarray(found, dtype=float)
         except Exception as error:
-            raise EventError(f"the event {self.name} raised {error!r} at t = {t:.6g} s") from error
+            raise EventError(
+                f"the event {self.name} raised {safe_repr(error)} at t = {t:.6g} s"
+            ) from error
         if value.size != 1 or not np.isfinite(value).all():
             raise EventError(
                 f"the event {self.name} returned {value.tolist()} at t = {t:.6g} s; "
@@ -128,9 +146,9 @@ class EventFunction:
             )
         return float(value.item())
 
-    def sign(self, value: float) -> float:
-        """Sign of a value; 0 at the floor."""
-        return 0.0 if abs(value) <= self.floor else math.copysign(1.0, value)
+    def floor_at(self, t: float, state: FloatArray) -> float:
+        """Size of values that count as zero at ``t`` (s) and ``state``."""
+        return self.floor if self.rests is None else max(self.floor, self.rests(t, state))
 
     def counts(self, rising: bool) -> bool:
         """Whether a zero passed upwards (``rising``) or downwards is an event."""
@@ -146,7 +164,7 @@ def prepare_events(
     ----------
     events
         Callables with the attributes ``terminal``, ``direction`` and ``action``, all optional; an
-        :class:`EventFunction` whose function is still as the user gives it keeps its properties.
+        :class:`EventFunction`, whose function is one of (t, state) already, is left as it is.
     adapt
         Makes a function of (t, state) of each callable.
 
@@ -158,19 +176,20 @@ def prepare_events(
     given: Sequence[Any] = [events]
     if not callable(events):
         given = listed_events(events)
-    prepared = [
-        event if isinstance(event, EventFunction) else _event_function(event, i)
+    return [
+        event if isinstance(event, EventFunction) else _event_function(event, i, adapt)
         for i, event in enumerate(given)
     ]
-    return [replace(event, function=adapt(event.function)) for event in prepared]
 
 
-def _event_function(event: Any, i: int) -> EventFunction:
-    """The user's ``event``, number ``i``, with its attributes."""
+def _event_function(
+    event: Any, i: int, adapt: Callable[[Callable[..., Any]], StateFunction]
+) -> EventFunction:
+    """The user's ``event``, number ``i``, with its attributes and ``adapt`` of it."""
     place = f"events[{i}]"
     if not callable(event):
         raise InputError(
-            f"{event!r} cannot be called",
+            f"{safe_repr(event)} cannot be called",
             element=place,
             remedy="Give functions that return a float, as scipy.integrate.solve_ivp takes them",
         )
@@ -181,19 +200,19 @@ def _event_function(event: Any, i: int) -> EventFunction:
         occurrences = math.inf
     if not (occurrences > 0.0 and (occurrences == math.inf or occurrences.is_integer())):
         raise InputError(
-            f"terminal = {terminal!r} is neither a boolean nor a number of occurrences",
+            f"terminal = {safe_repr(terminal)} is neither a boolean nor a number of occurrences",
             element=place,
             remedy="Give True, False or a positive integer",
         )
     if math.isnan(_number(direction)):
         raise InputError(
-            f"direction = {direction!r} is not a number",
+            f"direction = {safe_repr(direction)} is not a number",
             element=place,
             remedy="Give 1 (upwards), -1 (downwards) or 0 (both)",
         )
     label = place if name == "<lambda>" else repr(name)
     action = getattr(event, "action", None)
-    return EventFunction(label, event, occurrences, _number(direction), action)
+    return EventFunction(label, adapt(event), occurrences, _number(direction), action)
 
 
 def acting(events: Any) -> bool:
@@ -219,12 +238,46 @@ def _number(value: Any) -> float:
         return math.nan
 
 
+def sign_above(value: float, floor: float) -> float:
+    """Sign of a value; 0 at the floor."""
+    return 0.0 if abs(value) <= floor else math.copysign(1.0, value)
+
+
+@dataclass(frozen=True)
+class Occurrence:
+    """An occurrence of an event: its index among the events, its time (s) and state (nx,)."""
+
+    event: int
+    time: float
+    state: FloatArray
+
+
+def stop_message(name: str, count: int, t: float) -> str:
+    """The message of a run that the occurrence ``count`` of the event ``name`` ended at ``t``."""
+    which = f" (occurrence {count})" if count > 1 else ""
+    return f"The event {name}{which} ended the run at t = {t:.9g} s."
+
+
 @dataclass(frozen=True)
 class Stop:
-    """The end of a run by a terminal event: its time (s), and a sentence that names it."""
+    """The end of a run by a terminal event: its time (s) and state (nx,), and a sentence that
+    names it."""
 
     time: float
+    state: FloatArray
     message: str
+
+
+StepDense = Callable[[FloatArray], FloatArray]
+"""Dense output of one step: times (k,) within it -> states (k, nx)."""
+
+
+def step_dense(
+    system: System, scheme: ButcherTableau, state: FloatArray, result: StepResult, t_new: float
+) -> StepDense:
+    """Dense output of the step ``result`` from ``state`` to ``t_new`` (s), by the reference."""
+    data = step_data(result.t, state, [t_new], [result], scheme, system.tangent_size)
+    return DenseOutput(system, scheme, data)
 
 
 class EventWatch:
@@ -232,21 +285,17 @@ class EventWatch:
 
     Parameters
     ----------
-    system, scheme
-        For the dense output of the steps.
+    scheme
+        The tableau of the run.
     events
         From :func:`prepare_events`.
     size
         Length of a state.
     """
 
-    def __init__(
-        self, system: System, scheme: ButcherTableau, events: Sequence[EventFunction], size: int
-    ) -> None:
-        self._system = system
-        self._scheme = scheme
+    def __init__(self, scheme: ButcherTableau, events: Sequence[EventFunction], size: int) -> None:
         self._events = tuple(events)
-        self._fractions = np.linspace(0.0, 1.0, len(scheme.dense.rows) + 1)[1:-1]
+        self._fractions = _fractions(len(scheme.dense.rows))
         self._values = [0.0] * len(self._events)
         # The sign last seen; 0 after a value that was exactly zero.
         self._signs = [0.0] * len(self._events)
@@ -266,12 +315,14 @@ class EventWatch:
         self._start = t
         self._values = [event(t, state.copy()) for event in self._events]
         self._signs = [
-            0.0 if event.departs else event.sign(value)
+            0.0 if event.departs else sign_above(value, event.floor_at(t, state))
             for event, value in zip(self._events, self._values)
         ]
 
-    def after_step(self, state: FloatArray, result: StepResult, t_new: float) -> Stop | None:
-        """Record the events of an accepted step from ``state`` to ``t_new``.
+    def after_step(
+        self, t: float, state: FloatArray, t_new: float, end: FloatArray, dense: StepDense
+    ) -> Stop | None:
+        """Record the events of an accepted step from ``state`` at ``t`` to ``end`` at ``t_new``.
 
         Returns
         -------
@@ -283,12 +334,9 @@ class EventWatch:
         EventError
             If an event function fails, or a state within the step cannot be evaluated.
         """
-        t = result.t
-        data = step_data(t, state, [t_new], [result], self._scheme, self._system.tangent_size)
-        dense = DenseOutput(self._system, self._scheme, data)
         times = [*(t + self._fractions * (t_new - t)).tolist(), t_new]
         try:
-            states = [*dense(np.array(times[:-1])), result.state]
+            states = [*dense(np.array(times[:-1])), end]
         except EvaluationError as error:
             raise EventError(f"no event could be looked for within a step: {error}") from error
         found: list[tuple[float, int]] = []
@@ -301,14 +349,15 @@ class EventWatch:
             nodes = _with_vertices(event, dense, nodes)
             if early is not None:
                 nodes = [early, *(node for node in nodes[1:] if node[0] > early[0])]
-            found += [(time, i) for time in self._zeros(i, nodes, dense)]
+            floor = event.floor_at(t_new, end)
+            found += [(time, i) for time in self._zeros(i, nodes, dense, floor)]
             self._values[i] = values[-1]
         if not found:
             return None
         return self._record(sorted(found), dense, same_time(t, t_new))
 
     def _departing(
-        self, i: int, dense: DenseOutput, nodes: list[tuple[float, float]]
+        self, i: int, dense: StepDense, nodes: list[tuple[float, float]]
     ) -> tuple[float, float] | None:
         """A node of the first step between the start and the first of ``nodes`` where the value
         still has the sign with which it departs, if it returns to zero that soon; else None."""
@@ -322,8 +371,11 @@ class EventWatch:
                 return t + length, now
         return None
 
-    def _zeros(self, i: int, nodes: list[tuple[float, float]], dense: DenseOutput) -> list[float]:
-        """Times at which event ``i`` occurs, given its values at ``nodes``."""
+    def _zeros(
+        self, i: int, nodes: list[tuple[float, float]], dense: StepDense, floor: float
+    ) -> list[float]:
+        """Times at which event ``i`` occurs, given its values at ``nodes``; those up to ``floor``
+        are zero."""
         event = self._events[i]
         earliest = -math.inf
         if nodes[0][0] == self._start and not event.departs:
@@ -333,9 +385,13 @@ class EventWatch:
             earliest = self._start + tolerance
         zeros = []
         for left, right in pairwise(nodes):
-            before, now = self._signs[i], event.sign(right[1])
+            before, now = self._signs[i], sign_above(right[1], floor)
             self._signs[i] = now
-            if before == 0.0 or now == before:
+            if now == before:
+                continue
+            if before == 0.0:
+                if event.rests is not None and event.counts(rising=now > 0.0):
+                    zeros.append(_end_of_rest(event, dense, left[0], right[0], floor))
                 continue
             zero = right[0] if now == 0.0 else _zero_between(event, dense, left, right)
             if zero > earliest and event.counts(rising=before < 0.0):
@@ -343,7 +399,7 @@ class EventWatch:
         return zeros
 
     def _record(
-        self, found: list[tuple[float, int]], dense: DenseOutput, close: float
+        self, found: list[tuple[float, int]], dense: StepDense, close: float
     ) -> Stop | None:
         stop: Stop | None = None
         for time, i in found:
@@ -352,12 +408,11 @@ class EventWatch:
                     break
                 time = stop.time
             self._times[i].append(time)
-            self._states[i].append(dense(np.array([time]))[0])
+            state = dense(np.array([time]))[0] if stop is None else stop.state
+            self._states[i].append(state)
             event, count = self._events[i], len(self._times[i])
             if stop is None and (event.acts or count >= event.occurrences):
-                which = f" (occurrence {count})" if count > 1 else ""
-                message = f"The event {event.name}{which} ended the run at t = {time:.9g} s."
-                stop = Stop(time, message)
+                stop = Stop(time, state, stop_message(event.name, count, time))
         return stop
 
     def found(self) -> tuple[list[FloatArray], list[FloatArray]]:
@@ -370,12 +425,18 @@ class EventWatch:
         return times, states
 
 
-def _value_at(event: EventFunction, dense: DenseOutput, t: float) -> float:
+@lru_cache(maxsize=8)
+def _fractions(parts: int) -> FloatArray:
+    """Where a step is examined inside, over its length, if that is divided into ``parts``."""
+    return np.linspace(0.0, 1.0, parts + 1)[1:-1]
+
+
+def _value_at(event: EventFunction, dense: StepDense, t: float) -> float:
     return event(t, dense(np.array([t]))[0])
 
 
 def _with_vertices(
-    event: EventFunction, dense: DenseOutput, nodes: list[tuple[float, float]]
+    event: EventFunction, dense: StepDense, nodes: list[tuple[float, float]]
 ) -> list[tuple[float, float]]:
     """``nodes``, equally spaced, with the vertices of parabolas that come near zero between."""
     extra = []
@@ -396,21 +457,75 @@ def _with_vertices(
     return sorted([*nodes, *extra]) if extra else nodes
 
 
-def _zero_between(
-    event: EventFunction, dense: DenseOutput, left: tuple[float, float], right: tuple[float, float]
+def _end_of_rest(
+    event: EventFunction, dense: StepDense, rests: float, left: float, floor: float
 ) -> float:
-    """The zero of ``event`` between two (time, value) of opposite sign, to round-off."""
-    from scipy.optimize import brentq
+    """The time between ``rests`` and ``left`` (s) at which the value leaves zero."""
+    for _ in range(MAX_BISECTIONS):
+        middle = 0.5 * (rests + left)
+        if abs(_value_at(event, dense, middle)) <= floor:
+            rests = middle
+        else:
+            left = middle
+    return left
 
-    known = dict((left, right))
-    precision = 4.0 * np.finfo(float).eps
 
-    def value(t: float) -> float:
-        # The dense output at the ends of a step differs from its states by round-off, which
-        # could take the change of sign away.
-        return known[t] if t in known else _value_at(event, dense, t)
+def _zero_between(
+    event: EventFunction, dense: StepDense, left: tuple[float, float], right: tuple[float, float]
+) -> float:
+    """The zero of ``event`` between two (time, value) of opposite sign, to round-off.
 
-    zero = brentq(
-        value, left[0], right[0], xtol=precision * (right[0] - left[0]), rtol=precision, maxiter=200
-    )
-    return float(zero)
+    Brent's method: inverse quadratic interpolation of the last three values, and bisection where
+    its steps do not halve in two steps.  It ends where the next step must be below rounding because
+    the last ones shrank so fast.
+    """
+    (a, _), (b, _) = left, right
+    rising, length = right[1] > 0.0, b - a
+    points = [left, right]
+    precision = float(np.finfo(float).eps) * (length + max(abs(a), abs(b)))
+    at, steps = b, [math.inf, math.inf]
+    for _ in range(MAX_ROOT_STEPS):
+        new = _interpolated_zero(points)
+        step = abs(new - at)
+        interpolated = a < new < b and step < 0.5 * steps[-2]
+        if not interpolated:
+            new = 0.5 * (a + b)
+            step = abs(new - at)
+        fast = step < CONVERGED_STEP * length and step < FAST_CONVERGENCE * steps[-1]
+        last = b - a <= precision or (interpolated and (step <= precision or fast))
+        value, at = _value_at(event, dense, new), new
+        if value == 0.0:
+            return new
+        if last:
+            # Of the times beside it the nearest.
+            near = _interpolated_zero([points[-1], (new, value)])
+            beside = [near, math.nextafter(new, a), math.nextafter(new, b)]
+            best = abs(value)
+            for x in beside:
+                if x != new and a <= x <= b:
+                    found = abs(_value_at(event, dense, x))
+                    if found < best:
+                        best, new = found, x
+            return new
+        if (value > 0.0) == rising:
+            b = new
+        else:
+            a = new
+        points = [*points[-2:], (new, value)]
+        steps.append(step)
+    return 0.5 * (a + b)
+
+
+def _interpolated_zero(points: list[tuple[float, float]]) -> float:
+    """The zero by inverse interpolation of two or three (time, value); NaN if values are equal."""
+    (b, fb), (c, fc) = points[-2:]
+    if fb == fc:
+        return math.nan
+    secant = c - fc * (c - b) / (fc - fb)
+    if len(points) == 2:
+        return secant
+    a, fa = points[0]
+    if fa in (fb, fc):
+        return math.nan
+    other = b - fb * (b - a) / (fb - fa)
+    return secant - fc * (secant - other) / (fc - fa)

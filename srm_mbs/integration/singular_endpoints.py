@@ -21,21 +21,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.singularities.branch_limit import BranchLimit, branch_next_to
+from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.dynamics.singularities.branch_limit import BranchCurve, BranchLimit, branch_next_to
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.local_analysis import SingularConfiguration
 from srm_mbs.dynamics.system import SingularityAnalysis, System, Zone
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.control.placement import SINGULAR_END_SIGMA
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
+from srm_mbs.integration.methods.branch_nodes import BranchNodes
 from srm_mbs.integration.methods.multiplier_history import WINDOW, MultiplierHistory
 from srm_mbs.integration.methods.near_singular import LARGEST_ZONE_SIGMA
 from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.split_step import SplitStep
 
 BLOCK_STEPS = WINDOW - 1
 """Steps of a collocation block: its nodes are as many as one interpolation uses."""
@@ -90,13 +94,119 @@ class Point:
     sigma: float
 
 
-def _no_prediction(nv: int) -> Zone:
-    """The zone in which every row is dropped and the multiplier is zero."""
-    nothing = np.zeros(nv)
-    return Zone(np.inf, lambda _: nothing)
+class NodeMaker(Protocol):
+    """Makes the nodes of a :class:`BranchMotion`; an implementation by the kernel is in
+    :mod:`srm_mbs.integration.kernel.branch_motion`."""
+
+    def nodes(
+        self,
+        points: list[Point],
+        times: FloatArray,
+        values: FloatArray,
+        direct: float,
+        curve: BranchCurve | None,
+        extrapolated: int,
+    ) -> tuple[list[Point], FloatArray | None]:
+        """The motion at ``times`` (k,) s, with the multiplier interpolated between ``values``
+        (k, nv), and the multiplier solved for at each node.
+
+        Parameters
+        ----------
+        points
+            The motion at the first of ``times``.
+        direct
+            sigma from which a node is solved directly.
+        curve
+            The algebra on the branch, for nodes closer to the singular configuration.
+        extrapolated
+            With more than 0, the multiplier is extrapolated from so many nodes before.
+
+        Returns
+        -------
+        points
+            The nodes up to the last one that could be solved.
+        state : (nx,) or None
+            That of the next node, if the curve is missing or does not reach it.
+        """
 
 
 @dataclass(frozen=True, eq=False)
+class ReferenceNodes:
+    """:class:`NodeMaker` by the Python reference; ``geometry`` has the closures."""
+
+    system: System
+    analysis: SingularityAnalysis
+    geometry: ClosureGeometry
+    norm: ErrorNorm
+
+    def nodes(
+        self,
+        points: list[Point],
+        times: FloatArray,
+        values: FloatArray,
+        direct: float,
+        curve: BranchCurve | None,
+        extrapolated: int,
+    ) -> tuple[list[Point], FloatArray | None]:
+        """See :class:`NodeMaker`."""
+        system, method, found = self.system, PSRM("dop853"), list(points)
+        history = MultiplierHistory(times, values)
+        for t, t_next in pairwise(times[len(found) - 1 :].tolist()):
+            here = found[-1]
+            if extrapolated:
+                nodes = slice(max(0, len(found) - extrapolated), len(found))
+                solved = np.array([point.multiplier for point in found[nodes]])
+                history = MultiplierHistory(times[nodes], solved)
+            # Known everywhere: every stage takes the interpolated multiplier.
+            known = replace(history, known_until=np.inf, known_below=np.inf)
+            scale = system.state_scale(here.state)
+            memory = IntegratorState(here.rate, here.sigma, scale, known)
+            state = method.step(system, t, t_next - t, here.state, memory, self.norm).state
+            point = self._solve(t_next, state, direct, curve)
+            if point is None:
+                return found, state
+            found.append(point)
+        return found, None
+
+    def _solve(
+        self, t: float, x: FloatArray, direct: float, curve: BranchCurve | None
+    ) -> Point | None:
+        """The point of the motion at x (nx,), which is moved onto the closures."""
+        system = self.system
+        sigma = system.evaluate(t, x).sigma
+        if sigma >= direct:
+            for _ in range(2):  # the rates again, where the corrected position is
+                x = system.retract(x, -system.evaluate(t, x).correction())
+            terms = system.evaluate(t, x)
+            return Point(x, terms.rate().copy(), terms.multiplier().copy(), terms.sigma)
+        if curve is None:
+            return None
+        x = onto_branch(system, t, x, direct)
+        q, v = self.analysis.split(x)
+        at = curve.parameter(self.geometry.at(q, t))
+        if at is None:
+            return None
+        v = v - curve.off_branch(at, v)
+        x = np.concatenate([q, v])
+        free = free_acceleration(system, t, x)
+        multiplier = curve.multiplier(at, v, free)
+        return Point(x, np.concatenate([v, free - multiplier]), multiplier, sigma)
+
+
+def onto_branch(system: System, t: float, x: FloatArray, direct: float) -> FloatArray:
+    """x (nx,) moved onto the closures by the rows that are not small at the sigma ``direct``."""
+    strong = Zone.without_prediction(2.0 * direct, system.multiplier_size)
+    return system.retract(x, -system.evaluate(t, x, strong).correction())
+
+
+def free_acceleration(system: System, t: float, state: FloatArray) -> FloatArray:
+    """M^-1 f (nv,): the acceleration with every row dropped."""
+    nv = system.multiplier_size
+    terms = system.evaluate(t, state, Zone.without_prediction(np.inf, nv))
+    return terms.rate()[nv:].copy()
+
+
+@dataclass(eq=False)
 class BranchMotion:
     """The motion next to a singular configuration, by collocation of its multiplier.
 
@@ -108,41 +218,51 @@ class BranchMotion:
         Its closures.
     norm
         Error norm of the run.
+    maker
+        Makes the nodes.
+    curve
+        The algebra along the branch, if it is known; nodes that it does not reach replace it.
     """
 
     system: System
     analysis: SingularityAnalysis
     geometry: ClosureGeometry
     norm: ErrorNorm
+    maker: NodeMaker
+    curve: BranchCurve | None = None
 
-    def free_acceleration(self, t: float, state: FloatArray) -> FloatArray:
-        """M^-1 f (nv,): the acceleration with every row dropped."""
-        nv = self.system.multiplier_size
-        terms = self.system.evaluate(t, state, _no_prediction(nv))
-        return terms.rate()[nv:].copy()
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        geometry: ClosureGeometry,
+        analysis: SingularityAnalysis,
+        norm: ErrorNorm,
+        evaluator: Any,
+        limit: BranchLimit | None = None,
+    ) -> BranchMotion:
+        """The motion of ``system``, whose nodes its ``evaluator`` makes if it can."""
+        make = getattr(evaluator, "branch_nodes", None)
+        reference = ReferenceNodes(system, analysis, geometry, norm)
+        maker: NodeMaker = reference if make is None else make(norm)
+        curve = None if limit is None else limit.curve()
+        return cls(system, analysis, geometry, norm, maker, curve)
 
-    def solve(self, t: float, x: FloatArray, direct: float) -> Point | None:
-        """The point of the motion at x (nx,), which is moved onto the closures; None if it cannot.
-
-        ``direct`` is the sigma from which the multiplier is solved for directly.
-        """
+    def _solve(self, t: float, x: FloatArray, direct: float) -> Point | None:
+        """The point of the motion at x (nx,) from a new curve; None if there is none."""
         system, geometry = self.system, self.geometry
         sigma = system.evaluate(t, x).sigma
-        if sigma >= direct:
-            for _ in range(2):  # the rates again, where the corrected position is
-                x = system.retract(x, -system.evaluate(t, x).correction())
-            terms = system.evaluate(t, x)
-            return Point(x, terms.rate().copy(), terms.multiplier().copy(), terms.sigma)
-        strong = replace(_no_prediction(system.multiplier_size), threshold=2.0 * direct)
-        x = system.retract(x, -system.evaluate(t, x, strong).correction())
+        x = onto_branch(system, t, x, direct)
         q, v = self.analysis.split(x)
-        place = geometry.at(q, t)
-        _, limit = branch_next_to(geometry, self.analysis.rank, place, geometry.rates(v))
+        _, limit = branch_next_to(
+            geometry, self.analysis.rank, geometry.at(q, t), geometry.rates(v)
+        )
         if limit is None:
             return None
+        self.curve = limit.curve()
         v = v - limit.off_branch(v)
         x = np.concatenate([q, v])
-        free = self.free_acceleration(t, x)
+        free = free_acceleration(system, t, x)
         multiplier = limit.multiplier(v, free)
         return Point(x, np.concatenate([v, free - multiplier]), multiplier, sigma)
 
@@ -160,28 +280,19 @@ class BranchMotion:
             Whether the first multipliers are extrapolated from node to node, for a start that is
             far enough from the singular configuration; otherwise they are that of the start.
         """
-        system, unit = self.system, self.geometry.coordinate_unit
-        method = PSRM("dop853")
+        unit = self.geometry.coordinate_unit
         values = np.tile(start.multiplier, (len(times), 1))
         change = np.inf
         for iteration in range(MAX_ITERATIONS):
             points = [start]
-            history = MultiplierHistory(times, values)
-            for t, t_next in pairwise(times.tolist()):
-                here = points[-1]
-                if extrapolated and iteration == 0:
-                    nodes = slice(max(0, len(points) - EXTRAPOLATION_NODES), len(points))
-                    solved = np.array([point.multiplier for point in points[nodes]])
-                    history = MultiplierHistory(times[nodes], solved)
-                # Known everywhere: every stage takes the interpolated multiplier.
-                known = replace(history, known_until=np.inf, known_below=np.inf)
-                scale = system.state_scale(here.state)
-                memory = IntegratorState(here.rate, here.sigma, scale, known)
-                result = method.step(system, t, t_next - t, here.state, memory, self.norm)
-                point = self.solve(t_next, result.state, direct)
-                if point is None:
-                    return None
-                points.append(point)
+            count = EXTRAPOLATION_NODES if extrapolated and iteration == 0 else 0
+            while len(points) < len(times):
+                points, left = self.maker.nodes(points, times, values, direct, self.curve, count)
+                if left is not None:
+                    point = self._solve(float(times[len(points)]), left, direct)
+                    if point is None:
+                        return None
+                    points.append(point)
             improved = np.array([point.multiplier for point in points])
             old, change = change, float(np.abs((improved - values) / unit).max())
             values = improved
@@ -200,6 +311,14 @@ class BranchMotion:
         # Solves speed T + acceleration T^2 / 2 = BLOCK_MOTION without cancellation.
         root = np.sqrt(speed**2 + 2.0 * acceleration * BLOCK_MOTION)
         return longest if root == 0.0 else min(longest, float(2.0 * BLOCK_MOTION / (speed + root)))
+
+    def is_slow(self, rate: FloatArray) -> bool:
+        """Whether a motion with the tangent ``rate`` (2 nv,) moves by less than DEPARTED_SIGMA over
+        the longest block."""
+        longest = BLOCK_TIME / self.analysis.rate_unit
+        unit = np.tile(self.geometry.coordinate_unit, 2)
+        speed, acceleration = np.abs(rate / unit).reshape(2, -1).max(axis=1).tolist()
+        return bool(longest * (speed + 0.5 * longest * acceleration) < DEPARTED_SIGMA)
 
     def departure(self, t: float, start: Point, t_end: float) -> MultiplierHistory:
         """The multipliers of the motion from ``start`` at ``t`` until it has departed.
@@ -264,6 +383,7 @@ def singular_arrival(
     memory: IntegratorState,
     norm: ErrorNorm,
     end: float,
+    evaluator: Any = None,
 ) -> IntegratorState:
     """``memory`` at ``t`` (s), with the multipliers known up to ``end`` (s), the end of the run or
     of its smooth interval.
@@ -273,7 +393,8 @@ def singular_arrival(
     analysis = system.singularities
     if analysis is None or memory.history is None:
         return memory
-    motion = BranchMotion(system, analysis, analysis.geometry(analysis.split(state)[0], t), norm)
+    geometry = analysis.geometry(analysis.split(state)[0], t)
+    motion = BranchMotion.of(system, geometry, analysis, norm, evaluator)
     try:
         multiplier = system.evaluate(t, state).multiplier().copy()
         here = Point(state, memory.rate, multiplier, memory.sigma)
@@ -381,6 +502,12 @@ def _limit_at_start(
     return limit
 
 
+def _uses_nodes(method: Method) -> bool:
+    """Whether the steps of ``method`` solve stages by nodes of the branch."""
+    stepper = getattr(method, "stepper", method)
+    return isinstance(stepper, SplitStep) and stepper.eps is None
+
+
 def start(
     system: System,
     method: Method,
@@ -427,12 +554,17 @@ def start(
         return memory
     if limit is None:
         return memory
-    motion = BranchMotion(system, analysis, geometry, norm)
-    free = motion.free_acceleration(t, state)
+    motion = BranchMotion.of(system, geometry, analysis, norm, evaluator, limit)
+    unit = geometry.coordinate_unit
+    free = free_acceleration(system, t, state)
     multiplier = limit.multiplier(v, free)
     rate = np.concatenate([v, free - multiplier])
     history = MultiplierHistory.begin(t, multiplier)
-    if begins or memory.sigma < LARGEST_ZONE_SIGMA:
+    if motion.is_slow(rate) and _uses_nodes(method) and isinstance(system, ClosedSystem):
+        nodes = BranchNodes(system)
+        away = nodes.spaced(t, state, limit.direction[: len(unit)] * unit)
+        history, memory.lingering = replace(history, away=away), away is not None
+    elif begins or memory.sigma < LARGEST_ZONE_SIGMA:
         try:
             history = motion.departure(t, Point(state, rate, multiplier, memory.sigma), t_end)
         except InputError:

@@ -9,9 +9,9 @@ Both are found after the run, on its dense output.
   that loses rank changes sign across it (the motion passes through), or changes altogether (it
   departs on another branch); where the motion turns back, or passes by, that part stays the same.
 * A *bifurcation* is a singular configuration at which the motion comes to rest, or turns back so
-  close to it that the error of the run could decide.  Several branches meet there; momentum chooses
-  one, and without momentum the continuation is not unique.  The run keeps the branch that it
-  arrived on, and lists the place.
+  close to it that it could not be told from one that rests there.  Several branches meet there;
+  momentum chooses one, and without momentum the continuation is not unique.  The run keeps the
+  branch that it arrived on, and lists the place.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
+from srm_mbs.dynamics.singularities.critical import CriticalConfiguration, critical_configuration
 from srm_mbs.dynamics.singularities.local_analysis import (
     Participants,
     SingularConfiguration,
@@ -33,7 +34,8 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     smallest_singular_value,
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
-from srm_mbs.integration.dense_output import STEP_PLACEMENTS, DenseOutput, StepData
+from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
+from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 SLOPE_MARGIN = 1.5
@@ -61,6 +63,11 @@ TOUCHING_VALUE = 1e-6
 """Part of the values around below which such a motion touched the singular configuration."""
 VANISHING_TOGETHER = 2.0
 """Singular values up to this multiple of the smallest vanish with it."""
+RECORDED_DEPTH = 0.75
+"""Largest of the lowest sigmas between recorded samples, over those at the sides, of a minimum that
+is examined: sigma differs from the singular values by some per cent."""
+DIP_WIDTHS = (1, 3)
+"""Recorded intervals on either side of a minimum in which it is looked for, one after the other."""
 MAX_REFINEMENTS = 12
 """Steps of the search for the minimum of a singular value."""
 CROSSING_SEARCH = 0.3
@@ -70,9 +77,15 @@ VELOCITY_VALUE = 0.05
 """Part of the values around at which the velocity is taken before and after a crossing."""
 REVERSAL_SIGMA = 0.02
 """sigma below which a motion that turns back may have met a bifurcation."""
-UNDECIDED_DISTANCE = 100.0
-"""Distance to the singular configuration (rad, scene diagonals), over rtol, below which the error
-of the run could decide on the branch."""
+UNDECIDED_DISTANCE = 3e-6
+"""Distance to the singular configuration (rad, scene diagonals) below which a motion that turns
+back reaches it: the same at every tolerance."""
+UNDECIDED_VALUE = 1e-4
+"""Last structural singular value where a motion turns back above which it is farther away."""
+RESTING_SPEED = 0.05
+"""Speed where a motion turns back, over those around, above which it goes on in another freedom."""
+RESTING_SIGMA = 1e-7
+"""sigma at all stages of a step below which a motion without momentum rests."""
 WITHOUT_MOMENTUM = 0.01
 """Part of the largest speed of a run below which it ends without momentum."""
 BIFURCATION_SEARCH = 0.05
@@ -83,9 +96,15 @@ SAMPLES = 21
 
 
 class ConstraintMonitor:
-    """The closures and drives along the dense output of a run."""
+    """The closures and drives along the dense output of a run.
 
-    def __init__(self, analysis: SingularityAnalysis, dense: DenseOutput) -> None:
+    Residuals up to ``tolerance`` (row units) count as zero.
+    """
+
+    def __init__(
+        self, analysis: SingularityAnalysis, dense: DenseOutput, tolerance: float = 0.0
+    ) -> None:
+        self._tolerance = max(tolerance, ROUNDED_RESIDUAL)
         self.geometry = analysis.geometry(analysis.q0)
         self.rank = analysis.rank
         self._analysis = analysis
@@ -104,6 +123,24 @@ class ConstraintMonitor:
         geometry = self.geometry
         places = (geometry.at(q, time) for time, (q, _) in zip(t.tolist(), self.states(t)))
         return np.array([smallest_singular_value(geometry, x, self.rank) for x in places])
+
+    def critical(self, t: float) -> CriticalConfiguration | None:
+        """The critical configuration next to the motion at t (s); None if there is none."""
+        return critical_configuration(self.geometry, self.rank, self.place(t), CROSSING_SEARCH)
+
+    def counted_singular(self, t: float) -> FloatArray | None:
+        """The critical configuration next to the motion at t (s) whose residual counts as zero
+        without being it; None if there is none."""
+        found = self.critical(t)
+        if found is None or not ROUNDED_RESIDUAL < abs(found.residual) <= self._tolerance:
+            return None
+        return found.q
+
+    def avoids(self, t: float) -> bool:
+        """Whether the closures have a residual at the critical configuration next to the motion at
+        t (s) that the run followed."""
+        found = self.critical(t)
+        return found is not None and abs(found.residual) > self._tolerance
 
     def minimum(self, t: FloatArray, values: FloatArray) -> tuple[float, float]:
         """Time and value of the minimum bracketed by t (3,), values (3,) there.
@@ -151,7 +188,12 @@ class Crossing:
     placement
         How the stages were kept away: ``"a priori"`` (the step was shortened in advance),
         ``"redone"`` (it was redone with another length), ``"zone"`` (a stage came too close and
-        took the predicted multiplier) or ``""``.
+        took the predicted multiplier), ``"critical"`` (the motion was followed along the curve of
+        closed configurations) or ``""``.
+    kind
+        ``"passed"``: the motion went straight on, through a singular configuration; or
+        ``"avoided"``: the closures have a residual where their branches almost cross, and the
+        motion followed the data past it.
     """
 
     time: float
@@ -159,9 +201,25 @@ class Crossing:
     sigma: float
     rank: int
     placement: str
+    kind: str
     _monitor: ConstraintMonitor = field(repr=False, compare=False)
     _beside: float = field(repr=False, compare=False)
     _range: tuple[float, float] = field(repr=False, compare=False)
+
+    @cached_property
+    def residual(self) -> float | None:
+        """Residual of the closures at the critical configuration of the passage, in row units (over
+        the scene diagonal, rad): 0 to rounding at a singular configuration; None if none was found
+        (:mod:`srm_mbs.dynamics.singularities.critical`)."""
+        found = self._monitor.critical(self.time)
+        return None if found is None else found.residual
+
+    @property
+    def by_tolerance(self) -> bool:
+        """Whether the motion went straight on because the residual is below ``singular_tolerance``,
+        not because it is zero."""
+        residual = self.residual
+        return self.kind == "passed" and residual is not None and abs(residual) > ROUNDED_RESIDUAL
 
     @cached_property
     def singular(self) -> SingularConfiguration | None:
@@ -284,13 +342,17 @@ def _recorded(abscissae: FloatArray, steps: StepData) -> tuple[FloatArray, Float
     return t[fresh], sigma[fresh]
 
 
-def _may_vanish(t: FloatArray, sigma: FloatArray, around: int) -> BoolArray:
-    """Between which neighbouring samples (k - 1,) sigma may have come close to zero."""
+def _lowest(t: FloatArray, sigma: FloatArray, around: int) -> FloatArray:
+    """Lowest sigma (k - 1,) between neighbouring samples that the slopes ``around`` allow."""
     dt = np.diff(t)
-    slope = np.abs(np.diff(sigma)) / dt
-    widest = _largest(slope, around, around)
+    widest = _largest(np.abs(np.diff(sigma)) / dt, around, around)
+    out: FloatArray = 0.5 * (sigma[:-1] + sigma[1:] - SLOPE_MARGIN * widest * dt)
+    return out
+
+
+def _may_vanish(sigma: FloatArray, lowest: FloatArray, around: int) -> BoolArray:
+    """Between which neighbouring samples (k - 1,) sigma may have come close to zero."""
     size = _largest(sigma, around, around + 1)[:-1]
-    lowest = 0.5 * (sigma[:-1] + sigma[1:] - SLOPE_MARGIN * widest * dt)
     # A run that lingers next to a singular configuration takes steps far below its distance.
     lingers = np.minimum(sigma[:-1], sigma[1:]) < LINGERING_SIGMA
     out: BoolArray = (lowest < VANISHING_SIGMA * size) | lingers
@@ -305,27 +367,52 @@ def _largest(values: FloatArray, before: int, after: int) -> FloatArray:
     return out
 
 
-def _windows(t: FloatArray, marked: BoolArray) -> list[FloatArray]:
-    """Sampling times of each run of marked intervals, one interval more on either side."""
+def _windows(marked: BoolArray) -> list[tuple[int, int]]:
+    """First and last sample of each run of marked intervals, one interval more on either side."""
     grown = marked.copy()
     grown[:-1] |= marked[1:]
     grown[1:] |= marked[:-1]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], grown.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
+
+
+def _dips(sigma: FloatArray, lowest: FloatArray) -> list[tuple[int, int, int]]:
+    """Indices of the minima of the recorded ``sigma`` (k,) of a window that may be crossings, each
+    with those on both sides where it is left; ``lowest`` (k - 1,) between them.  At the ends of a
+    run the zero may lie before the first or after the last of them."""
+    before, after = np.append(np.inf, sigma[:-1]), np.append(sigma[1:], np.inf)
+    k = np.flatnonzero((sigma <= before) & (sigma < after))
+    # Of small minima between the same sides, the smallest.
+    high = np.flatnonzero(sigma >= max(DEPARTED_VALUE * float(sigma.max()), 1e-12))
+    bounds = np.concatenate([[0], high, [len(sigma) - 1]])
+    first = bounds[np.searchsorted(high, np.maximum(k - 1, 0), side="right")]
+    last = bounds[np.searchsorted(high, np.minimum(k + 1, len(sigma) - 1), side="left") + 1]
+    floor = np.minimum(np.append(np.inf, lowest)[k], np.append(lowest, np.inf)[k])
+    deep = floor < RECORDED_DEPTH * np.minimum(sigma[first], sigma[last])
+    k, first, last = k[deep], first[deep], last[deep]
+    order = np.lexsort((sigma[k], first))
+    distinct = np.flatnonzero(np.diff(first[order], prepend=-1))
+    chosen = order[distinct]
+    return list(zip(first[chosen].tolist(), k[chosen].tolist(), last[chosen].tolist()))
+
+
+def _times_around(t: FloatArray, first: int, k: int, last: int, width: int) -> FloatArray:
+    """Sampling times around the sample ``k`` of a window: ``width`` intervals on either side, and
+    the samples ``first`` and ``last``."""
+    nodes = t[max(first, k - width) : min(last, k + width) + 1]
     fractions = np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
-    out = []
-    for first, last in zip(edges[::2], edges[1::2]):
-        nodes = t[first : last + 1]
-        times = nodes[:-1, None] + np.diff(nodes)[:, None] * fractions
-        out.append(np.append(times.ravel(), nodes[-1]))
-    return out
+    inner = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
+    outer = [t[[first]], inner, nodes[-1:], t[[last]]]
+    return np.unique(np.concatenate(outer))
 
 
-def _minima(values: FloatArray) -> list[tuple[int, int, int]]:
+def _minima(values: FloatArray, scale: float) -> list[tuple[int, int, int]]:
     """Indices of the minima inside ``values``, each with those on both sides where it is left.
 
     Small minima between the same sides are one: dense output is rough where steps are tiny.
+    ``scale``: the largest value of the window.
     """
-    level = max(DEPARTED_VALUE * float(values.max()), 1e-12)
+    level = max(DEPARTED_VALUE * scale, 1e-12)
     found: dict[tuple[int, int], int] = {}
     for k in np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] < values[2:])) + 1:
         first, last = k - 1, k + 1
@@ -352,7 +439,9 @@ def _rank_loss_cosine(
     geometry = monitor.geometry
     q, q_before, q_after = (monitor.place(t) for t in (time, before, after))
     if not certain:
-        found = nearest_singular(geometry, q, monitor.rank, CROSSING_SEARCH)
+        found = monitor.counted_singular(time)
+        if found is None:
+            found = nearest_singular(geometry, q, monitor.rank, CROSSING_SEARCH)
         if found is None:
             return None
         moved = np.linalg.norm(geometry.difference(q_before, q_after))
@@ -368,7 +457,32 @@ def _rank_loss_cosine(
     return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
 
+def _step_at(steps: StepData, time: float) -> int:
+    return int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
+
+
+def _along_curve(steps: StepData, time: float) -> bool:
+    """Whether the motion at ``time`` (s) was followed along the curve of closed configurations."""
+    return bool(steps.placements[_step_at(steps, time)] == CRITICAL)
+
+
+def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list[Crossing]:
+    """The passages that were followed along the curve of closed configurations."""
+    marked = (steps.placements == CRITICAL).astype(int)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked, [0]])))
+    found = []
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist()):
+        lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
+        time = float(steps.times[lowest + 1])
+        beside = 0.25 * float(steps.times[last] - steps.times[first])
+        kind = "avoided" if monitor.avoids(time) else "passed"
+        found.append(crossing_at(monitor, steps, time, beside, kind))
+    return found
+
+
 def _placement(steps: StepData, i: int) -> str:
+    if steps.placements[i] == CRITICAL:
+        return STEP_PLACEMENTS[CRITICAL]
     # At the end of a step the next one's stages may be those that came too close.
     if any(k in steps.zones for k in (i - 1, i, i + 1)):
         return "zone"
@@ -378,16 +492,17 @@ def _placement(steps: StepData, i: int) -> str:
 
 
 def crossing_at(
-    monitor: ConstraintMonitor, steps: StepData, time: float, beside: float
+    monitor: ConstraintMonitor, steps: StepData, time: float, beside: float, kind: str = "passed"
 ) -> Crossing:
     """The crossing of a run at ``time`` (s), whose velocity is taken ``beside`` (s) it."""
-    i = int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
+    i = _step_at(steps, time)
     return Crossing(
         time,
         float(steps.sigmas[i, 0]),
         float(steps.sigmas[i].min()),
         int(steps.ranks[i]),
         _placement(steps, i),
+        kind,
         monitor,
         beside,
         (float(steps.times[0]), steps.end),
@@ -399,8 +514,12 @@ def find_crossings(
     scheme: ButcherTableau,
     steps: StepData,
     dense: DenseOutput,
+    tolerance: float = 0.0,
 ) -> tuple[Crossing, ...]:
-    """All crossings of a run, in order of time."""
+    """All crossings of a run, in order of time.
+
+    ``tolerance``: residual (row units) up to which a critical configuration counts as singular.
+    """
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
@@ -409,27 +528,73 @@ def find_crossings(
     t, sigma = t[inside], sigma[inside]
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
-    monitor = ConstraintMonitor(analysis, dense)
+    monitor = ConstraintMonitor(analysis, dense, tolerance)
     if analysis.sigma_reference < SMALL_REFERENCE_PIVOT:
         sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
-    found: list[Crossing] = []
-    for times in _windows(t, _may_vanish(t, sigma, scheme.n_stages)):
+    found: dict[float, Crossing] = {}
+    lowest = _lowest(t, sigma, scheme.n_stages)
+    for begin, end in _windows(_may_vanish(sigma, lowest, scheme.n_stages)):
+        own = slice(begin, end + 1)
+        dips = _dips(sigma[own], lowest[begin:end])
+        if not dips:
+            continue
+        largest = begin + int(np.argmax(sigma[own]))
+        scale = float(monitor.smallest(t[largest : largest + 1])[0])
+        for first, k, last in dips:
+            for crossing in _crossings_at(monitor, steps, t[own], (first, k, last), scale):
+                found.setdefault(crossing.time, crossing)
+    for crossing in _crossings_along_curves(monitor, steps):
+        found.setdefault(crossing.time, crossing)
+    return tuple(found[time] for time in sorted(found))
+
+
+def _crossings_at(
+    monitor: ConstraintMonitor,
+    steps: StepData,
+    t: FloatArray,
+    dip: tuple[int, int, int],
+    scale: float,
+) -> list[Crossing]:
+    """The crossings at a minimum of sigma in a window with the samples t (k,); ``scale`` is the
+    largest singular value there."""
+    minima: list[tuple[int, int, int]] = []
+    for width in DIP_WIDTHS:
+        times = _times_around(t, *dip, width)
         values = monitor.smallest(times)
-        scale = float(values.max())
-        for first, k, last in _minima(values):
-            near = slice(k - 1, k + 2)
-            time, value = monitor.minimum(times[near], values[near])
-            before, after = float(times[first]), float(times[last])
-            sides = values[[first, last]]
-            if not value < MINIMUM_DEPTH * sides.min():
-                continue
-            cosine = _rank_loss_cosine(monitor, time, value < SINGULAR_VALUE * scale, before, after)
+        minima = _minima(values, max(scale, float(values.max())))
+        if minima:
+            break
+    found = []
+    for first, k, last in minima:
+        near = slice(k - 1, k + 2)
+        before, after = float(times[first]), float(times[last])
+        sides = values[[first, last]]
+        if not _lowest_bracketed(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
+            continue
+        time, value = monitor.minimum(times[near], values[near])
+        if not value < MINIMUM_DEPTH * sides.min():
+            continue
+        if _along_curve(steps, time):
+            continue
+        certain = value < SINGULAR_VALUE * scale
+        kind = "passed"
+        if not certain and monitor.avoids(time):
+            kind = "avoided"
+        else:
+            cosine = _rank_loss_cosine(monitor, time, certain, before, after)
             if cosine is None or (cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale):
                 continue
-            slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
-            found.append(crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope))
-    return tuple(found)
+        slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
+        found.append(crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind))
+    return found
+
+
+def _lowest_bracketed(t: FloatArray, values: FloatArray) -> float:
+    """Lowest value between three samples (3,), the middle one the smallest, with a margin for
+    curvature."""
+    slopes = np.abs(np.diff(values)) / np.diff(t)
+    return float(values[1] - SLOPE_MARGIN * slopes.max() * np.diff(t).max())
 
 
 @dataclass(frozen=True)
@@ -540,11 +705,29 @@ def _reversal_time(monitor: ConstraintMonitor, t: FloatArray) -> float:
     return float(brentq(along, t[k], t[k + 1], xtol=1e-12 * (t[-1] - t[0]), rtol=1e-15))
 
 
+def _turns_back_there(monitor: ConstraintMonitor, steps: StepData, i: int) -> bool:
+    """Whether the motion that turns back in step ``i`` does so at rest on a singular
+    configuration."""
+    t = np.linspace(steps.times[i], min(steps.times[i + 1], steps.end), SAMPLES)
+    time = _reversal_time(monitor, t)
+    if monitor.smallest(np.array([time]))[0] > UNDECIDED_VALUE:
+        return False
+    rates = [monitor.geometry.rates(v) for _, v in monitor.states(np.array([t[0], time, t[-1]]))]
+    first, there, last = (np.linalg.norm(u[: monitor.geometry.model.nv]) for u in rates)
+    if there > RESTING_SPEED * max(first, last):
+        return False
+    q = monitor.place(time)
+    found = nearest_singular(monitor.geometry, q, monitor.rank, BIFURCATION_SEARCH)
+    if found is None:
+        return False
+    distance = np.linalg.norm(monitor.geometry.difference(found, q))
+    return bool(distance < UNDECIDED_DISTANCE)
+
+
 def find_bifurcations(
     system: System,
     steps: StepData,
     dense: DenseOutput,
-    rtol: float,
     failed: bool,
 ) -> tuple[Bifurcation, ...]:
     """The singular configurations that a run reached without momentum, in order of time.
@@ -564,17 +747,22 @@ def find_bifurcations(
     v = steps.states[:, len(analysis.q0) :] / analysis.coordinate_unit
     speeds = np.linalg.norm(v, axis=1)
     reverses = (v[:-1] * v[1:]).sum(axis=1) <= 0.0
+    slow = speeds[1:] <= WITHOUT_MOMENTUM * speeds.max()
+    rests = slow & (steps.sigmas.max(axis=1) < RESTING_SIGMA)
     # A run that cannot continue while it moves fails for another reason.
     stops = bool(failed and close[-1] and speeds[-1] <= WITHOUT_MOMENTUM * speeds.max())
-    marked = held | (reverses & close)
+    marked = held | rests
     marked[last] |= stops
-    if not marked.any():
+    turning = np.flatnonzero(reverses & close & ~marked)
+    if not (marked.any() or len(turning)):
         return ()
     found: list[Bifurcation] = []
     monitor = ConstraintMonitor(analysis, dense)
+    for i in turning.tolist():
+        marked[i] = _turns_back_there(monitor, steps, i)
     for first, final in _ranges(np.flatnonzero(marked).tolist(), steps):
         t = np.linspace(steps.times[first], min(steps.times[final + 1], steps.end), SAMPLES)
-        stayed = bool(final > first or held[first])
+        stayed = bool(final > first or held[first] or rests[first])
         stopped = stops and final == last
         # A motion may pass and come back within the step: whether it had the momentum to pass
         # follows from the place of its reversal.
@@ -584,8 +772,6 @@ def find_bifurcations(
         if singular is None:
             continue
         distance = float(np.linalg.norm(monitor.geometry.difference(singular, q)))
-        if not (stayed or stopped or distance < UNDECIDED_DISTANCE * rtol):
-            continue
         begin, end = (float(t[0]), float(t[-1])) if stayed else (closest, closest)
         # The branch of arrival is determined where the motion was faster.
         crossing = crossing_at(monitor, steps, begin, float(t[-1] - t[0]) / (final + 1 - first))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.numbers import vector
 
 WORLD = "world"
@@ -78,8 +78,10 @@ class Anchor:
         if index < 0:
             kind = "link" if self.link is not None else "frame"
             names = {f.name for f in model.frames if kind == "frame" or f.type == body}
-            shown = ", ".join(sorted(names - {"universe"} | {WORLD}))
-            raise InputError(f"there is no {kind} {self.where!r}", remedy=f"Known: {shown}")
+            names = names - {"universe"} | {WORLD}
+            raise InputError(
+                f"there is no {kind} {safe_repr(self.where)}", remedy=known_names(sorted(names))
+            )
         frame = model.frames[index]
         return int(frame.parentJoint), frame.placement * offset
 
@@ -94,7 +96,9 @@ def name_places(element: str, *anchors: Any) -> list[str]:
     """
     for anchor in anchors:
         if not isinstance(anchor, Anchor | None):
-            raise InputError(f"{anchor!r} is not an anchor", element=element, remedy=_GIVE_ANCHOR)
+            raise InputError(
+                f"{safe_repr(anchor)} is not an anchor", element=element, remedy=_GIVE_ANCHOR
+            )
     return [anchor.where for anchor in anchors if anchor is not None]
 
 
@@ -149,7 +153,9 @@ def resolve_moving(
     for anchor in given:
         if not isinstance(anchor, Anchor):
             raise InputError(
-                f"{anchor!r} is not a point of a link", element=element, remedy=_GIVE_ANCHOR
+                f"{safe_repr(anchor)} is not a point of a link",
+                element=element,
+                remedy=_GIVE_ANCHOR,
             )
         joint, placement = _resolve(model, anchor, element)
         if joint == 0:
@@ -173,9 +179,9 @@ def moving_joint(model: pin.Model, name: str | None, element: str) -> Any:
     names = list(model.names)[1:]
     if name not in names:
         raise InputError(
-            f"there is no moving joint {name!r}",
+            f"there is no moving joint {safe_repr(name)}",
             element=element,
-            remedy=f"Known: {', '.join(names) or 'none'}",
+            remedy=known_names(names),
         )
     return model.joints[model.getJointId(name)]
 
@@ -191,6 +197,8 @@ def one_degree_joint(model: pin.Model, name: str | None, element: str, instead: 
     joint = moving_joint(model, name, element)
     if joint.nv != 1:
         raise InputError(
-            f"joint {name!r} has {joint.nv} degrees of freedom", element=element, remedy=instead
+            f"joint {safe_repr(name)} has {joint.nv} degrees of freedom",
+            element=element,
+            remedy=instead,
         )
     return joint

@@ -31,9 +31,9 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
-from srm_mbs.model.numbers import check_name, finite_number, finite_numbers, unit_vector
+from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -256,6 +256,17 @@ def _key(words: str, form: str) -> Any:
     return field(default=None, metadata={"words": words, "remedy": f"Give {form}"})
 
 
+def _text(value: Any) -> str:
+    return plain(value) if isinstance(value, str) else safe_repr(value)
+
+
+def _listed(value: Any) -> tuple[Any, ...]:
+    try:
+        return tuple(value)
+    except Exception:  # objects may raise anything
+        return ()
+
+
 @dataclass(frozen=True)
 class LoopClosure:
     """One loop closure: between anchors ``a`` and ``b``, or (``coupling``) between joints.
@@ -308,14 +319,15 @@ class LoopClosure:
     offset: float | None = _key("an offset", '"offset = ..."')
 
     def __post_init__(self) -> None:
-        places = name_places(self._element, self.a, self.b) or self.joints or ()
-        check_name(self.name, "loop")
-        if not self.name:
-            object.__setattr__(self, "name", "_".join((self.type_name, *map(str, places))))
+        places = name_places(self._element, self.a, self.b)
+        name = checked_name(self.name, "loop")
+        if not name:
+            name = "_".join((self.type_name, *map(_text, places or _listed(self.joints))))
+        object.__setattr__(self, "name", name)
         known = isinstance(self.type, str) and self.type in CLOSURE_TYPES
         if not (known or isinstance(self.type, ClosureType)):
             raise self._fault(
-                f"there is no closure type {self.type!r}",
+                f"there is no closure type {safe_repr(self.type)}",
                 f"Known: {', '.join(CLOSURE_TYPES)}",
             )
         kind = self.kind
@@ -338,7 +350,7 @@ class LoopClosure:
     @property
     def _element(self) -> str:
         """Its name in messages."""
-        return f"loop {self.name!r}"
+        return f"loop {safe_repr(self.name)}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
@@ -355,11 +367,13 @@ class LoopClosure:
         object.__setattr__(self, "length", length)
 
     def _take_joints(self, given: Sequence[str]) -> None:
-        joints = tuple(given) if not isinstance(given, str) else (given,)
+        joints = (given,) if isinstance(given, str) else _listed(given)
         if not joints or not all(isinstance(name, str) for name in joints):
             raise self._fault(
-                f"joints = {given!r} is not a list of names", 'Give "joints = [first, second]"'
+                f"joints = {safe_repr(given)} is not a list of names",
+                'Give "joints = [first, second]"',
             )
+        joints = tuple(map(plain, joints))
         for name in joints:
             if joints.count(name) > 1:
                 raise self._fault(
@@ -405,7 +419,7 @@ class LoopClosure:
     @property
     def type_name(self) -> str:
         """The name of its type."""
-        return self.type.name if isinstance(self.type, ClosureType) else str(self.type)
+        return self.type.name if isinstance(self.type, ClosureType) else _text(self.type)
 
     @property
     def anchors(self) -> tuple[Anchor, ...]:

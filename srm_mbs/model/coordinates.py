@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.mechanism import MechanismData
 from srm_mbs.model.numbers import finite_array, name_list
 
@@ -27,7 +27,10 @@ def _numbers(value: Any, name: str, accepted: dict[int, str]) -> FloatArray:
     array = finite_array(value)
     if array is None or array.ndim > 1 or array.size not in accepted:
         wanted = " or ".join(accepted.values())
-        raise InputError(f"joint {name!r} cannot take the value {value!r}", remedy=f"Give {wanted}")
+        raise InputError(
+            f"joint {name!r} cannot take the value {safe_repr(value)}",
+            remedy=f"Give {wanted}",
+        )
     return np.atleast_1d(array)
 
 
@@ -62,7 +65,7 @@ def write_position(joint: Any, q: FloatArray, name: str, value: Any) -> None:
         length = float(np.linalg.norm(array[part]))
         if abs(length - 1.0) > UNIT_LENGTH_TOLERANCE:
             raise InputError(
-                f"joint {name!r}: the rotation part of {value!r} has length {length:.6g}",
+                f"joint {name!r}: the rotation part of {safe_repr(value)} has length {length:.6g}",
                 remedy="Give a unit quaternion (x, y, z, w), or a unit (cos, sin) pair",
             )
         array[part] /= length
@@ -107,7 +110,7 @@ def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexAr
     for name in name_list(names, "joints"):
         joint = mechanism.joint(name)
         if joint.idx_v in indices:
-            raise InputError(f"joint {name!r} is named twice", remedy="Name it once")
+            raise InputError(f"joint {safe_repr(name)} is named twice", remedy="Name it once")
         indices += range(joint.idx_v, joint.idx_v + joint.nv)
     return np.array(indices, dtype=int)
 

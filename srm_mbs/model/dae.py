@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 
 Callback = Callable[[float, Any], Any]
 """(t, x) -> array; x has shape (nx,)."""
@@ -50,7 +50,7 @@ class SemiExplicitDAE:
             value = getattr(self, name)
             if not callable(value) and not (name == "g_t" and value is None):
                 raise InputError(
-                    f"{name} = {value!r} cannot be called",
+                    f"{name} = {safe_repr(value)} cannot be called",
                     element=name,
                     remedy="Give a function of (t, x)",
                 )

@@ -16,11 +16,11 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
-from srm_mbs.model.numbers import check_name, unit_vector
+from srm_mbs.model.numbers import checked_name, unit_vector
 
 LAWS_WITH_VALUES = (Table, Polynomial, Sine)
 """Laws with a value s(0) of their own, which can prescribe positions."""
@@ -71,11 +71,12 @@ class Drive:
 
     def __post_init__(self) -> None:
         places = name_places(self._element, self.a, self.b)
-        check_name(self.name, "drive")
-        if not self.name:
-            object.__setattr__(self, "name", self.joint or "_".join(["drive", *places]))
+        name = checked_name(self.name, "drive") or self.joint or "_".join(["drive", *places])
+        object.__setattr__(self, "name", name)
         if not isinstance(self.law, Law):
-            raise self._fault(f"{self.law!r} is not a law", "Give srm.ConstantSpeed(...) or alike")
+            raise self._fault(
+                f"{safe_repr(self.law)} is not a law", "Give srm.ConstantSpeed(...) or alike"
+            )
         anchors = self.a is not None and self.b is not None
         if (self.joint is None) != anchors or (self.a is None) != (self.b is None):
             raise self._fault(
@@ -98,7 +99,7 @@ class Drive:
     @property
     def _element(self) -> str:
         """Its name in messages."""
-        return f"drive {self.name!r}"
+        return f"drive {safe_repr(self.name)}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)

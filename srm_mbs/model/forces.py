@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import (
     Anchor,
     moving_joint,
@@ -31,7 +31,7 @@ from srm_mbs.model.anchors import (
     resolve_moving,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.numbers import check_name, finite_array
+from srm_mbs.model.numbers import checked_name, finite_array
 
 
 def quantity(
@@ -87,7 +87,7 @@ class ForceElement(ABC):
     def _element(self) -> str:
         """Its name in messages."""
         named = isinstance(self.name, str) and self.name
-        return f"force {named or self.type!r}"
+        return f"force {safe_repr(named or self.type)}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
@@ -97,9 +97,8 @@ class ForceElement(ABC):
 
     def _take_name(self, *places: str) -> None:
         """The default name, if none is given."""
-        for name in (self.name, *places):
-            check_name(name, self._element)
-        self._set("name", self.name or "_".join((self.type, *places)))
+        name, *others = (checked_name(name, self._element) for name in (self.name, *places))
+        self._set("name", name or "_".join((self.type, *others)))
 
     def _take_number(self, key: str, count: int, nonnegative: bool = False) -> None:
         """Check a number (``count`` 0) or ``count`` numbers and store them as float or tuple."""
@@ -107,9 +106,9 @@ class ForceElement(ABC):
         wanted = f"a list of {count} finite numbers" if count else "a finite number"
         numbers = finite_array(given, (count,) if count else ())
         if numbers is None:
-            raise self._fault(f"{key} = {given!r} is not {wanted}", f"Give {wanted}")
+            raise self._fault(f"{key} = {safe_repr(given)} is not {wanted}", f"Give {wanted}")
         if nonnegative and numbers.min() < 0.0:
-            raise self._fault(f"{key} = {given!r} is negative", "Give a value >= 0")
+            raise self._fault(f"{key} = {safe_repr(given)} is negative", "Give a value >= 0")
         self._set(key, tuple(numbers.tolist()) if count else float(numbers))
 
     def _take_quantities(self) -> None:
@@ -169,7 +168,9 @@ class UserForce(ForceElement):
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise self._fault(f"{self.function!r} cannot be called", "Give a function of (t, q, v)")
+            raise self._fault(
+                f"{safe_repr(self.function)} cannot be called", "Give a function of (t, q, v)"
+            )
         self._take_name(getattr(self.function, "__name__", "function").strip("<>"))
         name_places(self._element, self.at)
 
@@ -287,7 +288,7 @@ class JointTorque(ForceElement):
         count = moving_joint(model, self.joint, self._element).nv
         if np.size(self.torque) != count:  # type: ignore[arg-type]
             raise self._fault(
-                f"torque = {self.torque!r} does not fit the {count} degrees of freedom of "
+                f"torque = {safe_repr(self.torque)} does not fit the {count} degrees of freedom of "
                 f"joint {self.joint!r}",
                 "Give one number" if count == 1 else f"Give a list of {count} numbers",
             )
@@ -379,7 +380,9 @@ class Wrench(ForceElement):
         self._take_quantities()
         self._refuse_zeros("force", "moment")
         if not isinstance(self.frame, str) or self.frame not in ("world", "link"):
-            raise self._fault(f"there is no frame {self.frame!r}", 'Give "world" or "link"')
+            raise self._fault(
+                f"there is no frame {safe_repr(self.frame)}", 'Give "world" or "link"'
+            )
 
     def check(self, model: pin.Model) -> None:
         resolve_moving(model, [self.at], f"{self._element}, anchor at")

@@ -15,14 +15,16 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, overload, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from srm_mbs.errors import InputError
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.numbers import finite_array
 
 
@@ -91,7 +93,7 @@ class Law(Protocol):
         """s(t); ``initial`` is s(0) of laws that prescribe only their target or their speed."""
 
     @property
-    def knots(self) -> tuple[float, ...]:
+    def knots(self) -> Sequence[float]:
         """Times (s) at which its third derivative jumps; none by default."""
         return ()
 
@@ -110,24 +112,74 @@ def _take(law: Law, key: str, above: float = -math.inf) -> float:
     given = getattr(law, key)
     number = None if isinstance(given, (bool, str)) else finite_array(given, ())
     if number is None:
-        raise _fault(law, f"{key} = {given!r} is not a finite number", f"Give a number for {key}")
+        raise _fault(
+            law, f"{key} = {safe_repr(given)} is not a finite number", f"Give a number for {key}"
+        )
     if not number > above:
-        raise _fault(law, f"{key} = {given!r} is too small", f"Give {key} above {above:g}")
+        raise _fault(law, f"{key} = {safe_repr(given)} is too small", f"Give {key} above {above:g}")
     object.__setattr__(law, key, float(number))
     return float(number)
 
 
-def _take_list(law: Law, key: str, least: int) -> tuple[float, ...]:
-    """Check a list of at least ``least`` numbers of ``law`` and store it as a tuple of floats."""
+def _list(law: Law, key: str, least: int) -> FloatArray:
+    """The list of numbers of ``law``, of which there are at least ``least``, as a new array."""
     array = finite_array(getattr(law, key), (None,))
     remedy = f"Give a list of finite numbers, at least {least}"
     if array is None:
         raise _fault(law, f"{key} is not a list of finite numbers", remedy)
     if len(array) < least:
         raise _fault(law, f"{key} has shape {array.shape}", remedy)
-    values = tuple(array.tolist())
-    object.__setattr__(law, key, values)
-    return values
+    return array
+
+
+class Samples(Sequence[float]):
+    """Numbers that behave as a tuple of floats, in a read-only array: a tuple takes four times the
+    memory.
+
+    Parameters
+    ----------
+    array : (n,)
+        The numbers; it becomes read-only.
+    """
+
+    __slots__ = ("_array",)
+
+    def __init__(self, array: FloatArray) -> None:
+        array.setflags(write=False)
+        self._array = array
+
+    def __len__(self) -> int:
+        return len(self._array)
+
+    @overload
+    def __getitem__(self, index: int) -> float: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[float, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> float | tuple[float, ...]:
+        found = self._array[index].tolist()
+        return tuple(found) if isinstance(index, slice) else found
+
+    def __iter__(self) -> Iterator[float]:
+        return iter(self._array.tolist())
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self._array, dtype) if copy else np.asarray(self._array, dtype)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, Samples):
+            return np.array_equal(self._array, other._array)
+        return tuple(self) == other if isinstance(other, tuple) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(tuple(self))
+
+    def __repr__(self) -> str:
+        return repr(tuple(self))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Samples, (self._array,)
 
 
 @dataclass(frozen=True)
@@ -217,7 +269,8 @@ class Polynomial(Law):
     coefficients: Sequence[float]
 
     def __post_init__(self) -> None:
-        _take_list(self, "coefficients", 1)
+        coefficients = tuple(_list(self, "coefficients", 1).tolist())
+        object.__setattr__(self, "coefficients", coefficients)
 
     def curve(self, initial: float = 0.0) -> Curve:
         return Curve(pieces=(tuple(self.coefficients),))
@@ -292,15 +345,17 @@ class Table(Law):
     values: Sequence[float]
 
     def __post_init__(self) -> None:
-        t, values = _take_list(self, "t", 4), _take_list(self, "values", 4)
+        t, values = _list(self, "t", 4), _list(self, "values", 4)
         if len(t) != len(values):
             raise _fault(self, f"{len(t)} times and {len(values)} values", "Give as many of each")
-        if not (np.diff(t) > 0.0).all():
+        if not (t[1:] > t[:-1]).all():
             raise _fault(self, "the times do not ascend", "Sort them, each time once")
         if t[0] > 0.0:
             raise _fault(
                 self, f"the table begins at t = {t[0]:g} s", "Let it begin at t = 0 or before"
             )
+        object.__setattr__(self, "t", Samples(t))
+        object.__setattr__(self, "values", Samples(values))
 
     def curve(self, initial: float = 0.0) -> Curve:
         from scipy.interpolate import CubicSpline
@@ -309,9 +364,10 @@ class Table(Law):
         return Curve(tuple(self.t[:-1]), tuple(map(tuple, spline.c[::-1].T.tolist())))
 
     @property
-    def knots(self) -> tuple[float, ...]:
+    def knots(self) -> Sequence[float]:
         # Not-a-knot: the third derivative is the same on both sides of the second and last but one.
-        return tuple(self.t[2:-2])
+        # Not a tuple: isinstance(table, Law) asks for the attributes of the protocol.
+        return Samples(np.asarray(self.t)[2:-2])
 
     @property
     def span(self) -> tuple[float, float]:

@@ -8,7 +8,8 @@ you.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import update_wrapper
@@ -18,12 +19,12 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
-from srm_mbs.model.numbers import check_name
+from srm_mbs.model.numbers import checked_name
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,
     closures_from_pinocchio,
@@ -37,6 +38,11 @@ from srm_mbs.model.validation import (
     checked_start,
     without,
 )
+
+# References to files by their full name, as in filename="/home/author/arm.stl".
+_FOLDER = r"(?:file://)?(?:/|[A-Za-z]:[\\/])(?:[^\"'<>\n]*[\\/])?"
+_FILE_KEYS = "urdf|sdf|mjcf|gepetto|table|file|filename"
+_FULL_NAME = re.compile(rf"""(\b(?:{_FILE_KEYS})\s*=\s*["']){_FOLDER}(?=[^"'/\\])""")
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,17 @@ class Source:
         """The fields that are saved: all but the reach."""
         return {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
 
+    def without_folders(self, text: str) -> str:
+        """``text`` of its files or about them, with the files of the model named relative to its
+        folders, and other files by their name alone."""
+        for file in (self.urdf_path, self.path):
+            folder = os.path.dirname(file)
+            for absolute in {folder, os.path.abspath(folder), os.path.realpath(folder)}:
+                if os.path.isabs(absolute) and absolute != os.path.dirname(absolute):
+                    for prefix in (f"file://{absolute}/", f"{absolute}{os.sep}"):
+                        text = text.replace(prefix, "")
+        return _FULL_NAME.sub(r"\1", text)
+
 
 @dataclass(frozen=True)
 class SimulationDefaults:
@@ -104,30 +121,32 @@ Owner = TypeVar("Owner", bound=ResultOwner, contravariant=True)
 Result = TypeVar("Result")
 
 
-class _Memoised(ABC, Generic[Owner, Result]):
+class _Memoised(Generic[Owner, Result]):
     """A function of a mechanism whose result is kept with the mechanism; nothing may change it."""
+
+    _store: str
+    """Attribute of :class:`ResultOwner` that holds the results."""
 
     def __init__(self, function: Callable[[Owner], Result]) -> None:
         self._function = function
         update_wrapper(self, function)
 
-    @abstractmethod
-    def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
-        """The store of the mechanism that the result belongs to."""
-
     def __call__(self, mechanism: Owner) -> Result:
-        results = self._results(mechanism)
-        if self not in results:
-            results[self] = self._function(mechanism)
-        return results[self]  # type: ignore[no-any-return]
+        results = getattr(mechanism, self._store)
+        try:
+            return results[self]  # type: ignore[no-any-return]
+        except KeyError:
+            pass
+        result = results[self] = self._function(mechanism)
+        return result
 
     def kept(self, mechanism: Owner) -> Result | None:
         """The result, if it was computed or given before."""
-        return self._results(mechanism).get(self)
+        return getattr(mechanism, self._store).get(self)  # type: ignore[no-any-return]
 
     def keep(self, mechanism: Owner, result: Result) -> None:
         """Use ``result`` instead of computing it."""
-        self._results(mechanism)[self] = result
+        getattr(mechanism, self._store)[self] = result
 
 
 class per_model(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
@@ -136,15 +155,13 @@ class per_model(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
     The result must not depend on the initial state.
     """
 
-    def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
-        return mechanism._model_results
+    _store = "_model_results"
 
 
 class per_start(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
     """Decorator: evaluate a function of a mechanism once for each initial state."""
 
-    def _results(self, mechanism: ResultOwner) -> dict[Any, Any]:
-        return mechanism._start_results
+    _store = "_start_results"
 
 
 FRICTION_SPEED = 0.01
@@ -180,8 +197,7 @@ class MechanismData(ResultOwner):
                 remedy="Give a pinocchio.Model",
             )
         check_tree(model)
-        check_name(self.name, "name")
-        set_(self, "name", self.name or model.name)
+        set_(self, "name", checked_name(self.name, "name") or model.name)
         self._take_start(
             pin.neutral(model) if self.q0 is None else self.q0,
             np.zeros(model.nv) if self.v0 is None else self.v0,
@@ -351,8 +367,11 @@ class MechanismData(ResultOwner):
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:
         """Times (s) between ``t0`` and ``t_end`` at which a part of it that depends on time is not
         smooth: knots of tables, switches of drives.  Runs take no step across them."""
-        times = {knot for _, law in _laws(self) for knot in law.knots}
-        return tuple(sorted(knot for knot in times if t0 < knot < t_end))
+        times: set[float] = set()
+        for _, law in _laws(self):
+            knots = np.asarray(law.knots, dtype=float)
+            times.update(knots[(t0 < knots) & (knots < t_end)].tolist())
+        return tuple(sorted(times))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -369,7 +388,7 @@ class MechanismData(ResultOwner):
         """
         if not isinstance(name, str) or name not in self.joint_names:
             raise InputError(
-                f"there is no joint {name!r}", remedy=f"Known: {', '.join(self.joint_names)}"
+                f"there is no joint {safe_repr(name)}", remedy=known_names(self.joint_names)
             )
         return self.model.joints[self.model.getJointId(name)]
 

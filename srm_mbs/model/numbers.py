@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 
 LARGEST_MAGNITUDE = 1e30
 """Of a number in a file, in SI units: the squares of larger ones may overflow in sums."""
@@ -49,7 +49,7 @@ def flag(value: Any, name: str) -> bool:
     if isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1)):
         return bool(value)
     raise InputError(
-        f"{name} = {value!r} is neither True nor False",
+        f"{name} = {safe_repr(value)} is neither True nor False",
         element=name,
         remedy="Give True or False",
     )
@@ -67,7 +67,7 @@ def choice(value: Any, known: Iterable[str], name: str) -> str:
     if isinstance(value, str) and value in words:
         return value
     raise InputError(
-        f"there is no {name} {value!r}",
+        f"there is no {name} {safe_repr(value)}",
         element=name,
         remedy=f"Known: {', '.join(map(repr, words))}",
     )
@@ -82,18 +82,18 @@ def name_list(given: Any, element: str) -> tuple[str, ...]:
         If it is anything else.
     """
     if isinstance(given, str):
-        return (given,)
+        return (plain(given),)
     try:
         names = tuple(given)
     except Exception:  # objects may raise anything
         names = (None,)
     if not all(isinstance(name, str) for name in names):
         raise InputError(
-            f"{element} = {given!r} is not a list of names",
+            f"{element} = {safe_repr(given)} is not a list of names",
             element=element,
             remedy="Give a list of names",
         )
-    return names
+    return tuple(map(plain, names))
 
 
 def named_values(given: Any, element: str) -> Mapping[str, Any]:
@@ -108,15 +108,20 @@ def named_values(given: Any, element: str) -> Mapping[str, Any]:
         return {}
     if not isinstance(given, Mapping):
         raise InputError(
-            f"{element} = {given!r} does not have a value for each name",
+            f"{element} = {safe_repr(given)} does not have a value for each name",
             element=element,
             remedy="Give a dictionary: name -> value",
         )
-    return given
+    return {plain(key) if isinstance(key, str) else key: value for key, value in given.items()}
 
 
-def check_name(name: Any, what: str) -> None:
-    """Refuse a name of ``what``, such as a force, that is not a text.
+def plain(text: str) -> str:
+    """``text`` without what a subclass of str adds, which formats itself as it likes."""
+    return str.__str__(text)
+
+
+def checked_name(name: Any, what: str) -> str:
+    """``name``, of ``what``, such as a force, as a text.
 
     Raises
     ------
@@ -125,8 +130,9 @@ def check_name(name: Any, what: str) -> None:
     """
     if not isinstance(name, str):
         raise InputError(
-            f"the name {name!r} is not a text", element=what, remedy="Give a text, or none"
+            f"the name {safe_repr(name)} is not a text", element=what, remedy="Give a text, or none"
         )
+    return plain(name)
 
 
 def finite_number(value: Any, name: str, element: str) -> float:
@@ -140,7 +146,7 @@ def finite_number(value: Any, name: str, element: str) -> float:
     array = finite_array(value, ())
     if array is None:
         raise InputError(
-            f"{name} = {value!r} is not a finite number",
+            f"{name} = {safe_repr(value)} is not a finite number",
             element=element,
             remedy="Give a finite number",
         )
@@ -160,7 +166,7 @@ def finite_numbers(
     array = finite_array(values, (count,))
     if array is None:
         raise InputError(
-            f"{name} must be {count} finite numbers, not {values!r}",
+            f"{name} must be {count} finite numbers, not {safe_repr(values)}",
             element=element or name,
             remedy=remedy,
         )

@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 
 import pinocchio as pin
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 
 MANIFESTS = ("package.xml", "model.config")
 """Files at the top of a package of ROS and of a model of Gazebo."""
@@ -71,7 +71,7 @@ class Reach:
         """
         if not isinstance(allow_outside, bool):
             raise InputError(
-                f"allow_outside = {allow_outside!r} is not True or False",
+                f"allow_outside = {safe_repr(allow_outside)} is not True or False",
                 element="allow_outside",
                 remedy="Give True or False",
             )

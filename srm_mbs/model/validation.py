@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dpotrf
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.numbers import finite_array
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
@@ -132,7 +132,7 @@ def check_tree(model: pin.Model) -> None:
         damping = model.damping[joint.idx_v : joint.idx_v + joint.nv]
         if (damping < 0.0).any():
             raise InputError(
-                f"the damping of the joint {name!r} is negative: {damping}",
+                f"the damping of the joint {safe_repr(name)} is negative: {damping}",
                 element="model.damping",
                 remedy="Give no negative numbers; a force that feeds energy in is an srm.UserForce",
             )
@@ -179,7 +179,7 @@ def checked_elements(
         several, parts = False, (given,)
     if not several or not all(hasattr(part, "name") and hasattr(part, "check") for part in parts):
         raise InputError(
-            f"{what}s = {given!r} is not a list of {what}s",
+            f"{what}s = {safe_repr(given)} is not a list of {what}s",
             element=f"{what}s",
             remedy=f"Give a list of them, such as [srm.{example}(...)]",
         )
@@ -187,8 +187,8 @@ def checked_elements(
     for name in names:
         if names.count(name) > 1:
             raise InputError(
-                f"the {what} name {name!r} is used twice",
-                element=f"{what} {name!r}",
+                f"the {what} name {safe_repr(name)} is used twice",
+                element=f"{what} {safe_repr(name)}",
                 remedy=f"Give every {what} its own name",
             )
     for part in parts:
@@ -206,8 +206,8 @@ def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
     """
     kept = tuple(part for part in parts if part.name != name)
     if len(kept) == len(parts):
-        known = ", ".join(repr(part.name) for part in parts) or "none"
-        raise InputError(f"there is no {what} {name!r}", remedy=f"Known: {known}")
+        known = known_names(repr(part.name) for part in parts)
+        raise InputError(f"there is no {what} {safe_repr(name)}", remedy=known)
     return kept
 
 
@@ -258,7 +258,7 @@ def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
     speed = finite_array(friction_speed, ())
     if speed is None or speed <= 0.0:
         raise InputError(
-            f"friction_speed = {friction_speed!r} is not a finite positive number",
+            f"friction_speed = {safe_repr(friction_speed)} is not a finite positive number",
             element="friction_speed",
             remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.errors import ControllerError, EvaluationError, InputError
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, safe_repr
 from srm_mbs.integration.control.prescribed_times import suspected
 from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.driver import RunRecord, RunStatus
@@ -65,7 +65,9 @@ def _interval(t_span: Any) -> tuple[float, float]:
     remedy = "Give (t0, t1) with t0 < t1"
     ends = numbers(t_span, "t_span", remedy)
     if ends.shape != (2,) or not ends[0] < ends[1]:
-        raise InputError(f"t_span = {t_span!r} is not an interval", element="t_span", remedy=remedy)
+        raise InputError(
+            f"t_span = {safe_repr(t_span)} is not an interval", element="t_span", remedy=remedy
+        )
     return float(ends[0]), float(ends[1])
 
 
@@ -125,7 +127,7 @@ def run_dae(
     """
     if not isinstance(problem, SemiExplicitDAE):
         raise InputError(
-            f"{problem!r} is not a DAE",
+            f"{safe_repr(problem)} is not a DAE",
             element="problem",
             remedy="Give srm.SemiExplicitDAE(f=..., B=..., g=..., G=...)",
         )
@@ -141,7 +143,7 @@ def run_dae(
     watch = None
     if options.events is not None:
         prepared = prepare_events(options.events, lambda event: event)
-        watch = EventWatch(system, method.scheme, prepared, state.size)
+        watch = EventWatch(method.scheme, prepared, state.size)
     record, wrappers, first_sweeps = _integrate(system, options, norm, state, watch)
     turned = suspected(wrappers)
     if first_sweeps:
@@ -160,7 +162,7 @@ def run_dae(
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message + method_messages(method, record.steps, norm),
-        stats=statistics(system, record, data, wrappers),
+        stats=statistics(system, record, data.count, len(data.zones), wrappers),
     )
     log_end("DAE", result)
     return finished(result, options)

@@ -92,7 +92,10 @@ class BalancedRun(Protocol):
     t: FloatArray
     q: FloatArray
     v: FloatArray
-    steps: StepData
+
+    @property
+    def steps(self) -> StepData:
+        """The accepted steps."""
 
     @property
     def energy(self) -> FloatArray:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, warn
+from srm_mbs.errors import InputError, safe_repr, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -40,6 +40,9 @@ AVOIDABLE = 1e-9
 SAMPLED = 1e-9
 """Part of a sample time before the end of a run from which no sample is taken."""
 MOST_SAMPLES = 10**8
+SINGULAR_TOLERANCE = 1e-9
+"""Default of ``singular_tolerance``: residual, over the size of the mechanism, up to which a
+critical configuration counts as singular; that of data with ten digits."""
 METHODS: dict[str, Callable[..., Method]] = {
     "psrm": PSRM,
     "srm": partial(SRM, restart=True, carry=True),
@@ -81,6 +84,7 @@ class RunOptions(NamedTuple):
     progress: Any = False
     backend: Any = "auto"
     raise_on_failure: bool = False
+    singular_tolerance: Any = SINGULAR_TOLERANCE
     lost: tuple[str, ...] = ()
 
     def checked(
@@ -127,6 +131,7 @@ class RunOptions(NamedTuple):
             method=method,
             tableau=None,
             rtol=checked_rtol(self.rtol, loosest, tightest),
+            singular_tolerance=checked_singular_tolerance(self.singular_tolerance),
             t_eval=checked_times(self.t_eval, t0, t_end),
         )
 
@@ -150,7 +155,7 @@ class RunOptions(NamedTuple):
 
 REPEATED = (
     *("t0", "method", "tableau", "first_step", "max_step", "events", "controller", "sample_time"),
-    *("breakpoints", "placement", "singular_times", "backend"),
+    *("breakpoints", "placement", "singular_times", "backend", "singular_tolerance"),
 )
 """Options that a rerun takes over; start, accuracy and output come from elsewhere."""
 _NOT_REPEATED = {
@@ -168,11 +173,30 @@ def positive(value: Any, what: str, unit: str = "") -> float:
         number = math.nan
     if not (math.isfinite(number) and number > 0.0):
         raise InputError(
-            f"{what} = {value!r} is not a positive number{unit}",
+            f"{what} = {safe_repr(value)} is not a positive number{unit}",
             element=what,
             remedy="Give a positive number",
         )
     return number
+
+
+def checked_singular_tolerance(value: Any) -> float:
+    """``singular_tolerance`` as a float.
+
+    Raises
+    ------
+    InputError
+        If it is negative or not finite.
+    """
+    number = finite_array(value, ())
+    if number is None or not float(number) >= 0.0:
+        raise InputError(
+            f"singular_tolerance = {value!r} is not a number of at least 0",
+            element="singular_tolerance",
+            remedy="Give the residual, over the size of the mechanism, up to which a configuration "
+            "counts as singular; 0 follows the data",
+        )
+    return float(number)
 
 
 def check_progress(progress: Any, arguments: str) -> None:
@@ -185,7 +209,7 @@ def check_progress(progress: Any, arguments: str) -> None:
     """
     if not (callable(progress) or isinstance(progress, bool | np.bool_)):
         raise InputError(
-            f"progress = {progress!r} is neither True or False nor a function",
+            f"progress = {safe_repr(progress)} is neither True or False nor a function",
             element="progress",
             remedy=f"Give True for a progress bar, or a function of {arguments}",
         )
@@ -198,7 +222,7 @@ def finite(value: Any, what: str) -> float:
     number = finite_array(value, ())
     if number is None:
         raise InputError(
-            f"{what} = {value!r} is not a finite number",
+            f"{what} = {safe_repr(value)} is not a finite number",
             element=what,
             remedy="Give a number of seconds",
         )
@@ -210,7 +234,9 @@ def numbers(values: Any, what: str, remedy: str) -> FloatArray:
     array = finite_array(values)
     if array is None:
         raise InputError(
-            f"{what} = {values!r} does not consist of finite numbers", element=what, remedy=remedy
+            f"{what} = {safe_repr(values)} does not consist of finite numbers",
+            element=what,
+            remedy=remedy,
         )
     return array
 
@@ -262,7 +288,7 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
     if isinstance(method, str):
         if method.lower() not in METHODS:
             raise InputError(
-                f"there is no method {method!r}",
+                f"there is no method {safe_repr(method)}",
                 element="method",
                 remedy=f"Known: {', '.join(repr(name) for name in METHODS)}",
             )
@@ -279,7 +305,7 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
         hasattr(method, name) for name in ("scheme", "start", "step", "accept")
     ):
         raise InputError(
-            f"method = {method!r} is not a method",
+            f"method = {safe_repr(method)} is not a method",
             element="method",
             remedy='Give "psrm" or an object such as PSRM(tableau="dopr54")',
         )

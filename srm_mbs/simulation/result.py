@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -16,7 +16,7 @@ from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.dense_output import (
     DenseOutput,
     StepData,
@@ -24,6 +24,7 @@ from srm_mbs.integration.dense_output import (
     unwrapped_angles,
 )
 from srm_mbs.integration.driver import RunStatus
+from srm_mbs.integration.events import Occurrence
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
@@ -33,6 +34,7 @@ from srm_mbs.integration.singular_passages import (
 )
 from srm_mbs.simulation.energy_balance import EnergyBalance, energy_balance
 from srm_mbs.simulation.options import RunOptions
+from srm_mbs.simulation.streamed_output import StreamedOutput
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class Settings:
     placement: str = "automatic"
     singular_times: tuple[float, ...] = ()
     backend: str = "python"
+    singular_tolerance: float = 1e-9
 
 
 ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
@@ -173,9 +176,11 @@ class SimulationResult(RunOutcome):
         mechanism: Mechanism,
         system: OpenSystem | ClosedSystem,
         scheme: ButcherTableau,
-        steps: StepData,
+        steps: StepData | None,
         *,
         dense: DenseOutput | None = None,
+        output: StreamedOutput | None = None,
+        again: Callable[[], SimulationResult] | None = None,
         t_eval: FloatArray | None,
         attempts: NDArray[np.void],
         events: tuple[list[FloatArray], list[FloatArray]] | None = None,
@@ -185,7 +190,8 @@ class SimulationResult(RunOutcome):
         settings: Settings,
     ) -> None:
         self.mechanism = mechanism
-        self.steps = steps
+        self._steps = steps
+        self._output, self._again = output, again
         self.scheme = scheme
         self.attempts = attempts
         self.status = RunStatus(status)
@@ -193,28 +199,87 @@ class SimulationResult(RunOutcome):
         self.stats = stats
         self.settings = settings
         self._system = system
-        self._dense = DenseOutput(system, scheme, steps) if dense is None else dense
-        # q and v are views: writing to them would change the dense output.
-        steps.states.setflags(write=False)
-        steps.times.setflags(write=False)
+        if steps is not None:
+            dense = DenseOutput(system, scheme, steps) if dense is None else dense
+            # q and v are views: writing to them would change the dense output.
+            steps.states.setflags(write=False)
+            steps.times.setflags(write=False)
+        self._dense_output = dense
         self.t_eval = t_eval
-        if t_eval is None:
+        if output is not None:
+            self.t, states = output.t, output.states
+        elif t_eval is None:
             self.t, states = self._dense.nodes()
             states.setflags(write=False)
             self.t.setflags(write=False)
         else:
-            self.t = t_eval[t_eval <= steps.end]
+            self.t = t_eval[t_eval <= self.steps.end]
             states = self._dense(self.t)
         nq = mechanism.model.nq
         self.q, self.v = states[:, :nq], states[:, nq:]
-        self._events = events
         self.t_events: list[FloatArray] | None = None
         self.q_events: list[FloatArray] | None = None
         self.v_events: list[FloatArray] | None = None
+        self._take_events(events)
+
+    def _take_events(self, events: tuple[list[FloatArray], list[FloatArray]] | None) -> None:
+        """Times and states of the occurrences of each event."""
+        self._events = events
         if events is not None:
+            nq = self.mechanism.model.nq
             self.t_events, found = events
             self.q_events = [states[:, :nq] for states in found]
             self.v_events = [states[:, nq:] for states in found]
+
+    def add_occurrences(self, occurrences: Sequence[Occurrence]) -> None:
+        """Add ``occurrences`` of events at the start or the end of the run."""
+        if self._events is None:
+            return
+        times, states = map(list, self._events)
+        for found in occurrences:
+            i = found.event
+            times[i] = np.append(times[i], found.time)
+            order = np.argsort(times[i], kind="stable")
+            times[i] = times[i][order]
+            states[i] = np.concatenate([states[i], found.state[None]])[order]
+        self._take_events((times, states))
+
+    @property
+    def steps(self) -> StepData:  # type: ignore[override]
+        """The accepted steps.
+
+        A run with output times keeps them up to 8 MB; of a longer one it is made again here, once.
+
+        Raises
+        ------
+        InputError
+            If that run called Python functions, which are not called again.
+        """
+        if self._steps is None:
+            self._make_again()
+        return self._steps  # type: ignore[return-value]
+
+    @property
+    def _dense(self) -> DenseOutput:
+        if self._dense_output is None:
+            self._make_again()
+        return self._dense_output  # type: ignore[return-value]
+
+    def _make_again(self) -> None:
+        if self._again is None:
+            raise InputError(
+                f"the run has output times and {self.stats.steps} steps, which are more than it "
+                "keeps, and called Python functions, so that it is not made again",
+                element="t_eval",
+                remedy="Run it without t_eval, and read solution.at(times)",
+            )
+        whole = self._again()
+        self._steps, self._dense_output = whole.steps, whole._dense
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the run, whatever ``t`` holds."""
+        return super().span if self._output is None else self._output.span
 
     @property
     def held(self) -> HeldForce | None:
@@ -222,10 +287,21 @@ class SimulationResult(RunOutcome):
         return self._system.held
 
     @property
+    def system(self) -> OpenSystem | ClosedSystem:
+        """The equations of motion of the run."""
+        return self._system
+
+    @property
+    def kernel_system(self) -> Any:
+        """The kernel system that the run keeps, for itself alone; None without one."""
+        return getattr(self._dense_output, "kernel_system", None)
+
+    @property
     def steps_to_save(self) -> StepData:
-        """The steps; complete where the controller, which is not saved, would be needed to read
-        between them."""
-        called = self.settings.controlled and self._system.controlled and self.held is None
+        """The steps; complete where functions of the user, which are not saved, would be needed to
+        read between them."""
+        system = self._system
+        called = system.has_user_forces or (system.controlled and self.held is None)
         return self._dense.complete() if called else self.steps
 
     def __call__(self, t: Any) -> tuple[FloatArray, FloatArray]:
@@ -292,12 +368,14 @@ class SimulationResult(RunOutcome):
         joint = self.mechanism.joint(name)
         if joint.nv != 1:
             raise InputError(
-                f"joint {name!r} has {joint.nv} degrees of freedom",
+                f"joint {safe_repr(name)} has {joint.nv} degrees of freedom",
                 remedy=f"Use solution.v[:, {joint.idx_v}:{joint.idx_v + joint.nv}]",
             )
         rate = self.v[:, joint.idx_v]
         if joint.nq == 1:
             return self.q[:, joint.idx_q], rate
+        if self._output is not None:
+            return self._output.angles[self.mechanism.model.getJointId(name)], rate
         states = np.hstack([self.q, self.v])
         nq = self.mechanism.model.nq
         return unwrapped_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
@@ -305,13 +383,16 @@ class SimulationResult(RunOutcome):
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
-        return find_crossings(self._system, self.scheme, self.steps, self._dense)
+        tolerance = self.settings.singular_tolerance
+        return find_crossings(self._system, self.scheme, self.steps, self._dense, tolerance)
 
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:
         """Singular configurations that the run reached without the momentum to choose a branch."""
+        if self._output is not None:
+            return self._output.bifurcations
         failed = self.status is RunStatus.FAILED
-        return find_bifurcations(self._system, self.steps, self._dense, self.settings.rtol, failed)
+        return find_bifurcations(self._system, self.steps, self._dense, failed)
 
     @cached_property
     def drift(self) -> FloatArray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,11 +19,12 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.dae import DaeSystem
+from srm_mbs.dynamics.forces import over_half_turn
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError, safe_repr
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals, smooth_intervals
 from srm_mbs.integration.control.prescribed_times import placed, suspected
@@ -34,8 +36,9 @@ from srm_mbs.integration.control.step_size import (
     StepSizeControl,
     initial_step,
 )
+from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
 from srm_mbs.integration.dense_output import DenseOutput, StepData
-from srm_mbs.integration.driver import RunRecord, RunStatus
+from srm_mbs.integration.driver import RunRecord, RunStatus, StepSink
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
 from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import uses_kernel
@@ -46,6 +49,7 @@ from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
 from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, branch_changes
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, method_messages
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.model.forces import LimitSpring
@@ -70,6 +74,7 @@ from srm_mbs.simulation.result import (
     Statistics,
     attempt_array,
 )
+from srm_mbs.simulation.streamed_output import OutputStream, StreamedOutput
 
 DESCRIBED_BIFURCATIONS = 2
 """Bifurcations that the message of a run describes."""
@@ -77,6 +82,11 @@ LIMIT_ROUNDING = 1e-12
 """Distance (rad, m) beyond a joint limit that is rounding; times |q| where that is above 1."""
 CONSISTENT = 1e-8
 """Largest closure error of an accepted start, in row units, and of its rates in those per time."""
+LONGEST_REPEATED = 2.0
+"""Longest first step of a segment that continues another, over the length of that one: events come
+as soon again, and a longer step would be read at its beginning only."""
+SHORTEST_REPEATED = 0.1
+"""That step, over the last one, below which the first step is chosen as at the start of a run."""
 SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
 """Remedy for a passage that may have changed the branch."""
 
@@ -109,6 +119,14 @@ class Problem:
         The forces that a sampled controller held; None without one.
     watch
         Looks for the events; None without any.
+    passages
+        Examines passages of singular configurations; None where steps make them all.
+    kernel_system
+        The kernel system of the segment before, if it serves this one; None otherwise.
+    stream
+        Takes the steps of a run with output times; None without them.
+    last_step
+        Length (s) of the last step of the segment before, as far as it is used; 0 without one.
     """
 
     mechanism: Mechanism
@@ -120,9 +138,18 @@ class Problem:
     on_kernel: bool
     held: HeldForce | None
     watch: EventWatch | None
+    passages: CriticalPassages | None
+    kernel_system: Any = None
+    stream: OutputStream | None = None
+    last_step: float = 0.0
 
 
-def run_segment(mechanism: Mechanism, options: RunOptions, result_type: type[Result]) -> Result:
+def run_segment(
+    mechanism: Mechanism,
+    options: RunOptions,
+    result_type: type[Result],
+    before: SimulationResult | None = None,
+) -> Result:
     """A run without event actions.
 
     Parameters
@@ -131,8 +158,11 @@ def run_segment(mechanism: Mechanism, options: RunOptions, result_type: type[Res
         From :func:`checked_options`.
     result_type
         Class of the result.
+    before
+        The segment that this one continues; its equations of motion serve this one, too, unless the
+        mechanism was switched.
     """
-    problem = assemble_problem(mechanism, options)
+    problem = assemble_problem(mechanism, options, before)
     by = "kernel" if problem.on_kernel else "python"
     log_start(mechanism.name, options, problem.norm, by)
     record, counters, kernel_system = integrate_problem(problem)
@@ -140,6 +170,15 @@ def run_segment(mechanism: Mechanism, options: RunOptions, result_type: type[Res
     result.message += bifurcation_sentences(result)
     log_end(mechanism.name, result)
     return result
+
+
+def unstarted_segment(
+    mechanism: Mechanism, options: RunOptions, error: Exception, result_type: type[Result]
+) -> Result:
+    """The result of a run that ``error`` ends at its start."""
+    problem = assemble_problem(mechanism, options)
+    record = failed_start(options.t0, problem.state, error, " s")
+    return assemble_result(problem, record, (), None, result_type)
 
 
 def finished(result: Outcome, options: RunOptions) -> Outcome:
@@ -170,7 +209,7 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
     t0, t_end = checked_span(options.t0, options.t_end)
     if options.controller is not None and not callable(options.controller):
         raise InputError(
-            f"controller = {options.controller!r} cannot be called",
+            f"controller = {safe_repr(options.controller)} cannot be called",
             element="controller",
             remedy="Give a function of (t, q, v) that returns the generalised forces",
         )
@@ -237,7 +276,8 @@ def initial_state(
 
     Drives begin with the state at 0; a later start is one of the motion from there.
     """
-    if q0 is not None or v0 is not None:
+    known = (q0 is None or q0 is mechanism.q0) and (v0 is None or v0 is mechanism.v0)
+    if not known:
         start_at = mechanism.with_state if t0 == 0.0 else mechanism.moved
         mechanism = start_at(mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0)
     return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
@@ -290,8 +330,10 @@ def _check_errors(mechanism: Mechanism, t: float) -> None:
 # --- assemble the problem -------------------------------------------------------------------------
 
 
-def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
-    """The problem of a run of ``mechanism``.
+def assemble_problem(
+    mechanism: Mechanism, options: RunOptions, before: SimulationResult | None = None
+) -> Problem:
+    """The problem of a run of ``mechanism``; ``before`` as for :func:`run_segment`.
 
     Raises
     ------
@@ -308,18 +350,40 @@ def assemble_problem(mechanism: Mechanism, options: RunOptions) -> Problem:
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
     norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
-    system = make_system(mechanism, options.controller if held is None else held)
+    kernel_system = None
+    last_step = 0.0
+    if before is not None and held is None and before.mechanism.structure is mechanism.structure:
+        length, last_step = np.ptp(before.span), before.steps.last_length
+        longest = LONGEST_REPEATED * float(length)
+        last_step = min(last_step, longest) if longest > SHORTEST_REPEATED * last_step else 0.0
+        system = before.system
+        system.restart()
+        kernel_system = before.kernel_system
+    else:
+        system = make_system(mechanism, options.controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
         check_consistent(mechanism, t0)
     watch = None
     if options.events is not None:
+        nq = mechanism.model.nq
 
         def adapt(event: Callable[..., Any]) -> StateFunction:
-            return lambda t, x: event(t, *system.split(x))
+            return lambda t, x: event(t, x[:nq], x[nq:])
 
-        watch = EventWatch(system, method.scheme, prepare_events(options.events, adapt), state.size)
-    return Problem(mechanism, options, system, norm, state, intervals, on_kernel, held, watch)
+        watch = EventWatch(method.scheme, prepare_events(options.events, adapt), state.size)
+    passages = examined_passages(
+        system, method, norm, options.placement, options.singular_tolerance
+    )
+    problem = Problem(
+        mechanism, options, system, norm, state, intervals, on_kernel, held, watch, passages
+    )
+    problem.kernel_system, problem.last_step = kernel_system, last_step
+    # Sweeps say at the end what they met in their steps.
+    if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
+        by = "kernel" if on_kernel else "python"
+        problem.stream = OutputStream(system, method.scheme, options.t_eval, by)
+    return problem
 
 
 def sampler(
@@ -375,9 +439,14 @@ def integrate_problem(problem: Problem) -> tuple[RunRecord, Counters, Any]:
 
     Whatever happens on the way ends in the record: a start that cannot be evaluated, too.
     """
-    kernel_system: Any = None
+    kernel_system: Any = problem.kernel_system
+    if kernel_system is not None:
+        kernel_system.renew(**problem.system.constants_of_start())
+    made_here = problem.on_kernel and kernel_system is None
     try:
-        with workspace(problem.system) if problem.on_kernel else nullcontext() as kernel_system:
+        with (
+            workspace(problem.system) if made_here else nullcontext(kernel_system) as kernel_system
+        ):
             return *_integrate(problem, kernel_system), kernel_system
     except (EvaluationError, ControllerError) as error:
         return failed_start(problem.options.t0, problem.state, error, " s"), (), kernel_system
@@ -393,32 +462,64 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.sample(t0, state)
     memory = start(system, method, t0, state, norm, options.t_end, evaluator)
     if kernel_system is None:
-        found = integrate_steps(system, options, norm, memory, state, problem.watch, handler)
+        found = integrate_steps(
+            system,
+            options,
+            norm,
+            memory,
+            state,
+            problem.watch,
+            handler,
+            problem.passages,
+            sink=problem.stream,
+            last_step=problem.last_step,
+        )
         handler.done()
         return found
     check_embedded(method.scheme, options.step)
-    run = CompiledRun(
-        kernel_system,
-        method,
-        norm,
-        memory,
-        state,
-        problem.intervals,
-        t0=t0,
-        step=options.step,
-        first_step=chosen_first_step(evaluator, norm, options, memory, state)
-        if options.step is None
-        else 0.0,
-        max_step=options.longest_step,
-        placed=options.placement,
-        arrivals=handler.arrivals,
-    )
+    given = options.first_step or problem.last_step or None
+    try:
+        run = _compiled_run(problem, kernel_system, memory, given, handler)
+    except ArithmeticError:  # the reference raises the error that says why
+        first_step = chosen_first_step(evaluator, norm, options, memory, state)
+        run = _compiled_run(problem, kernel_system, memory, first_step, handler)
     with progress_of(options.progress, system, options.t_end) as tick:
         record = kernel_driver.integrate(
-            system, run, tick=tick, events=problem.watch, passing=handler
+            system,
+            run,
+            tick=tick,
+            events=problem.watch,
+            passing=handler,
+            passages=problem.passages,
+            sink=problem.stream,
         )
     handler.done()
     return record, (record,)
+
+
+def _compiled_run(
+    problem: Problem,
+    kernel_system: Any,
+    memory: IntegratorState,
+    first_step: float | None,
+    handler: BreakpointHandler,
+) -> CompiledRun:
+    options = problem.options
+    return CompiledRun(
+        kernel_system,
+        options.method,
+        problem.norm,
+        memory,
+        problem.state,
+        problem.intervals,
+        t0=options.t0,
+        step=options.step,
+        first_step=first_step,
+        max_step=options.longest_step,
+        placed=options.placement,
+        arrivals=handler.arrivals,
+        examines=problem.passages is not None,
+    )
 
 
 def integrate_steps(
@@ -429,16 +530,20 @@ def integrate_steps(
     state: FloatArray,
     watch: EventWatch | None,
     handler: BreakpointHandler | None = None,
+    passages: CriticalPassages | None = None,
     words: ProblemVocabulary = MECHANISM,
+    sink: StepSink | None = None,
+    last_step: float = 0.0,
 ) -> tuple[RunRecord, Sequence[ControlWrapper]]:
     """The record of a run with the Python reference, and the wrappers of its control.
 
-    The parameters are those of :func:`srm_mbs.integration.driver.integrate`.
+    The parameters are those of :func:`srm_mbs.integration.driver.integrate`, and ``last_step`` as
+    for :func:`chosen_first_step`.
     """
     control, wrappers = placed_control(
         system,
         options,
-        lambda: chosen_first_step(system, norm, options, memory, state),
+        lambda: chosen_first_step(system, norm, options, memory, state, last_step),
         handler is not None and handler.arrivals,
     )
     with progress_of(options.progress, system, options.t_end) as tick:
@@ -455,7 +560,9 @@ def integrate_steps(
             tick=tick,
             events=watch,
             breakpoints=handler,
+            passages=passages,
             words=words,
+            sink=sink,
         )
     return record, wrappers
 
@@ -466,15 +573,15 @@ def chosen_first_step(
     options: RunOptions,
     memory: IntegratorState,
     state: FloatArray,
+    last_step: float = 0.0,
 ) -> float:
-    """The given first step (s), or the one that the start of the run allows."""
+    """The given first step (s), the ``last_step`` of the segment before, if there is one with the
+    same equations, or the step that the start of the run allows."""
     if options.first_step is not None:
         return float(options.first_step)
     order = options.method.scheme.controller_order or 1
     span, t0 = options.t_end - options.t0, options.t0
-    if isinstance(evaluator, Evaluator):
-        return evaluator.first_step(state, memory, norm, span, order, t0)
-    return initial_step(evaluator, state, memory, norm, span, order, t0)
+    return last_step or initial_step(evaluator, state, memory, norm, span, order, t0)
 
 
 def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "") -> RunRecord:
@@ -491,16 +598,17 @@ def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "")
 def statistics(
     system: OpenSystem | ClosedSystem | DaeSystem,
     record: RunRecord,
-    data: StepData,
+    steps: int,
+    zone_steps: int,
     counters: Counters,
 ) -> Statistics:
     """Counts of a run."""
     return Statistics(
-        steps=data.count,
+        steps=steps,
         rejected=sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
         placements=sum(counter.placed for counter in counters),
         replaced=sum(counter.replaced for counter in counters),
-        zone_steps=len(data.zones),
+        zone_steps=zone_steps,
         evaluations=system.evaluations,
         factorisations=system.factorisations,
         wall_time=record.wall_time,
@@ -519,6 +627,7 @@ def settings(options: RunOptions, norm: ErrorNorm, controlled: bool, backend: st
         options.placement,
         tuple(options.singular_times.tolist()),
         backend,
+        options.singular_tolerance,
     )
 
 
@@ -532,14 +641,35 @@ def assemble_result(
     """Arrays, statistics and message of a run."""
     system, options, mechanism = problem.system, problem.options, problem.mechanism
     scheme = options.method.scheme
-    data = record.data(scheme, system.tangent_size)
-    dense: DenseOutput
-    if isinstance(record, CompiledRecord):
-        dense = CompiledDenseOutput(None if shared(system) else kernel_system, system, scheme, data)
-    else:
-        dense = DenseOutput(system, scheme, data)
-    # Counted before anything below reads the dense output, which evaluates stages.
-    stats = statistics(system, record, data, counters)
+    last = record.data(scheme, system.tangent_size)
+    data: StepData | None = last
+    output: StreamedOutput | None = None
+    if problem.stream is not None:
+        kept = problem.stream.finish(last, record.status is RunStatus.FAILED)
+        data, output = (None, kept) if isinstance(kept, StreamedOutput) else (kept, None)
+    dense: DenseOutput | None = None
+    again = None
+    if data is not None:
+        # The dense output of a single step is that in which the event was found.
+        end_state = record.stop_state if data.count == 1 else None
+        if isinstance(record, CompiledRecord):
+            own = None if shared(system) else kernel_system
+            dense = CompiledDenseOutput(own, system, scheme, data, end_state)
+        else:
+            dense = DenseOutput(system, scheme, data, end_state)
+        # Counted before anything below reads the dense output, which evaluates stages.
+        stats = statistics(system, record, data.count, len(data.zones), counters)
+        q = dense.nodes()[1][:, : mechanism.model.nq]
+        # The reductions themselves: their methods cost more than they do here.
+        least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
+        turned = over_half_turn(mechanism, q)
+    elif output is not None:
+        stats = statistics(system, record, output.count, output.zone_steps, counters)
+        least, largest, turned = output.least, output.largest, output.over_half_turn
+        if options.controller is None and not system.has_user_forces:
+            again = partial(
+                run_segment, mechanism, options._replace(t_eval=None, progress=False), result_type
+            )
     controlled = options.controller is not None or system.has_user_forces
     by = "kernel" if problem.on_kernel else "python"
     return result_type(
@@ -548,6 +678,8 @@ def assemble_result(
         scheme,
         data,
         dense=dense,
+        output=output,
+        again=again,
         t_eval=options.t_eval,
         attempts=attempt_array(record.attempts),
         events=None if problem.watch is None else problem.watch.found(),
@@ -555,10 +687,23 @@ def assemble_result(
         message=record.message
         + branch_changes(suspected(counters), "the velocity turned", SMALLER_STEPS)
         + method_messages(options.method, record.steps, problem.norm)
-        + _limits_left(mechanism, dense)
+        + ("" if problem.passages is None else problem.passages.message())
+        + _limits_left(mechanism, least, largest)
+        + _half_turns(turned)
         + _driven_too_far(mechanism, record),
         stats=stats,
         settings=settings(options, problem.norm, controlled, by),
+    )
+
+
+def _half_turns(names: tuple[str, ...]) -> str:
+    """A sentence about the bushings ``names``, which turned by more than half a turn."""
+    if not names:
+        return ""
+    return (
+        " Bushings turned by more than half a turn, where their moments jump to the opposite "
+        f"({', '.join(names)}): from there the error is not controlled. Use torsion springs, whose "
+        "angles count turns."
     )
 
 
@@ -595,14 +740,13 @@ def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatA
     return names, np.array(indices, dtype=int), np.array(limits).reshape(-1, 2).T
 
 
-def _limits_left(mechanism: Mechanism, dense: DenseOutput) -> str:
-    """A sentence naming the one-degree joints that left their limits, which do not act."""
+def _limits_left(mechanism: Mechanism, least: FloatArray, largest: FloatArray) -> str:
+    """A sentence naming the one-degree joints that left their limits, which do not act; ``least``
+    and ``largest`` (nq,) are their coordinates."""
     names, indices, (low, high) = _limited_joints(mechanism)
     if not names:
         return ""
-    q = dense.nodes()[1][:, indices]
-    # The reductions themselves: their methods cost more than they do here.
-    least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
+    least, largest = least[indices], largest[indices]
     beyond = np.maximum(low - least, largest - high)
     if not max(beyond.tolist()) > 0.0:
         return ""

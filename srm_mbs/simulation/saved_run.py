@@ -31,6 +31,7 @@ from srm_mbs.dynamics.constraints.structure import Structure, row_names
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import Units
+from srm_mbs.dynamics.system import System
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.dense_output import STEP_PLACEMENTS, TIME_TOLERANCE, StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -40,6 +41,7 @@ from srm_mbs.model.forces import FORCE_TYPES
 from srm_mbs.model.laws import LAW_TYPES
 from srm_mbs.model.model_data import StrictData, finite_numbers
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
+from srm_mbs.simulation.options import SINGULAR_TOLERANCE
 from srm_mbs.simulation.result import ATTEMPT
 
 LONGEST_TEXT = 64 * 10**6
@@ -52,6 +54,9 @@ MOST_ELEMENTS = 10_000
 """Closures, forces or drives of a mechanism."""
 LARGEST_NUMBER = 1e100
 """Of an array of a run: where runs end because products of larger ones overflow."""
+JOIN_TOLERANCE = 1e-9
+"""Distance between the end of a step and where its rates lead, over the size of the state and of
+the terms: rounding leaves 1e-14."""
 UNIT_LENGTH = 1e-6
 """Deviation of quaternions and (cos, sin) pairs of a run from unit length."""
 VERDICTS = ("rejected", "replaced")
@@ -134,6 +139,9 @@ class StructureEntry(StrictData):
     rate: Positive
 
 
+Tolerance = Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
+
+
 class SettingsEntry(StrictData):
     """:class:`~srm_mbs.simulation.result.Settings`."""
 
@@ -146,6 +154,7 @@ class SettingsEntry(StrictData):
     placement: Literal[tuple(PLACEMENTS)] = "automatic"  # type: ignore[valid-type]
     singular_times: Numbers = Field(default_factory=list)
     backend: Literal["python", "kernel"] = "python"
+    singular_tolerance: Tolerance = SINGULAR_TOLERANCE
 
 
 class StatisticsEntry(StrictData):
@@ -175,6 +184,7 @@ class OptionsEntry(StrictData):
     placement: Literal[tuple(PLACEMENTS)]  # type: ignore[valid-type]
     singular_times: Numbers
     backend: Literal["auto", "python", "kernel"]
+    singular_tolerance: Tolerance = SINGULAR_TOLERANCE
 
 
 class RequestEntry(StrictData):
@@ -463,6 +473,31 @@ def steps_from(
         breaks=breaks,
         break_rates=_array(arrays, "break_rates", (len(breaks), m)),
     )
+
+
+def check_steps_join(system: System, scheme: ButcherTableau, steps: StepData) -> None:
+    """Refuse steps whose rates and corrections do not lead from each state to the next.
+
+    A step ends at the uncorrected point that dense output has there, moved by the correction; both
+    repeat what the run computed, to rounding.
+
+    Raises
+    ------
+    ValueError, EvaluationError
+        If a step ends elsewhere, or nowhere.
+    """
+    weights = scheme.dense.weights(np.ones(1))[0][: steps.rates.shape[1]]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i, h in enumerate(np.diff(steps.times).tolist()):
+            terms = h * weights[:, None] * steps.rates[i]
+            moved = terms.sum(axis=0)
+            system.chart_rate(moved, moved)  # refuses joints that turn too far
+            x, end = system.retract(steps.states[i], moved), steps.states[i + 1]
+            if steps.corrections.shape[1]:
+                x = system.retract(x, -steps.corrections[i])
+            size = 1.0 + np.abs(end).max() + np.abs(terms).max()
+            if not np.abs(x - end).max() <= JOIN_TOLERANCE * size:
+                raise ValueError(f"the rates of step {i} do not lead from its state to the next")
 
 
 def _zones(

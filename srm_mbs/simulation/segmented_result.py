@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
@@ -16,6 +17,8 @@ from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
 from srm_mbs.simulation.energy_balance import EnergyBalance, joined_balance
 from srm_mbs.simulation.result import SimulationResult, Statistics
+
+_STATISTICS = attrgetter(*(key.name for key in fields(Statistics)))
 
 
 class SegmentedResult(SimulationResult):
@@ -47,7 +50,8 @@ class SegmentedResult(SimulationResult):
         self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
-        self.stats = Statistics(*map(sum, zip(*(astuple(part.stats) for part in self.segments))))
+        counts = zip(*(_STATISTICS(part.stats) for part in self.segments))
+        self.stats = Statistics(*map(sum, counts))
         self.t_eval = t_eval
         self._parts: tuple[SimulationResult, ...] = self.segments
         self._order: IndexArray | slice = slice(None)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,30 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
-from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger
+from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr
+from srm_mbs.integration.contacts import Contact, ContactProbe
 from srm_mbs.integration.driver import RunStatus
-from srm_mbs.integration.events import EventFunction, acting, prepare_events, same_time
+from srm_mbs.integration.events import (
+    EventFunction,
+    Occurrence,
+    acting,
+    prepare_events,
+    same_time,
+    stop_message,
+)
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.simulation.options import RunOptions, numbers, positive
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.simulation.runner import check_consistent, checked_options, finished, run_segment
+from srm_mbs.simulation.runner import (
+    check_consistent,
+    checked_options,
+    finished,
+    initial_state,
+    run_segment,
+    unstarted_segment,
+)
 from srm_mbs.simulation.segmented_result import R, ResultTypes
 
 
@@ -62,7 +78,7 @@ class Event:
         for given, what in ((function, "function"), (action, "action")):
             if given is not None and not callable(given):
                 raise InputError(
-                    f"the {what} {given!r} of an event cannot be called",
+                    f"the {what} {safe_repr(given)} of an event cannot be called",
                     element=what,
                     remedy="Give a function of (t, q, v)",
                 )
@@ -73,6 +89,17 @@ class Event:
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         """The value of the function."""
         return self.function(t, q, v)
+
+
+class _OfState:
+    """An event function as one of the state; pickled with the segments of a run."""
+
+    def __init__(self, event: Callable[..., Any], nq: int) -> None:
+        self._function = event.function if isinstance(event, Event) else event
+        self._nq = nq
+
+    def __call__(self, t: float, state: FloatArray) -> Any:
+        return self._function(t, state[: self._nq], state[self._nq :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +161,7 @@ def impact(
     share = finite_array(restitution, ())
     if share is None or not 0.0 <= share <= 1.0:
         raise InputError(
-            f"restitution = {restitution!r} is not between 0 and 1",
+            f"restitution = {safe_repr(restitution)} is not between 0 and 1",
             element="restitution",
             remedy="Give 0 (nothing springs back) to 1 (all of it)",
         )
@@ -163,7 +190,10 @@ def impact(
 log = get_logger(__name__)
 
 CHATTER_ACTIONS = 10
-"""Actions of an event after which it may chatter."""
+"""Times at which an event acts after which it may chatter."""
+MOST_AT_ONCE = 1000
+"""Actions of an event at one time from which it chatters: inelastic impacts between many bodies
+that touch settle after as many as 50 for each of them."""
 CHATTER_SPAN = 1e-8
 """An event that acts CHATTER_ACTIONS times within this part of the run chatters."""
 HELD_EVENT_ROUNDING = 1e-9
@@ -184,6 +214,8 @@ class _RunEvent:
     ----------
     event
         Of the whole run.
+    place
+        Its index among the events.
     count
         Occurrences in the segments so far.
     acted
@@ -192,14 +224,31 @@ class _RunEvent:
         As for :class:`~srm_mbs.integration.events.EventFunction`, in the next segment.
     acted_at
         The last times (s) of its action.
+    at_once
+        Number of actions at the last of them.
+    contact
+        How it touches at the start of the next segment; None if it does not.
+    rounding
+        Rounding of its value at a time and a state.
+    zero
+        Size of values that are zero at the start of the next segment: twice that at its zero there.
+    counts_from
+        After an occurrence at the start of the next segment, the least sign of its rate, positive
+        to the allowed side, at which it counts again; -1 without one.
     """
 
     event: EventFunction
+    place: int
     count: int = 0
     acted: bool = False
     floor: float = 0.0
     start_tolerance: float | None = None
     acted_at: deque[float] = field(default_factory=lambda: deque(maxlen=CHATTER_ACTIONS))
+    at_once: int = 0
+    contact: Contact | None = None
+    rounding: Callable[[float, FloatArray], float] | None = None
+    zero: float = 0.0
+    counts_from: int = -1
 
     @property
     def name(self) -> str:
@@ -210,17 +259,44 @@ class _RunEvent:
         """Number of further occurrences that ends the run."""
         return self.event.occurrences - self.count
 
+    @property
+    def may_touch(self) -> bool:
+        """Whether it is a contact: it acts, and has a forbidden side."""
+        return self.event.action is not None and self.event.direction != 0.0
+
     def in_segment(self) -> EventFunction:
         """The event as it is in the next segment."""
+        contact = self.contact
+        rests = contact is not None and contact.departs == 0
+        leaves = self.acted or (contact is not None and not rests)
         return replace(
             self.event,
             occurrences=self.left,
             action=None,
             acts=self.event.action is not None,
-            departs=self.acted and self.floor == 0.0,
+            departs=leaves and not rests and self.floor == 0.0,
+            rests=self.rounding if rests else None,
             floor=self.floor,
             start_tolerance=self.start_tolerance,
         )
+
+    def value(self, t: float, state: FloatArray) -> float:
+        """The value at ``t`` (s) and ``state`` (nx,)."""
+        return self.event(t, state.copy())
+
+    def begin_instant(self, acted: bool, zero: float) -> None:
+        """Begin the actions at the start of the next segment; see the attributes."""
+        self.contact, self.acted, self.zero = None, acted, zero
+        self.counts_from = -1
+
+    def acts_at_once(self, probe: ContactProbe, t: float, state: FloatArray, slack: float) -> bool:
+        """Whether it touches at ``t`` (s) and ``state``, and leaves to the forbidden side."""
+        self.rounding = partial(probe.rounding, self.event)
+        self.contact = contact = probe.contact(self.event, t, state, self.zero, slack, self.floor)
+        if contact is None or contact.rate < self.counts_from:
+            return False
+        self.counts_from = -1
+        return contact.departs < 0
 
     def act(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         """The answer of the action; None without one."""
@@ -228,17 +304,24 @@ class _RunEvent:
         try:
             return None if action is None else action(t, q, v)
         except Exception as error:
-            raise EventError(f"the action of the event {self.name!r} raised {error!r}") from error
+            raise EventError(
+                f"the action of the event {self.name!r} raised {safe_repr(error)}"
+            ) from error
 
     def check_chatter(self, t: float, span: float) -> None:
         """Record an action at ``t`` (s); refuse too many within a part of the length ``span``."""
-        self.acted_at.append(t)
+        if self.acted_at and self.acted_at[-1] == t:
+            self.at_once += 1
+        else:
+            self.acted_at.append(t)
+            self.at_once = 1
         within = t - self.acted_at[0]
-        if len(self.acted_at) == CHATTER_ACTIONS and within < CHATTER_SPAN * span:
+        often = len(self.acted_at) == CHATTER_ACTIONS and within < CHATTER_SPAN * span
+        if often or self.at_once == MOST_AT_ONCE:
+            how = f"{CHATTER_ACTIONS} times within {within:.1e} s" if often else "on and on at once"
             raise EventError(
-                f"the event {self.name!r} occurred {CHATTER_ACTIONS} times within {within:.1e} s: "
-                "it chatters. Let its action hold what it hits (srm.Switch with a closure) when "
-                "the impact is slow"
+                f"the event {self.name!r} occurred {how}: it chatters. Let its action hold what it "
+                "hits (srm.Switch with a closure) when the impact is slow"
             )
 
 
@@ -286,8 +369,9 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
 
 def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
     """The segments between the actions of events, joined."""
-    t_end = options.t_end
-    events = [_RunEvent(event) for event in prepare_events(options.events, lambda event: event)]
+    t_end, nq = options.t_end, mechanism.model.nq
+    given = prepare_events(options.events, lambda event: _OfState(event, nq))
+    events = [_RunEvent(event, place) for place, event in enumerate(given)]
     q0, v0 = options.q0, options.v0
     if options.t0 == 0.0 and not (q0 is None and v0 is None):
         # Drives begin with this state.
@@ -302,10 +386,18 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
     t = options.t0
     span = t_end - t
     status, message = RunStatus.RUNNING, ""
+    at_once: list[Occurrence] = []
+    try:
+        mechanism, q, v = _at_start(events, mechanism, here, span, at_once)
+        if at_once:
+            here = here._replace(q0=q, v0=v)
+    except EventError as error:
+        parts.append(unstarted_segment(mechanism, here, error, types.plain))
+        status, message = parts[0].status, parts[0].message
     while status is RunStatus.RUNNING:
         try:
             asked = here._replace(events=[event.in_segment() for event in events])
-            part = run_segment(mechanism, asked, types.plain)
+            part = run_segment(mechanism, asked, types.plain, parts[-1] if parts else None)
             part.request = asked.repeatable()
             parts.append(part)
             status, message, t = part.status, part.message, part.steps.end
@@ -316,7 +408,11 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
                     due.append(event)
             if status is not RunStatus.EVENT or any(event.left <= 0 for event in due):
                 break
-            mechanism, q, v = _after_actions(events, due, part, span)
+            mechanism, q, v = _after_actions(events, due, part, here.controller, span, at_once)
+            last = next((event for event in events if event.left <= 0), None)
+            if last is not None:
+                message = stop_message(last.event.name, last.count, t)
+                break
         except InputError as error:
             if not parts:
                 raise
@@ -333,15 +429,102 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
         else:
             here = here._replace(t0=t, q0=q, v0=v)
             status = RunStatus.RUNNING if t_end - t > NEGLIGIBLE_REST * span else RunStatus.FINISHED
+        finally:
+            if parts and at_once:
+                parts[-1].add_occurrences(at_once)
+                at_once.clear()
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
     return types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
 
 
-def _rounding(event: Callable[..., Any], solution: SimulationResult) -> float:
+def _at_start(
+    events: list[_RunEvent],
+    mechanism: Mechanism,
+    options: RunOptions,
+    span: float,
+    occurred: list[Occurrence],
+) -> tuple[Mechanism, FloatArray, FloatArray]:
+    """Mechanism and state after the actions of contacts that touch at the start of the run.
+
+    An occurrence that would end the run is not counted there.
+
+    Raises
+    ------
+    EventError
+        If an action fails, or an event chatters.
+    InputError
+        If the start is inconsistent.
+    """
+    t0 = options.t0
+    started, x = initial_state(mechanism, t0, options.q0, options.v0)
+    nq = started.model.nq
+    contacts = [event for event in events if event.may_touch and event.left > 1]
+    if contacts:
+        if started.constrained:
+            check_consistent(started, t0)
+        found = _act_at_once(
+            contacts, started, t0, x[:nq], x[nq:], options.controller, span, occurred
+        )
+        return found if occurred else (mechanism, x[:nq], x[nq:])
+    return mechanism, x[:nq], x[nq:]
+
+
+def _act_at_once(
+    contacts: list[_RunEvent],
+    mechanism: Mechanism,
+    t: float,
+    q: FloatArray,
+    v: FloatArray,
+    controller: Callable[..., Any] | None,
+    span: float,
+    occurred: list[Occurrence],
+    slack: Callable[[_RunEvent], float] = lambda event: 0.0,
+    system: OpenSystem | ClosedSystem | None = None,
+) -> tuple[Mechanism, FloatArray, FloatArray]:
+    """Mechanism and state after the actions of ``contacts`` that touch at ``t`` and leave to their
+    forbidden side, one after the other until none does (:mod:`srm_mbs.integration.contacts`).
+
+    Parameters
+    ----------
+    occurred
+        Receives the occurrences.
+    slack
+        Size of the value of an event on its forbidden side that is zero.
+    system
+        The equations of motion, if they are known.
+
+    Raises
+    ------
+    EventError
+        If an action fails, or an event chatters.
+    """
+    units = mechanism.structure.units
+    while True:
+        x = np.concatenate([q, v])
+        if system is None:
+            system = make_system(mechanism, controller)
+        probe = ContactProbe(system, units, span)
+        leaving = [event for event in contacts if event.acts_at_once(probe, t, x, slack(event))]
+        if not leaving:
+            return mechanism, q, v
+        event = leaving[0]
+        occurred.append(Occurrence(event.place, t, x))
+        event.count += 1
+        event.acted = True
+        if event.left <= 0:
+            return mechanism, q, v
+        structure = mechanism.structure
+        mechanism, q, v = _acted(event, mechanism, t, q, v)
+        if mechanism.structure is not structure:
+            system = None
+        event.check_chatter(t, span)
+
+
+def _rounding(event: _RunEvent, solution: SimulationResult) -> float:
     """Size of the value of an event that new closures hold at zero."""
-    rows = zip(solution.t, solution.q, solution.v)
-    return HELD_EVENT_ROUNDING * max(abs(float(event(t, q.copy(), v.copy()))) for t, q, v in rows)
+    states = np.hstack([solution.q, solution.v])
+    return HELD_EVENT_ROUNDING * max(abs(event.value(t, x)) for t, x in zip(solution.t, states))
 
 
 def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
@@ -356,9 +539,15 @@ def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
 
 
 def _after_actions(
-    events: list[_RunEvent], due: list[_RunEvent], part: SimulationResult, span: float
+    events: list[_RunEvent],
+    due: list[_RunEvent],
+    part: SimulationResult,
+    controller: Callable[..., Any] | None,
+    span: float,
+    at_once: list[Occurrence],
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
-    """Mechanism and state after the actions of the events ``due`` at the end of a segment.
+    """Mechanism and state after the actions of the events ``due`` at the end of a segment, and of
+    contacts that touch there, whose occurrences ``at_once`` receives.
 
     Raises
     ------
@@ -368,43 +557,69 @@ def _after_actions(
     mechanism, t = part.mechanism, part.steps.end
     # What was counted here is not counted again just after; the rest has still to be.
     near = 2.0 * same_time(*part.steps.times[-2:].tolist())
-    for event, times in zip(events, part.t_events or []):
-        event.start_tolerance = near if len(times) and times[-1] >= t - near else 0.0
-        event.acted = event in due and event.event.action is not None
-    acting_events = [event for event in events if event.acted]
-    names = ", ".join(event.name for event in acting_events)
-    log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
     nq = mechanism.model.nq
-    x = np.concatenate([part.q[-1], part.v[-1]])
+    before = x = np.concatenate([part.q[-1], part.v[-1]])
+    system = part.system if controller is None else make_system(mechanism)
     try:
         # The dense output is on the closures within the tolerance only.
-        system = make_system(mechanism)
         if not _closed(system, t, x):
             x = onto_closures(system, t, x)
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
+    for event, times in zip(events, part.t_events or []):
+        event.start_tolerance = near if len(times) and times[-1] >= t - near else 0.0
+        acted = event in due and event.event.action is not None
+        event.begin_instant(acted, 2.0 * abs(event.value(t, x)) if acted else 0.0)
+    acting_events = [event for event in events if event.acted]
+    names = ", ".join(event.name for event in acting_events)
+    log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
     q, v = x[:nq], x[nq:]
     for event in acting_events:
-        answer = event.act(t, q.copy(), v.copy())
-        if answer is None:
-            continue
-        try:
-            if isinstance(answer, Switch):
-                mechanism, q, v = _switched(mechanism, answer, t, q, v)
-            else:
-                q, v = (np.asarray(part, dtype=float) for part in answer)
-                moved = mechanism.moved(q, v)
-                check_consistent(moved, t)
-                q, v = moved.q0, moved.v0
-        except (InputError, EvaluationError, TypeError, ValueError) as error:
-            raise EventError(
-                f"the action of the event {event.name!r} cannot be carried out: {error}"
-            ) from error
+        mechanism, q, v = _acted(event, mechanism, t, q, v)
     switched = mechanism.loops != part.mechanism.loops
     for event in acting_events:
-        event.floor = _rounding(event.event.function, part) if switched else 0.0
+        event.floor = _rounding(event, part) if switched else 0.0
         event.check_chatter(t, span)
+
+    def moved_by(event: _RunEvent) -> float:
+        """Twice the change of an event when the state was moved onto the closures."""
+        return 0.0 if x is before else 2.0 * abs(event.value(t, x) - event.value(t, before))
+
+    contacts = [event for event in events if event.may_touch]
+    if contacts:
+        known = part.system if mechanism.structure is part.mechanism.structure else None
+        return _act_at_once(
+            contacts, mechanism, t, q, v, controller, span, at_once, moved_by, known
+        )
     return mechanism, q, v
+
+
+def _acted(
+    event: _RunEvent, mechanism: Mechanism, t: float, q: FloatArray, v: FloatArray
+) -> tuple[Mechanism, FloatArray, FloatArray]:
+    """Mechanism and state after the action of ``event``.
+
+    Raises
+    ------
+    EventError
+        If it fails, or its answer cannot be carried out.
+    """
+    answer = event.act(t, q.copy(), v.copy())
+    event.counts_from = 1 if answer is None else 0
+    if answer is None:
+        return mechanism, q, v
+    try:
+        if isinstance(answer, Switch):
+            return _switched(mechanism, answer, t, q, v)
+        q, v = (np.asarray(part, dtype=float) for part in answer)
+        moved = mechanism.continued(q, v)
+        if moved.constrained:
+            check_consistent(moved, t)
+        return moved, moved.q0, moved.v0
+    except (InputError, EvaluationError, TypeError, ValueError) as error:
+        raise EventError(
+            f"the action of the event {event.name!r} cannot be carried out: {error}"
+        ) from error
 
 
 def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:

@@ -13,7 +13,7 @@ from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
-from srm_mbs.errors import EvaluationError, InputError, SimulationError
+from srm_mbs.errors import EvaluationError, InputError, SimulationError, safe_repr
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.methods.base import Method
@@ -164,7 +164,7 @@ class Simulator:
         if dt <= NEGLIGIBLE_DT * math.ulp(t):
             if not end > t:
                 raise InputError(
-                    f"dt = {dt!r} s is below the rounding of t = {t!r} s",
+                    f"dt = {safe_repr(dt)} s is below the rounding of t = {t!r} s",
                     element="dt",
                     remedy="Give a longer one, or reset to an earlier time",
                 )
@@ -324,7 +324,7 @@ class Simulator:
 
 def _bad_force(tau: Any) -> InputError:
     return InputError(
-        f"tau = {tau!r} is not a vector of finite generalised forces",
+        f"tau = {safe_repr(tau)} is not a vector of finite generalised forces",
         element="tau",
         remedy="Give nv numbers, N and N m",
     )

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -48,7 +46,7 @@ from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
-from srm_mbs.model.laws import Curve, Law
+from srm_mbs.model.laws import Curve, Law, Samples
 from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.model.model_data import model_from_data, model_to_data
 from srm_mbs.model.pinocchio_archive import model_from_archive
@@ -88,7 +86,7 @@ def _plain(value: Any) -> Any:
     if is_dataclass(value):
         kind: dict[str, Any] = {"type": value.type} if isinstance(value, Law | ForceElement) else {}
         return kind | {key.name: _plain(getattr(value, key.name)) for key in fields(value)}
-    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+    return [_plain(part) for part in value] if isinstance(value, tuple | Samples) else value
 
 
 # -- options of the run -----------------------------------------------------------------------
@@ -205,27 +203,11 @@ def _npz(arrays: dict[str, Any], write: Any) -> bytes:
     return file.getvalue()
 
 
-_FOLDER = r"(?:file://)?(?:/|[A-Za-z]:[\\/])(?:[^\"'<>\n]*[\\/])?"
-_FILE_KEYS = "urdf|sdf|mjcf|gepetto|table|file|filename"
-_FULL_NAME = re.compile(rf"""(\b(?:{_FILE_KEYS})\s*=\s*["']){_FOLDER}(?=[^"'/\\])""")
-
-
-def _without_folders(text: str, source: Source) -> str:
-    """``text`` with the files of the model named relative to its folders, and other files by their
-    name alone."""
-    for file in (source.urdf_path, source.path):
-        folder = os.path.dirname(file)
-        for absolute in {folder, os.path.abspath(folder), os.path.realpath(folder)}:
-            if os.path.isabs(absolute) and absolute != os.path.dirname(absolute):
-                text = text.replace(f"file://{absolute}/", "").replace(f"{absolute}{os.sep}", "")
-    return _FULL_NAME.sub(r"\1", text)
-
-
 def _source_entry(source: Source, full_paths: bool) -> dict[str, Any]:
     """``source`` as JSON, without the folders that its files lay in unless asked for."""
     entry = source.entries()
     if not full_paths:
-        entry |= {key: _without_folders(entry[key], source) for key in ("description", "urdf")}
+        entry |= {key: source.without_folders(entry[key]) for key in ("description", "urdf")}
         entry |= {key: file_name(entry[key]) for key in ("path", "urdf_path")}
     return entry
 
@@ -234,7 +216,7 @@ def _notes(mechanism: Mechanism, full_paths: bool) -> list[str]:
     source = mechanism.source
     if source is None or full_paths:
         return list(mechanism.notes)
-    return [_without_folders(note, source) for note in mechanism.notes]
+    return [source.without_folders(note) for note in mechanism.notes]
 
 
 def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dict[str, Any]:
@@ -435,12 +417,15 @@ def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach = NO
     steps = saved_run.steps_from(mechanism, scheme, entry, arrays)
     events = saved_run.events_from(mechanism.model, entry.events, steps, arrays)
     system = make_system(mechanism, saved_run.held_from(arrays, mechanism.model.nv))
+    saved_run.check_steps_join(system, scheme, steps)
+    dense = dense_output(system, scheme, steps, settings.backend)
+    dense.file = str(path)
     solution = result_type(
         mechanism,
         system,
         scheme,
         steps,
-        dense=dense_output(system, scheme, steps, settings.backend),
+        dense=dense,
         t_eval=saved_run.output_times_from(arrays, float(steps.times[0])),
         attempts=saved_run.attempts_from(arrays),
         events=events,

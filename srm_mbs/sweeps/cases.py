@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.model.numbers import plain
 
 STARTS = ("q0", "v0", "q", "v")
 """Parameters of the start of a given mechanism."""
@@ -38,7 +39,7 @@ class Case:
     @property
     def where(self) -> str:
         """Place of the case in messages."""
-        return f"cases[{self.name!r}]"
+        return f"cases[{safe_repr(self.name)}]"
 
 
 def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) -> tuple[Case, ...]:
@@ -68,15 +69,15 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
         case = Case(index, name, parameters)
         if not isinstance(parameters, Mapping) or not all(isinstance(k, str) for k in parameters):
             raise InputError(
-                f"{parameters!r} is not a set of parameters",
+                f"{safe_repr(parameters)} is not a set of parameters",
                 element=case.where,
                 remedy="Give a dictionary: name of a parameter -> value",
             )
         _check_names(case, isinstance(source, Mechanism), free)
-        out.append(Case(index, name, dict(parameters)))
+        out.append(Case(index, name, {plain(k): value for k, value in parameters.items()}))
     if not out:
         raise InputError(
-            f"there are no cases in {cases!r}",
+            f"there are no cases in {safe_repr(cases)}",
             element="cases",
             remedy="Give a list of dictionaries, a mapping of names to them, or one of columns",
         )
@@ -86,11 +87,11 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
 def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
     """Named cases, or the rows of columns."""
     if all(isinstance(value, Mapping) for value in cases.values()):
-        return [(name if isinstance(name, int) else str(name), cases[name]) for name in cases]
+        return [(_label(name), cases[name]) for name in cases]
     columns = {name: values for name, values in cases.items() if not np.isscalar(values)}
     try:
         lengths = {name: len(values) for name, values in columns.items()}
-    except TypeError:
+    except Exception:  # objects may raise anything
         lengths = {}
     if len(lengths) < len(cases) or len(set(lengths.values())) != 1:
         raise InputError(
@@ -102,11 +103,21 @@ def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
     return [(k, {name: values[k] for name, values in columns.items()}) for k in range(count)]
 
 
+def _label(name: Any) -> int | str:
+    """The key of a case as its name."""
+    if isinstance(name, int):
+        return name
+    try:
+        return plain(str(name))
+    except Exception:  # objects may raise anything
+        return safe_repr(name)
+
+
 def _check_names(case: Case, mechanism_given: bool, free: bool) -> None:
     names = set(case.parameters)
     if reserved := sorted(names & set(RESERVED)):
         raise InputError(
-            f"{reserved[0]!r} is a column of every table",
+            f"{safe_repr(reserved[0])} is a column of every table",
             element=case.where,
             remedy="Give the parameter another name",
         )
@@ -115,7 +126,7 @@ def _check_names(case: Case, mechanism_given: bool, free: bool) -> None:
     unknown = sorted(names - set(STARTS))
     if unknown and not free:
         raise InputError(
-            f"a given mechanism has no parameter {unknown[0]!r}",
+            f"a given mechanism has no parameter {safe_repr(unknown[0])}",
             element=case.where,
             remedy=f"Give {', '.join(STARTS)}; for others a function that makes the mechanism "
             "of a case instead of the mechanism, or options=",

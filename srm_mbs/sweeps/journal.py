@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from srm_mbs.errors import InputError, __version__
+from srm_mbs.errors import InputError, __version__, printable
 from srm_mbs.formats.files import checked_path, read_bytes
 from srm_mbs.sweeps.cases import Case
 from srm_mbs.sweeps.fingerprint import fingerprint
@@ -203,7 +203,7 @@ def _checked_fingerprint(value: Any, what: str) -> str:
         return fingerprint(value)
     except Exception as error:  # objects may raise anything when they are pickled
         raise InputError(
-            f"what it holds cannot be compared with a later sweep: {error}",
+            f"what it holds cannot be compared with a later sweep: {printable(error)}",
             element=what,
             remedy="Leave resume= out, or give functions and values that can be pickled",
         ) from error

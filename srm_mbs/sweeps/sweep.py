@@ -13,7 +13,7 @@ from typing import Any
 
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress, checked_span
 from srm_mbs.simulation.runner import mechanism_method
@@ -106,24 +106,26 @@ def sweep(
     """
     if not (isinstance(mechanism, Mechanism) or callable(mechanism)):
         raise InputError(
-            f"{mechanism!r} is neither a mechanism nor a function that makes one",
+            f"{safe_repr(mechanism)} is neither a mechanism nor a function that makes one",
             element="mechanism",
             remedy="Give srm.load(...), or a function of the parameters of a case",
         )
     for name, function in {"measure": measure, "options": options}.items():
         if not callable(function) and (name == "measure" or function is not None):
             raise InputError(
-                f"{name} = {function!r} cannot be called", element=name, remedy="Give a function"
+                f"{name} = {safe_repr(function)} cannot be called",
+                element=name,
+                remedy="Give a function",
             )
     if not isinstance(chunk, int) or chunk < 1:
         raise InputError(
-            f"chunk = {chunk!r} is not a positive number of cases",
+            f"chunk = {safe_repr(chunk)} is not a positive number of cases",
             element="chunk",
             remedy="Give 1 or more",
         )
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(
-            f"{executor!r} has no submit",
+            f"{safe_repr(executor)} has no submit",
             element="executor",
             remedy="Give an executor of the kind of concurrent.futures; of a Dask client its "
             "get_executor()",

@@ -14,7 +14,7 @@ import numpy as np
 from srm_mbs.api import Solution, simulate
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, printable, safe_repr
 from srm_mbs.simulation.result import check_run
 from srm_mbs.sweeps.cases import RESERVED, STARTS
 
@@ -129,12 +129,12 @@ def checked_measures(
     """
     remedy = "Let measure= return a dictionary of numbers: name of a column -> number"
     if not isinstance(measures, Mapping):
-        raise InputError(f"it returned {measures!r}", element="measure", remedy=remedy)
+        raise InputError(f"it returned {safe_repr(measures)}", element="measure", remedy=remedy)
     out: dict[str, Value] = {}
     for name, value in measures.items():
         if name in parameters or name in RESERVED:
             raise InputError(
-                f"it returned {name!r}, which is a column already",
+                f"it returned {safe_repr(name)}, which is a column already",
                 element="measure",
                 remedy="Give the measure another name",
             )
@@ -142,7 +142,11 @@ def checked_measures(
             value.item() if isinstance(value, np.generic | np.ndarray) and not value.ndim else value
         )
         if not isinstance(name, str) or not isinstance(plain, Value):
-            raise InputError(f"it returned {name!r}: {value!r}", element="measure", remedy=remedy)
+            raise InputError(
+                f"it returned {safe_repr(name)}: {safe_repr(value)}",
+                element="measure",
+                remedy=remedy,
+            )
         out[name] = plain
     return out
 
@@ -165,7 +169,7 @@ def packed(task: Task) -> bytes:
         return dumps(task)  # type: ignore[no-any-return]
     except Exception as error:
         raise InputError(
-            f"the runs cannot be sent to other processes: {error}",
+            f"the runs cannot be sent to other processes: {printable(error)}",
             element="executor",
             remedy="Define the functions at the top of a module, install cloudpickle, or use a "
             "ThreadPoolExecutor",

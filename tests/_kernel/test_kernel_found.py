@@ -67,10 +67,12 @@ class Machine:
         distribution.mkdir()
         metadata = f"Metadata-Version: 2.1\nName: srm-mbs\nVersion: {srm.__version__}\n"
         (distribution / "METADATA").write_text(metadata)
+        origin = {"url": self.checkout.as_uri(), "dir_info": {}}
+        (distribution / "direct_url.json").write_text(json.dumps(origin))
         (self.site / "sitecustomize.py").write_text(SITECUSTOMIZE)
         self.script = self.site / "bin" / "srm-mbs"
         self.script.parent.mkdir()
-        self.script.write_text("from srm_mbs.cli.app import main\nmain()\n")
+        self.script.write_text("from srm_mbs.__main__ import main\nmain()\n")
 
     def python(self, folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
         """Start Python in ``folder``, with the copy as the first installed package."""

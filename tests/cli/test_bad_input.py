@@ -118,7 +118,7 @@ def test_folder_without_permission_is_refused_before_the_run(tmp_path: Path) -> 
 def test_file_that_cannot_be_written_after_all_does_not_lose_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_: object, path: Path) -> None:
+    def full(_: object, path: Path, full_paths: bool) -> None:
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr("srm_mbs.api.Solution.save", full)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -85,6 +86,20 @@ def test_help_lists_the_commands_and_the_exit_status() -> None:
 
 def test_version_is_that_of_the_package() -> None:
     assert run("--version") == f"srm-mbs {srm.__version__}\n"
+
+
+def test_the_saved_run_names_folders_only_if_asked(tmp_path: Path, describe: Describe) -> None:
+    path, out = describe(), tmp_path / "run.npz"
+
+    def text(*options: object) -> str:
+        run("simulate", path, "--t-end", 0.1, "--out", out, *options)
+        with np.load(out) as file:
+            return str(file["meta"])
+
+    assert str(tmp_path) not in text()
+    assert str(path) in text("--full-paths")
+    alone = run("simulate", path, "--t-end", 0.1, "--full-paths", status=2)
+    assert "Give --out too" in alone
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -261,6 +276,54 @@ def test_simulate_can_play_the_run_at_once(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @POSIX
+@pytest.mark.parametrize("module", ["typer", "numpy"])
+def test_ctrl_c_while_the_command_line_is_loaded_ends_it_without_a_word(
+    tmp_path: Path, module: str
+) -> None:
+    # In place of a module that is imported: the signal comes while it is loaded.
+    (tmp_path / f"{module}.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(20)\n"
+    )
+    with subprocess.Popen(
+        command("info", "four_bar"),
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:
+        output, messages = process.communicate(timeout=60)
+    if module == "typer":  # before any command has begun
+        assert process.returncode == -signal.SIGINT
+        assert messages == ""
+    else:
+        assert process.returncode == 130
+        assert messages == "error: interrupted\n"
+    assert output == ""
+
+
+@POSIX
+def test_a_command_whose_shell_ignores_ctrl_c_ignores_it() -> None:
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c"),
+            "import signal, sys\n"
+            "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+            "sys.argv = ['srm-mbs', '--version']\n"
+            "from srm_mbs.__main__ import main\n"
+            "try:\n    main()\nexcept SystemExit:\n    pass\n"
+            "assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN",
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@POSIX
 def test_interrupted_run_is_written_and_exits_with_1(tmp_path: Path) -> None:
     psutil = pytest.importorskip("psutil")
     out, plot = tmp_path / "run.npz", tmp_path / "run.png"
@@ -392,29 +455,19 @@ def test_rounding_of_the_assembly_is_shown_as_zero() -> None:
     assert shown == [("1 rad", "0 rad/s"), ("0 rad", "0.5 rad/s"), ("0 rad", "0 rad/s")]
 
 
-@pytest.mark.parametrize(
-    ("project", "packages"),
-    [
-        (None, True),
-        ('[project]\nname = "another"', True),
-        ('[project]\nname = "srm-mbs"', False),
-        ('project = "srm-mbs"', True),
-        ("[project", True),
-        ("a = " + "[" * 100_000, True),
-    ],
-)
-def test_the_benchmark_of_a_folder_that_is_no_checkout_is_not_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: str | None, packages: bool
+@pytest.mark.parametrize("imitated", [False, True])
+def test_the_benchmark_of_another_folder_is_not_run_whatever_it_imitates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, imitated: bool
 ) -> None:
     folder = tmp_path / "benchmarks" / "work_precision"
-    folder.mkdir(parents=True)
+    if imitated:  # all of a checkout, with another benchmark
+        for name in ("srm_mbs", "benchmarks"):
+            shutil.copytree(ROOT / name, tmp_path / name)
+        for name in ("pyproject.toml", "CMakeLists.txt", "README.md"):
+            shutil.copy(ROOT / name, tmp_path)
+    else:
+        folder.mkdir(parents=True)
     (folder / "__main__.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
-    if project is not None:
-        (tmp_path / "pyproject.toml").write_text(project)
-    if packages:
-        (tmp_path / "srm_mbs").mkdir()
-        for package in (folder, folder.parent, tmp_path / "srm_mbs"):
-            (package / "__init__.py").write_text("")
     monkeypatch.chdir(tmp_path)
     assert "Run it at the top of a checkout of the source" in run("benchmark", status=2)
     assert not (tmp_path / "ran").exists()

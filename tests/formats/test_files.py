@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import stat
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.formats import files
 from srm_mbs.formats.files import (
     checked_path,
     open_regular,
@@ -20,6 +24,7 @@ from srm_mbs.formats.files import (
 )
 
 posix = pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
+locks = pytest.mark.skipif(files.fcntl is None, reason="locks of files")
 
 
 @posix
@@ -106,6 +111,85 @@ def test_the_temporary_file_has_the_suffix_that_programs_choose_formats_by(tmp_p
         temporary.write_bytes(b"film")
 
     assert (tmp_path / "film.mp4").read_bytes() == b"film"
+
+
+def test_a_write_of_nothing_keeps_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"old")
+
+    with pytest.raises(OSError, match=r"nothing was written.*film\.mp4"), whole_file(path):
+        pass  # an encoder that ends without a word
+
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["film.mp4"]
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from srm_mbs.formats.files import whole_file
+with whole_file(Path(sys.argv[1])) as temporary:
+    temporary.write_text("half of it")
+    print(temporary.name, flush=True)
+    sys.stdin.readline()
+    temporary.write_text("all of it")
+"""
+
+
+def writer(path: Path) -> subprocess.Popen[str]:
+    """A process that writes ``path``, and waits in the middle for a line."""
+    return subprocess.Popen(
+        [sys.executable, "-c", WRITER, path],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+@locks
+def test_what_a_killed_writer_leaves_is_removed_by_the_next_and_no_file_in_use(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / ".srm-notes").write_text("of the user")
+    with writer(tmp_path / "killed.csv") as killed, writer(tmp_path / "alive.csv") as alive:
+        names = [process.stdout.readline().strip() for process in (killed, alive)]
+        killed.kill()
+        killed.wait()
+        assert set(names) < set(os.listdir(tmp_path))
+
+        write_text(tmp_path / "next.csv", "next")
+
+        assert sorted(os.listdir(tmp_path)) == sorted([".srm-notes", names[1], "next.csv"])
+        alive.communicate("go on\n")
+        assert alive.returncode == 0
+    assert sorted(os.listdir(tmp_path)) == [".srm-notes", "alive.csv", "next.csv"]
+    assert (tmp_path / "alive.csv").read_text() == "all of it"
+
+
+@locks
+def test_links_and_pipes_that_look_like_temporary_files_harm_nobody(tmp_path: Path) -> None:
+    (tmp_path / "good").write_text("good")
+    (tmp_path / f".srm-{'0' * 16}").symlink_to(tmp_path / "good")
+    os.mkfifo(tmp_path / f".srm-{'1' * 16}.csv")
+
+    write_text(tmp_path / "next.csv", "next")
+
+    assert (tmp_path / "good").read_text() == "good"
+    assert (tmp_path / "next.csv").read_text() == "next"
+
+
+@locks
+def test_many_writers_at_once_lose_no_file(tmp_path: Path) -> None:
+    def write(k: int) -> None:
+        for _ in range(20):
+            write_text(tmp_path / f"{k % 4}.txt", f"{k}")
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, range(8)))
+
+    assert sorted(os.listdir(tmp_path)) == [f"{k}.txt" for k in range(4)]
+    for k in range(4):
+        assert int((tmp_path / f"{k}.txt").read_text()) % 4 == k
 
 
 @posix

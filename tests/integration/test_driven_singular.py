@@ -227,7 +227,7 @@ def test_a_run_from_a_singular_passage_goes_on_like_the_one_that_came_through(na
 def test_a_drive_that_stops_short_of_its_dead_point_turns_the_bars_back(short: float) -> None:
     solution = srm.simulate(towards_the_dead_point(short), 2.0, rtol=1e-9)
     assert solution.success, solution.message
-    assert solution.crossings == ()
+    assert {crossing.kind for crossing in solution.crossings} <= {"avoided"}
     crank, _ = solution.joint("crank")
     assert crank.max() == pytest.approx(-np.sqrt(0.5 * short), rel=1e-2)
     slider = 3.5 - short - 0.5 * np.cos(4.0)

@@ -314,7 +314,7 @@ def test_events_of_systems_that_are_no_mechanism_take_states() -> None:
         return float(x[5] - 0.1)
 
     found = prepare_events(third_rate, lambda function: function)
-    watch = EventWatch(system, method.scheme, found, x0.size)
+    watch = EventWatch(method.scheme, found, x0.size)
     memory = method.start(system, 0.0, x0, norm)
     control = FixedStep(0.0, 2.0, 0.01)
     record = integrate(system, method, control, norm, memory, x0, 0.0, 2.0, events=watch)

@@ -13,13 +13,15 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.singularities.branch_limit import branch_limit
+from srm_mbs.dynamics.singularities.branch_limit import branch_limit, branch_next_to
 from srm_mbs.dynamics.singularities.local_analysis import (
     SingularConfiguration,
     analyse_singular,
     nearest_singular,
 )
+from srm_mbs.integration import singular_endpoints
 from tests.support import reduced, slider_crank
+from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.convergence import fitted_order
 from tests.support.mechanisms import ball_dead_point, distance, floating_slider_crank
@@ -217,13 +219,19 @@ def test_a_slow_start_leaves_the_singular_configuration_on_its_branch() -> None:
     assert slider_crank.error(solution, start) < 1e-8
 
 
-def test_a_start_that_stays_next_to_a_singular_configuration_is_refused(
+def test_sweeps_refuse_a_start_that_stays_next_to_a_singular_configuration(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Hanging, a slider-crank swings through the singular configuration by 1e-6 rad."""
     monkeypatch.setattr("srm_mbs.integration.singular_endpoints.DEPARTURE_BLOCKS", 3)
     with pytest.raises(srm.InputError, match="does not leave"):
-        srm.simulate(load("slider_crank"), 20.0, **state(LOWEST, 1e-6))
+        srm.simulate(load("slider_crank"), 20.0, method=srm.SRM(), **state(LOWEST, 1e-6))
+
+
+def test_a_start_that_stays_next_to_a_singular_configuration_swings_there() -> None:
+    start = [LOWEST, 1e-6]
+    solution = srm.simulate(load("slider_crank"), 20.0, **state(*start), rtol=1e-8, atol=1e-12)
+    assert slider_crank.error(solution, start) < 1e-10
 
 
 # --- orders -------------------------------------------------------------------------------------
@@ -437,3 +445,37 @@ def test_starts_give_the_same_motion_as_a_run_that_passes_there() -> None:
     rate = float(passing(t0)[1][0])
     started = simulated("slider_crank", 1.0 - t0, 1e-11, **state(LOWEST, rate))
     assert distance(load("slider_crank"), passing, started) < 1e-8
+
+
+def folded(t: float, y: Any) -> list[float]:
+    """Equal bars of 2 m and 1 kg that turn as one body: (8/3) theta'' = -2 g cos theta."""
+    return [y[1], -0.75 * reduced.G * float(np.cos(y[0]))]
+
+
+@on_both
+@pytest.mark.parametrize("speed", [1e-4, 1e-2])
+@pytest.mark.parametrize("branch", ["stretched", "folded"])
+def test_a_slow_start_costs_one_curve_on_its_branch_and_is_exact(
+    branch: str, speed: float, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hanging on the singular configuration, which the motion does not leave before the end."""
+    mechanism = load("slider_crank")
+    found: list[Any] = []
+
+    def counted(*arguments: Any) -> Any:
+        found.append(branch_next_to(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr(singular_endpoints, "branch_next_to", counted)
+    theta, t_end = 1.5 * np.pi, 0.7
+    rates = [speed, 0.0] if branch == "folded" else [speed, -2.0 * speed]
+    run = srm.simulate(
+        mechanism, t_end, q0=[theta, -3.0 * np.pi], v0=rates, rtol=1e-9, backend=backend
+    )
+    assert run.success, run.message
+    field = folded if branch == "folded" else reduced.slider_crank()
+    exact = reduced.integrate(field, [theta, speed], t_end)
+    assert run.q[-1, 0] == pytest.approx(exact[0], abs=1e-8 * speed + 1e-14)
+    assert run.v[-1, 0] == pytest.approx(exact[1], abs=1e-8 * speed + 1e-14)
+    # One for the start and one for the end, which lies next to it as well.
+    assert len(found) <= 2

@@ -147,7 +147,7 @@ def test_a_linkage_that_turns_just_beyond_passes_twice(tableau: str, reach: floa
 def test_a_linkage_that_turns_just_before_passes_nowhere(tableau: str, reach: float) -> None:
     solution, error = touched(reach, tableau)
     assert error < 1e-7
-    assert solution.crossings == ()
+    assert {crossing.kind for crossing in solution.crossings} <= {"avoided"}
 
 
 @TABLEAUS

@@ -10,10 +10,14 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from tests.support import reduced
+from tests.support.bundled import load
 from tests.support.convergence import fitted_order
+from tests.support.dynamics import mass_matrix
 from tests.support.references import observed, reference
 
 PROBLEMS = {
@@ -112,3 +116,32 @@ def test_an_absolute_tolerance_beyond_all_measure_ends_the_run_with_a_reason() -
         G=lambda t, x: x,
     )
     assert "atol" in srm.solve_dae(circle, (0.0, 1.0), [1.0, 0.0], atol=1e-300).message
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("share", [0.1, 0.7, 1.0, 1.5])
+def test_no_tolerance_is_an_outlier_with_masses_over_eight_decades(share: float) -> None:
+    """A parallelogram with a heavy coupler on light bars, through up to 60 change points."""
+    light = load("parallelogram")
+    model = light.model.copy()
+    for k, factor in ((1, 1e-4), (2, 1e4), (3, 1e-4)):
+        body = model.inertias[k]
+        model.inertias[k] = pin.Inertia(body.mass * factor, body.lever, body.inertia * factor)
+    mechanism = srm.Mechanism(model, light.loops, q0=light.q0, v0=share * np.array(light.v0))
+    along = np.array([1.0, -1.0, 1.0])  # crank and rocker turn alike, the coupler does not
+    data = model.createData()
+
+    def reduced_equation(t: float, y: np.ndarray) -> list[float]:
+        q = np.array(mechanism.q0) + (y[0] - mechanism.q0[0]) * along
+        inertia = along @ mass_matrix(model, q) @ along
+        weight = along @ pin.computeGeneralizedGravity(model, data, q)
+        return [y[1], -weight / inertia]
+
+    t_end = 10.0
+    start = [float(mechanism.q0[0]), float(mechanism.v0[0])]
+    exact = reduced.integrate(reduced_equation, start, t_end)
+    for rtol in np.logspace(-2.0, -12.0, 21):
+        run = srm.simulate(mechanism, t_end, rtol=float(rtol))
+        assert run.success, run.message
+        error = np.abs([run.q[-1, 0] - exact[0], run.v[-1, 0] - exact[1]]).max()
+        assert error < 10.0 * rtol + 1e-9

@@ -845,3 +845,31 @@ def test_what_acts_on_a_joint_is_listed_in_the_units_of_its_coordinates() -> Non
     assert rows["to hold plane"].count(" N, [") == 1
     assert rows["to hold plane"].endswith("] N m")
     assert rows["to hold slide"] == f"{held.holding['slide'][0]:.6g} N"
+
+
+@pytest.mark.parametrize(
+    "joint", [pin.JointModelRZ(), pin.JointModelRUBZ(), pin.JointModelSpherical()]
+)
+@pytest.mark.parametrize(("share", "named"), [(0.95, False), (1.05, True)])
+def test_a_run_says_where_a_bushing_turned_by_more_than_half_a_turn(
+    joint: Any, share: float, named: bool
+) -> None:
+    """A wheel of inertia I with the speed w reaches half a turn if I w^2 > K pi^2."""
+    model = pin.Model()
+    model.gravity.linear = np.zeros(3)
+    index = model.addJoint(0, joint, pin.SE3.Identity(), "axle")
+    model.appendBodyToJoint(
+        index, pin.Inertia(1.0, np.zeros(3), np.diag([0.3, 0.3, 0.4])), pin.SE3.Identity()
+    )
+    model.addBodyFrame("wheel", index, pin.SE3.Identity(), 0)
+    stiffness = 2.5
+    bushing = srm.Bushing(
+        srm.Anchor("wheel"), srm.Anchor("world"), (0, 0, 0, 0, 0, stiffness), name="rubber"
+    )
+    speed = share * np.pi * np.sqrt(stiffness / 0.4)
+    v0 = np.zeros(model.nv)
+    v0[-1] = speed
+    wheel = srm.Mechanism(model, forces=[bushing], v0=v0)
+    run = srm.simulate(wheel, 2.0)
+    assert ("half a turn" in run.message) == named
+    assert ("(rubber)" in run.message) == named

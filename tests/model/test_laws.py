@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -72,6 +76,54 @@ def test_a_table_is_the_cubic_spline_through_its_values() -> None:
     jumps = [abs(spline(k, 3) - spline(k - 1e-9, 3)) > 1e-6 for k in TIMES[1:-1]]
     assert LAWS["table"].knots == tuple(t for t, jump in zip(TIMES[1:-1], jumps) if jump)
     assert LAWS["table"].span == (0.0, 2.0)
+
+
+def test_a_table_is_a_value_like_the_tuples_of_its_numbers() -> None:
+    table, same = srm.Table(TIMES, VALUES), srm.Table(np.array(TIMES), np.array(VALUES))
+    other = srm.Table(TIMES, [*VALUES[:-1], 0.8])
+    assert table == same
+    assert table != other
+    assert len({table, same, other}) == 2
+    assert table.t == tuple(TIMES)
+    assert tuple(TIMES) == table.t
+    assert table.t != TIMES  # as a tuple is no list
+    assert hash(table.t) == hash(tuple(TIMES))
+    assert repr(table) == f"Table(t={tuple(TIMES)}, values={tuple(VALUES)})"
+    assert (table.t[0], table.t[-1], table.t[1:3], len(table.t)) == (0.0, 2.0, (0.2, 0.5), 6)
+    assert [type(value) for value in (*table.t, table.values[2])] == [float] * 7
+    assert 0.5 in table.t
+    assert replace(table, values=other.values) == other
+    for made in (pickle.loads(pickle.dumps(table)), copy.deepcopy(table), copy.copy(table)):
+        assert made == table
+        with pytest.raises(ValueError, match="read-only"):
+            np.asarray(made.t)[0] = 1.0
+
+
+def test_a_table_takes_little_more_memory_than_its_numbers(tmp_path: Path) -> None:
+    rows = 200_000
+    numbers = 2 * 8 * rows  # bytes
+    t = 1e-3 * np.arange(rows)
+    path = tmp_path / "long.csv"
+    text = "".join(f"{at:.3f},{value:.6f}\n" for at, value in zip(t, np.sin(t)))
+    path.write_text(f"t,value\n{text}")
+
+    tracemalloc.start()
+    try:
+        table = srm.Table(*read_csv(path).columns(("t", "value")).T)
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert kept < 1.1 * numbers
+    np.testing.assert_allclose(table.t, t, atol=1e-12)
+    np.testing.assert_allclose(table.values, np.sin(t), atol=1e-6)
+
+
+def test_a_table_does_not_follow_the_arrays_it_was_made_of() -> None:
+    t, values = np.array(TIMES), np.array(VALUES)
+    table = srm.Table(t, values)
+    t[0], values[0] = -1.0, 9.0
+    assert table == LAWS["table"]
 
 
 REFUSED: dict[str, Callable[[], object]] = {

@@ -21,6 +21,8 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.errors import EvaluationError
 from srm_mbs.formats import archive
 from srm_mbs.simulation import storage
 from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
@@ -248,6 +250,31 @@ def test_a_controlled_run_is_read_between_its_steps_without_its_controller(
     assert np.array_equal(again(t)[0], loaded(t)[0])
 
 
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_run_with_a_user_force_is_read_between_its_steps_without_it(
+    tmp_path: Path, tableau: str, sampled: bool
+) -> None:
+    def push(t: float, q: np.ndarray, v: np.ndarray) -> list[float]:
+        return [5.0 * np.sin(9.0 * t) - 3.0 * v[0], 0.0]
+
+    mechanism = replace(srm.load("slider_crank"), forces=[srm.UserForce(push)])
+    options: dict[str, Any] = {"controller": lambda t, q, v: -v, "sample_time": 0.05}
+    solution = srm.simulate(mechanism, 2.0, tableau=tableau, **(options if sampled else {}))
+    assert solution.crossings
+    t = np.linspace(0.0, 2.0, 201)
+    before = solution(t)
+    assert np.abs(before[1]).max() > 1.0
+
+    loaded = reloaded(solution, tmp_path)
+
+    for a, b in zip(loaded(t), before):
+        assert np.abs(a - b).max() < 1e-12
+    assert [c.time for c in loaded.crossings] == pytest.approx([c.time for c in solution.crossings])
+    again = reloaded(loaded, tmp_path)
+    assert np.array_equal(again(t)[0], loaded(t)[0])
+
+
 def test_drives_of_a_run_that_starts_later_go_on_when_it_is_loaded(tmp_path: Path) -> None:
     drive = srm.Drive(srm.Sine(amplitude=0.4, omega=9.0, phase=0.3), joint="crank")
     mechanism = replace(srm.load("slider_crank_regular"), drives=[drive])
@@ -410,9 +437,14 @@ def test_entries_of_another_kind_or_size_are_refused(
         ("times", lambda a: a * np.nan, "not finite"),
         ("states", lambda a: a + 1e200, "too large"),
         ("rates", lambda a: a[:, :3], "rates has shape"),
+        ("rates", lambda a: a * (1.0 + 1e-6), "the rates of step 0 do not lead"),
+        ("rates", lambda a: a + 1e99, "do not lead"),
+        ("corrections", lambda a: a + 1e-6, "the rates of step 0 do not lead"),
+        ("states", lambda a: a + 1e-6 * np.arange(len(a))[:, None], "do not lead"),
+        ("times", lambda a: 1.001 * a, "do not lead"),
         ("breaks", lambda a: np.array([-1]), "outside 1 to"),
         ("breaks", lambda a: np.array([1, 1]), "does not increase"),
-        ("placements", lambda a: a + 7.0, "placements has values outside 0 to 2"),
+        ("placements", lambda a: a + 7.0, "placements has values outside 0 to 3"),
         ("ranks", lambda a: a + 0.5, "no whole numbers"),
         ("sigmas", lambda a: -a, "outside 0 to"),
         ("event_0_times", lambda a: a + 9.0, "event_0_times has values outside"),
@@ -425,6 +457,18 @@ def test_arrays_of_another_shape_type_or_range_are_refused(
 ) -> None:
     with pytest.raises(srm.InputError, match=says):
         srm.load_solution(changed_run(tmp_path, **{name: change}))
+
+
+def test_a_ball_joint_that_turns_too_far_in_a_step_is_refused(tmp_path: Path) -> None:
+    srm.simulate(floating_ring(), 0.05).save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        arrays = dict(file)
+    # A rotation has no size: its end does not show how far the rates lead.
+    arrays["rates"][0, 0, 5] = 1e20
+    np.savez(tmp_path / "run.npz", **arrays)
+
+    with pytest.raises(srm.InputError, match="turns too far within one step"):
+        srm.load_solution(tmp_path / "run.npz")
 
 
 def test_saved_runs_name_no_folders_unless_asked_for(tmp_path: Path) -> None:
@@ -589,3 +633,21 @@ def test_a_save_that_fails_leaves_the_file_that_was_there(
         srm.simulate(srm.load("four_bar"), 0.3).save(tmp_path / "run.npz")
     assert (tmp_path / "run.npz").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
+
+
+def test_a_loaded_run_whose_stages_cannot_be_evaluated_names_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = srm.simulate(srm.load("four_bar"), 0.2, backend="python")
+    run.save(tmp_path / "run.npz")
+    loaded = srm.load_solution(tmp_path / "run.npz")
+
+    def fails(*_: Any) -> Any:
+        raise EvaluationError("two points coincide")
+
+    monkeypatch.setattr(ClosedSystem, "evaluate", fails)
+    between = 0.5 * (run.t[0] + run.t[1])
+    with pytest.raises(srm.InputError, match=r"run\.npz.*two points coincide"):
+        loaded(between)
+    with pytest.raises(EvaluationError, match="two points coincide"):
+        run(between)

@@ -229,8 +229,8 @@ def mutated(parts: Parts, number: int, rng: Rng) -> str:
 
 
 def outcome(content: bytes, rng: Rng) -> dict[str, Any]:
-    """``refused`` with a message, ``read``, or ``undetermined`` where a value that the file may
-    have makes the equations of motion unsolvable; anything else is a fault."""
+    """``refused`` with a message when it is loaded, ``refused when read`` where a value that the
+    file may have makes the equations of motion unsolvable, or ``read``; all else is a fault."""
     try:
         solution = storage.load_from(io.BytesIO(content), Path("run.npz"), SOLUTIONS)
     except srm.InputError as error:
@@ -240,10 +240,13 @@ def outcome(content: bytes, rng: Rng) -> dict[str, Any]:
     start, end = solution.span
     try:
         q, v = solution(np.clip(np.linspace(start, end, 4), start, end))
+    except srm.InputError as error:
+        return {"is": "refused when read", "message": str(error)}
+    try:
         if rng.random() < 0.1 and not solution.settings.controlled:
             _ = solution.crossings, solution.reactions, solution.energy, solution.bifurcations
-    except srm.SrmError as error:
-        return {"is": "undetermined", "message": str(error)}
+    except srm.SrmError as error:  # the equations of motion of another possible mechanism
+        return {"is": "refused when read", "message": str(error)}
     fits = q.shape == (4, solution.mechanism.model.nq) and len(q) == len(v)
     return {"is": "read" if fits and np.isfinite(q).all() else "not finite"}
 

@@ -23,6 +23,8 @@ pytestmark = pytest.mark.stress
 COUNT = 10_000
 SECONDS = 1200.0
 MOST_CRASHES = 5
+MOST_REFUSED_LATE = 10
+"""Runs that load and are refused when their dense output is read."""
 
 
 def write_runs(folder: Path) -> None:
@@ -94,11 +96,14 @@ def test_mutated_saved_runs_are_refused_or_read_and_crash_nothing(tmp_path: Path
 
     found = outcomes(tmp_path, 0, COUNT)
 
-    faults = [one for one in found if one["is"] not in ("refused", "read", "undetermined")]
+    faults = [one for one in found if one["is"] not in ("refused", "read", "refused when read")]
     counts = Counter(one["is"] for one in found)
     print(dict(counts))  # noqa: T201 - shown by pytest -rP
     assert not faults, f"{len(faults)} of {counts}, as {faults[:10]}"
     assert len(found) == COUNT
+    # Models that could be, and states so large that a sum with the rates is rounded to them:
+    # only the equations of motion at every stage would tell.
+    assert counts["refused when read"] <= MOST_REFUSED_LATE
     # Most changes are seen, and those of numbers that a run may have are read.
     assert counts["refused"] > 0.5 * COUNT
     assert counts["read"] > 0.1 * COUNT

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.errors import printable, safe_repr
 from tests.stress.wrong_arguments import Call, calls, wrong_values
 
 pytestmark = [
@@ -60,7 +61,7 @@ def outcome(call: Call, place: int | str, value: Any) -> str:
     except TooLong:
         return "too long"
     except Exception as error:
-        return f"{type(error).__name__}: {error}"[:200]
+        return f"{type(error).__name__}: {printable(error)}"[:200]
     return "returned"
 
 
@@ -83,7 +84,7 @@ def test_wrong_arguments_are_refused_with_an_error_of_the_package(
             end = outcome(call, place, value)
             ended[end if end in ("returned", "refused", "too long") else "leaked"] += 1
             if end not in ("returned", "refused", "too long"):
-                leaked.append(f"{name}, {place!r} = {value!r:.60}: {end}")
+                leaked.append(f"{name}, {place!r} = {safe_repr(value):.60}: {end}")
             if time.monotonic() > until:
                 break
 

@@ -15,17 +15,27 @@ import srm_mbs as srm
 
 
 class Raising:
-    """An object of which nothing can be asked, but for its representation."""
+    """An object of which nothing can be asked, not even its representation."""
 
     def _fail(self, *_: Any, **__: Any) -> Any:
         raise RuntimeError("not to be asked")
 
     __array__ = __float__ = __int__ = __index__ = __len__ = __iter__ = __fspath__ = _fail
     __call__ = __bool__ = __eq__ = __hash__ = __getitem__ = __lt__ = __contains__ = _fail
-    __str__ = __add__ = __radd__ = __mul__ = __rmul__ = _fail
+    __str__ = __add__ = __radd__ = __mul__ = __rmul__ = __repr__ = __format__ = _fail
 
-    def __repr__(self) -> str:
-        return "Raising()"
+
+class RaisingText(str):
+    """A text that cannot be shown."""
+
+    def _fail(self, *_: Any) -> Any:
+        raise RuntimeError("not to be asked")
+
+    __repr__ = __str__ = __format__ = _fail
+
+
+HUGE = 10**5000
+"""An integer that Python does not write as text."""
 
 
 def wrong_values() -> list[Any]:
@@ -58,6 +68,9 @@ def wrong_values() -> list[Any]:
             set(),
             {1},
         ),
+        *(HUGE, -HUGE, [HUGE], [HUGE] * 3, (1.0, 2.0, HUGE), {"crank": HUGE}, {HUGE: 1.0}),
+        *([Raising()], {"crank": Raising()}, {1: Raising()}, RaisingText("crank")),
+        *([RaisingText("x")], {RaisingText("crank"): 0.0}, {RaisingText("x"): 0.0}),
         *(object(), int, Raising(), Raising, len, lambda: None, lambda *_: None, lambda *_: "x"),
         *(np.zeros(0), np.zeros((3, 3)), np.zeros((1, 1, 1)), np.array(["a"]), np.array(None)),
         *(np.zeros(3, complex), np.full(3, np.nan), np.zeros(100_000), np.array([1, "x"], object)),
@@ -175,6 +188,9 @@ def calls(folder: Path) -> dict[str, Call]:
         ),
         "Anchor": Call(srm.Anchor, ("crank",), {"xyz": (0.0, 0.0, 0.0), "rpy": (0.0, 0.0, 0.0)}),
         "LoopClosure": Call(srm.LoopClosure, ("point", anchor, anchor), {"name": "x"}),
+        "LoopClosure of joints": Call(
+            srm.LoopClosure, ("coupling",), {"joints": (crank, "rocker"), "ratio": 1.0}
+        ),
         "Drive": Call(srm.Drive, (sine,), {"joint": crank, "axis": None, "name": "x"}),
         "Sine": Call(srm.Sine, (), {"amplitude": 0.1, "frequency_hz": 1.0, "phase": 0.0}),
         "ConstantSpeed": Call(srm.ConstantSpeed, (), {"speed": 1.0}),

@@ -41,6 +41,8 @@ def control_state(control: Any) -> Any:
                 "redo": 0.0 if control._redo is None else control._redo,
                 "redone": control._redone,
                 "arrival": int(control._arrival),
+                "turning": control._turning,
+                "lost_branch": control._lost_branch,
             }
         elif isinstance(control, SlopeOfSigma):
             state |= {"slope": control._slope}

@@ -23,6 +23,17 @@ namespace srm {
     field(double, direct_hit)              /* sigma below which any prediction is better */        \
     field(int, max_projections)            /* Newton steps onto the branch, per stage */           \
     field(int, min_history)                /* nodes from which the prediction is better */         \
+    /* Branch nodes: methods/branch_nodes.py. */                                                   \
+    field(double, known_direction)         /* sigma from which the state has a direction */        \
+    field(double, direction_probe)         /* motion that measures it, over sigma */               \
+    field(double, node_spacing)            /* distance of nodes (units) */                         \
+    field(int, node_doublings)             /* of it, where sigma grows slowly */                   \
+    field(double, node_sigma)              /* of the first nodes, for which they are far enough */ \
+    field(int, node_iterations)            /* onto the closures */                                 \
+    field(double, node_closing)            /* largest first one, over the spacing */               \
+    field(double, node_accuracy)           /* last one (units) */                                  \
+    field(double, node_misfit)             /* largest relative error of the multiplier */          \
+    field(double, branch_below)            /* sigma below which lingering stages use them */       \
     /* Evaluation of all closure rows: methods/split_step.py. */                                   \
     field(int, residual_interval)          /* accepted steps between two of them */                \
     /* Step-size control: control/step_size.py. */                                                 \
@@ -45,6 +56,9 @@ namespace srm {
     field(int, max_placements)             /* tries per step */                                    \
     field(double, singular_end)            /* sigma below which an end counts as singular */       \
     field(double, arrival_sigma_change)    /* distance from which such an end is prepared for */   \
+    field(double, turning_sigma)           /* extreme of sigma at which a motion turns back */     \
+    field(double, turning_misfit)          /* of the parabola, over the change of sigma */         \
+    field(double, slow_sigma_change)       /* per step, of a slow motion */                        \
     /* Branch guard: control/branch_guard.py. */                                                   \
     field(double, branch_change)           /* relative change of velocity that is suspect */       \
     field(int, max_guard_retries)          /* tries per step */                                    \
@@ -57,7 +71,19 @@ namespace srm {
     field(double, lost_residual)           /* of rows, after the correction */                     \
     field(double, search_below)            /* sigma below which singularities are searched for */  \
     field(double, search_factor)           /* fall of sigma from one search to the next */         \
-    field(double, rounding_share)          /* of the tolerance, in the first stage of a piece */
+    field(double, rounding_share)          /* of the tolerance, in the first stage of a piece */   \
+    /* Critical configurations: singularities/critical.py, critical_passages.py. */                \
+    field(int, critical_iterations)                                                                \
+    field(double, critical_difference)     /* step of the differences of G^T u (units) */          \
+    field(double, critical_converged)                                                              \
+    field(double, critical_accepted)                                                               \
+    field(double, critical_frozen)         /* step up to which the Hessian is kept (units) */      \
+    field(double, critical_ridge)          /* added to the Hessian's diagonal */                   \
+    field(double, critical_reach)          /* of the search (units) */                             \
+    field(double, critical_passed)         /* distance that is a passage, over that of the start */ \
+    field(double, rounded_residual)        /* that of a singular configuration (row units) */      \
+    field(double, expected_steps)          /* steps within which a zero of sigma is examined */   \
+    field(double, expected_sigma)          /* sigma below which it is, wherever it lies */
 
 struct Constants {
     SRM_FIELDS(SRM_CONSTANTS)

@@ -76,7 +76,7 @@ Proposal FixedStep::propose(double t, double limit, IntegratorState&) {
 StepDecision FixedStep::decide(const Proposal& proposal, const StepResult* result) {
     if (!result || !finite(result->state.data(), static_cast<int>(result->state.size())))
         return StepDecision::rejected;
-    while (proposal.t_new >= t0_ + static_cast<double>(index_) * step_ - sliver()) ++index_;
+    moved(proposal.t_new);
     return StepDecision::accepted;
 }
 
@@ -135,6 +135,8 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
     if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.max_sigma_change / slope_);
     memory.sigma_slope = slope_;
     const Proposal proposal = inner_->propose(t, limit, memory);
+    lingering_ = memory.lingering = lingers(proposal, memory);
+    if (lingering_) return proposal;
     if (arrives(t, proposal)) {
         arrival_ = Arrival::none;
         return {proposal.h, proposal.t_new, proposal.placed, true};
@@ -150,6 +152,16 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
         }
     }
     return proposal;
+}
+
+// Whether stages next to a singular configuration are to be solved by nodes of the branch: the
+// motion turns back there, or is slow.
+bool SingularityPlacement::lingers(const Proposal& proposal, const IntegratorState& memory) const {
+    if (lost_branch_ || !memory.history || memory.history->known_until >= proposal.t_new)
+        return false;
+    if (!adaptive) return !memory.history->away.empty();
+    if (!(memory.sigma < constants_.monitored_below)) return false;
+    return turning_ || !memory.history->away.empty();
 }
 
 // Whether Python is to prepare for the end next to a singular configuration.
@@ -198,15 +210,21 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
                          c > 0.0 ? std::abs(sigmas[middle_] - start) / c : 0.0) / h;
     } else if (result) {
         slope = sigma_slope(abscissae_, result->sigmas, h);
+        if (lingering_ && result->lost_branch) {
+            lost_branch_ = true;
+            redo_ = h;
+            ++replaced;
+            return StepDecision::replaced;
+        }
         const bool last = proposal.t_new >= t_end_;
-        if (last && arrival_ == Arrival::watched &&
+        if (last && !lingering_ && arrival_ == Arrival::watched &&
             result->sigmas.back() < constants_.singular_end) {
             arrival_ = Arrival::due;
             redo_ = h;
             ++replaced;
             return StepDecision::replaced;
         }
-        if (redone_ < constants_.max_placements && !known_) {
+        if (redone_ < constants_.max_placements && !known_ && !lingering_) {
             const double better = better_step(h, result->sigmas, slope, last);
             if (0.0 < better && better < h) {
                 redo_ = better;
@@ -221,11 +239,24 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
     redone_ = 0;
     if (decision == StepDecision::accepted && result) {
         slope_ = std::max(slope, 0.5 * slope_);
-        zero_ = result->quiet
-                    ? nan
-                    : result->t + h * zero_ahead(abscissae_[middle_], result->sigmas[0],
-                                                 result->sigmas[middle_],
-                                                 result->sigmas.back(), constants_.zero_horizon);
+        turning_ = !result->quiet && result->sigmas.back() < constants_.monitored_below &&
+                   (slope_ * h < constants_.slow_sigma_change ||
+                    std::abs(extreme_sigma(abscissae_, middle_, result->sigmas,
+                                           constants_.turning_misfit)) <
+                        constants_.turning_sigma);
+        lost_branch_ = lost_branch_ && !result->quiet;
+        zero_ = expected_ = nan;
+        if (!result->quiet) {
+            const std::vector<double>& sigmas = result->sigmas;
+            const double start = sigmas[0], end = sigmas.back();
+            const double ahead = zero_ahead(abscissae_[middle_], start, sigmas[middle_], end,
+                                            constants_.zero_horizon);
+            zero_ = result->t + h * ahead;
+            if (ahead < 1.0 + constants_.expected_steps)
+                expected_ = zero_;
+            else if (end < start && end < constants_.expected_sigma)
+                expected_ = result->t + h * (start / (start - end));
+        }
     }
     return decision;
 }
@@ -372,6 +403,31 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
         }
     }
     return zero;
+}
+
+double extreme_sigma(const std::vector<double>& abscissae, int middle,
+                     const std::vector<double>& sigmas, double allowed) {
+    const double c = abscissae[middle], start = sigmas[0];
+    if (!(0.1 < c && c < 0.9)) return inf;
+    double best = inf, extreme = inf;
+    for (const auto& [sign, last_sign] :
+         {std::pair{1.0, 1.0}, {1.0, -1.0}, {-1.0, -1.0}, {-1.0, 1.0}}) {
+        const double end = last_sign * sigmas.back();
+        const double b = ((sign * sigmas[middle] - start) / c - (end - start)) / (c - 1.0);
+        const double a = end - start - b;
+        double misfit = 0.0;
+        for (std::size_t j = 0; j < sigmas.size(); ++j) {
+            const double x = abscissae[j];
+            const double off = std::abs(start + x * (a + x * b)) - sigmas[j];
+            misfit += off * off;
+        }
+        if (!(misfit < best)) continue;
+        best = misfit;
+        extreme = b == 0.0 ? inf : start - a * a / (4.0 * b);
+    }
+    const auto [low, high] = std::minmax_element(sigmas.begin(), sigmas.end());
+    const double misfit = std::sqrt(best / static_cast<double>(sigmas.size()));
+    return misfit <= allowed * (*high - *low) ? extreme : inf;
 }
 
 double zero_ahead(double c, double start, double middle, double end, double horizon) {

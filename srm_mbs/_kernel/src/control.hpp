@@ -34,6 +34,9 @@ struct Proposal {
     field(double, redo)                                                                     \
     field(int, redone)                                                                      \
     field(int, arrival)                                                                     \
+    /* Whether the motion turns back or is slow, and whether its branch was lost. */        \
+    field(bool, turning)                                                                    \
+    field(bool, lost_branch)                                                                \
     /* Branch guard: longest step (s), tries. */                                            \
     field(double, limit)                                                                    \
     field(int, tries)
@@ -55,6 +58,10 @@ public:
     virtual StepDecision decide(const Proposal& proposal, const StepResult* result) = 0;
     // A step ends on `end`: a breakpoint, or the end of the run.
     virtual void set_target_time(double end) = 0;
+    // The run is at t by steps that no control proposed.
+    virtual void moved(double t) = 0;
+    // When sigma is expected to vanish; NaN if that is not to be seen.
+    virtual double next_zero() const { return std::numeric_limits<double>::quiet_NaN(); }
     bool adaptive = true;
     long placed = 0, replaced = 0;
 };
@@ -66,6 +73,7 @@ public:
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void set_target_time(double end) override { t_end_ = end; }
+    void moved(double) override {}
     void start_grid(double, double) override {}
     void resume(const ControlState& s) override {
         h_ = s.h;
@@ -93,6 +101,9 @@ public:
     }
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
+    void moved(double t) override {
+        while (t >= t0_ + static_cast<double>(index_) * step_ - sliver()) ++index_;
+    }
     void set_target_time(double end) override { t_end_ = end; }
     void start_grid(double t0, double step) override {
         t0_ = t0;
@@ -129,6 +140,8 @@ public:
         adaptive = inner_->adaptive;
     }
     void set_target_time(double end) override { inner_->set_target_time(end); }
+    void moved(double t) override { inner_->moved(t); }
+    double next_zero() const override { return inner_->next_zero(); }
     void start_grid(double t0, double step) override { inner_->start_grid(t0, step); }
 
 protected:
@@ -146,6 +159,13 @@ public:
         arrival_ = first_arrival_;
         inner_->set_target_time(end);
     }
+    double next_zero() const override { return expected_; }
+    void moved(double t) override {
+        inner_->moved(t);
+        zero_ = expected_ = std::numeric_limits<double>::quiet_NaN();
+        redo_ = 0.0;
+        redone_ = 0;
+    }
     void resume(const ControlState& s) override {
         inner_->resume(s);
         arrival_ = static_cast<Arrival>(s.arrival);
@@ -153,6 +173,8 @@ public:
         zero_ = s.zero;
         redo_ = s.redo;
         redone_ = s.redone;
+        turning_ = s.turning;
+        lost_branch_ = s.lost_branch;
     }
     void save(ControlState& s) const override {
         inner_->save(s);
@@ -161,12 +183,15 @@ public:
         s.zero = zero_;
         s.redo = redo_;
         s.redone = redone_;
+        s.turning = turning_;
+        s.lost_branch = lost_branch_;
     }
 
 private:
     double placed_step(double distance, double h, double t) const;
     double better_step(double h, const std::vector<double>& sigmas, double slope, bool last) const;
     bool arrives(double t, const Proposal& proposal) const;
+    bool lingers(const Proposal& proposal, const IntegratorState& memory) const;
 
     // Whether the end next to a singular configuration is prepared for: never or done, if one is
     // found, or now.
@@ -175,11 +200,15 @@ private:
     Constants constants_;
     double t_end_;
     Arrival first_arrival_, arrival_;
-    bool known_ = false;  // the multipliers up to the end are known
+    // The multipliers up to the end are known; those next to the singular configuration are solved
+    // by nodes of the branch.
+    bool known_ = false, lingering_ = false;
+    bool turning_ = false, lost_branch_ = false;
     Gaps gaps_;
     std::vector<double> abscissae_;
     int middle_;  // stage next to the middle of the step
     double slope_ = 0.0, zero_, redo_ = 0.0;
+    double expected_ = std::numeric_limits<double>::quiet_NaN();
     int redone_ = 0;
 };
 
@@ -209,6 +238,11 @@ public:
     BranchGuard(std::unique_ptr<Control> inner, const System& system, const Constants& constants);
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
+    void moved(double t) override {
+        inner_->moved(t);
+        limit_ = std::numeric_limits<double>::infinity();
+        tries_ = 0;
+    }
     void resume(const ControlState& s) override {
         inner_->resume(s);
         limit_ = s.limit;
@@ -236,5 +270,10 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
 // The next zero of sigma, in steps from the start of the last one; NaN if it is further than
 // `horizon`.
 double zero_ahead(double c, double start, double middle, double end, double horizon);
+// The extreme value of the parabola through sigma at the start, the stage `middle` and the end of a
+// step, with its sign changed where the step passes a zero; infinite if its misfit at the stages is
+// larger than the part `allowed` of the change of sigma.
+double extreme_sigma(const std::vector<double>& abscissae, int middle,
+                     const std::vector<double>& sigmas, double allowed);
 
 }  // namespace srm

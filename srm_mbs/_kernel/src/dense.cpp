@@ -100,7 +100,7 @@ bool DenseOutput::close_to_singular(long step) const {
         change = std::max(change, std::abs(sigmas[j] - sigmas[0]) / abscissae_[j]);
         lowest = std::min(lowest, sigmas[j]);
     }
-    return lowest < constants_.close * change;
+    return lowest < std::max(constants_.close * change, constants_.branch_below);
 }
 
 void DenseOutput::weights(double theta, double* out) const {

@@ -28,6 +28,7 @@ struct Extension {
     field(std::vector<int>, nodes)     /* ends of steps of the three polynomials */           \
     field(double, spacing)             /* smallest distance of nodes, over the step */        \
     field(double, close)               /* sigma next to a singularity, over its change per step */ \
+    field(double, branch_below)        /* the same, of lingering motions, as it is */              \
     field(std::vector<double>, probes) /* fractions at which polynomials are compared */      \
     field(double, slack)               /* relative time that may be read beyond the ends */
 

@@ -10,12 +10,14 @@ void MultiplierHistory::check() const {
     const std::size_t width = static_cast<std::size_t>(nv);
     expect_size("values", values.size(), times.size() * width);
     if (nv > 0) expect_size("normals", normals.size(), normals.size() / width * width);
+    if (!away.empty()) expect_size("away", away.size(), width);
 }
 
 void MultiplierHistory::clear() {
     times.clear();
     values.clear();
     normals.clear();
+    away.clear();
     forget_known();
 }
 
@@ -25,7 +27,8 @@ void MultiplierHistory::forget_known() {
 }
 
 void MultiplierHistory::extend(double t, const double* value,
-                               const std::vector<double>& new_normals) {
+                               const std::vector<double>& new_normals,
+                               const std::vector<double>& new_away) {
     int kept = 0;
     while (kept < size() && times[kept] < t) ++kept;
     times.resize(kept);
@@ -39,6 +42,7 @@ void MultiplierHistory::extend(double t, const double* value,
     }
     forget_known();
     normals = new_normals;
+    away = new_away;
 }
 
 int MultiplierHistory::first_around(double t) const {

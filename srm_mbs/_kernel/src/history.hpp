@@ -15,7 +15,9 @@ namespace srm {
     /* Up to known_until (s) the values hold for sigma below known_below. */              \
     field(double, known_until)                                                            \
     field(double, known_below)                                                            \
-    field(std::vector<double>, normals) /* (m, nv), of the weakest row last; or empty */
+    field(std::vector<double>, normals) /* (m, nv), of the weakest row last; or empty */      \
+    /* Direction of the branch that leads away from a singular configuration (nv,); or empty. */ \
+    field(std::vector<double>, away)
 
 class MultiplierHistory {
 public:
@@ -30,7 +32,8 @@ public:
     bool begun() const { return !times.empty(); }
     void clear();
     // Adds the multiplier at t; the newest `points` nodes are kept, those after t dropped.
-    void extend(double t, const double* value, const std::vector<double>& normals);
+    void extend(double t, const double* value, const std::vector<double>& normals,
+                const std::vector<double>& away);
     void predict(double t, double* out) const;
     // Predicts unless t is too far from the nodes; whether it does.
     bool predict_near(double t, double* out) const;

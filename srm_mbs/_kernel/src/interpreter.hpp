@@ -1,8 +1,9 @@
 // The interpreter's lock, given up and taken again by threads that may outlive the interpreter.
 //
-// When a program ends while a daemon thread is in the kernel, CPython (before 3.14) ends that thread
-// where it asks for the lock, by unwinding its stack: through C++ frames that is an abort.  Threads
-// of the kernel therefore sleep from then on, and never ask again.
+// When a program ends while a daemon thread runs, CPython (before 3.14) ends that thread where it
+// asks for the lock, by unwinding its stack: through C++ frames that is an abort, be they the
+// kernel's or those of a library that gives up the lock in C++, as NumPy does.  Threads of the
+// kernel therefore sleep from then on, and never ask again.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -11,6 +12,11 @@ namespace srm {
 
 // Sleeps for ever if the interpreter is ending; to be called without the lock.
 void sleep_if_ending();
+
+// Between these calls a thread runs Python code, or asks for the lock to do so: the end of the
+// program waits until it leaves, or enters again and sleeps.  With or without the lock.
+void enter_python();
+void leave_python();
 
 // Gives the lock up, for a scope.
 class WithoutLock {
@@ -36,7 +42,7 @@ private:
     PyGILState_STATE state_;
 };
 
-// Has atexit put the threads of the kernel to sleep, once Python code that they called has returned.
+// Has atexit put the threads of the kernel to sleep, and wait until they do.
 void sleep_at_exit();
 
 }  // namespace srm

@@ -12,6 +12,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "algebra.hpp"
+#include "branch_motion.hpp"
 #include "constants.hpp"
 #include "dense.hpp"
 #include "errors.hpp"
@@ -104,6 +105,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<SystemData>(m, "SystemData");
     bind_struct<Extension>(m, "Extension");
     bind_struct<DenseConstants>(m, "DenseConstants");
+    bind_struct<BranchCurve>(m, "BranchCurve");
 }
 
 // ---- System -------------------------------------------------------------------------------------
@@ -154,15 +156,6 @@ struct PySystem {
         return out;
     }
 
-    double first_step(double t, const Array& state, const IntegratorState& memory,
-                      const ErrorNorm& norm, double span, int order, const Constants& constants) {
-        for (const std::size_t found : {memory.rate.size(), norm.atol.size()})
-            if (found != static_cast<std::size_t>(2 * system->nv))
-                throw nb::value_error("the memory or the norm has not 2 nv numbers");
-        return initial_step(*system, norm, t, vector_of(state, state_size(), "state"),
-                            memory.rate.data(), memory.state_scale.data(), span, order, constants);
-    }
-
     // Evaluates the stage `repeats` times, to measure one evaluation in the loop.
     void repeat(double t, const Array& state, long repeats) {
         std::vector<double> rate(2 * system->nv);
@@ -197,7 +190,6 @@ void bind_system(nb::module_& m) {
         .def(nb::init<nb::object, const SystemData&, nb::object>(), nb::arg("model"),
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
-        .def("first_step", &PySystem::first_step)
         .def("repeat", &PySystem::repeat)
         .def("repeat_tree", &PySystem::repeat_tree)
         .def("between",
@@ -211,7 +203,127 @@ void bind_system(nb::module_& m) {
                      [](const PySystem& s) { return s.system->factorisations(); });
 }
 
+// ---- Branch motion ------------------------------------------------------------------------------
+
+struct PyBranchMotion {
+    nb::object owner;  // kept alive
+    System& system;
+    BranchMotion motion;
+
+    PyBranchMotion(nb::object owner_, const ButcherTableau& scheme, const Constants& constants,
+                   const ErrorNorm& norm)
+        : owner(std::move(owner_)),
+          system(*nb::cast<PySystem&>(owner).system),
+          motion(system, scheme, constants, norm) {}
+
+    // The points after the first of `points`, which are solved, as far as they can be: (points,
+    // state), state that of the point that needs a curve, or None.  `values` (k, nv) are the
+    // multipliers at `times` (k,); with `extrapolated` > 0 those of as many solved points.
+    nb::tuple nodes(const Array& times, const Array& values, std::vector<BranchPoint> points,
+                    int extrapolated, double direct, nb::handle curve_or_none) {
+        const BranchCurve* curve =
+            curve_or_none.is_none() ? nullptr : &nb::cast<const BranchCurve&>(curve_or_none);
+        const std::size_t nv = static_cast<std::size_t>(system.nv);
+        if (points.empty() || times.ndim() != 1 || values.size() != times.size() * nv)
+            throw nb::value_error("times, values and points do not fit");
+        const double* t = times.data();
+        MultiplierHistory known;
+        known.nv = system.nv;
+        known.times.assign(t, t + times.size());
+        known.values.assign(values.data(), values.data() + values.size());
+        nb::object left = nb::none();
+        while (points.size() < times.size()) {
+            const std::size_t last = points.size() - 1;
+            if (extrapolated > 0) {
+                const std::size_t first =
+                    points.size() > static_cast<std::size_t>(extrapolated)
+                        ? points.size() - static_cast<std::size_t>(extrapolated) : 0;
+                known.times.assign(t + first, t + points.size());
+                known.values.clear();
+                for (std::size_t i = first; i < points.size(); ++i)
+                    known.values.insert(known.values.end(), points[i].multiplier.begin(),
+                                        points[i].multiplier.end());
+            }
+            BranchPoint point = points.back();
+            motion.advance(t[last], t[last + 1], known, point);
+            const std::vector<double> before = point.state;
+            if (!motion.solve(t[last + 1], direct, curve, point)) {
+                left = owned_array(before);
+                break;
+            }
+            points.push_back(std::move(point));
+        }
+        return nb::make_tuple(std::move(points), left);
+    }
+};
+
+void bind_branch_motion(nb::module_& m) {
+    nb::class_<BranchPoint>(m, "BranchPoint")
+        .def("__init__",
+             [](BranchPoint* self, const Array& state, const Array& rate, const Array& multiplier,
+                double sigma) {
+                 new (self) BranchPoint{to_vector(state), to_vector(rate), to_vector(multiplier),
+                                        sigma};
+             })
+        .def_prop_ro("state", [](const BranchPoint& p) { return owned_array(p.state); })
+        .def_prop_ro("rate", [](const BranchPoint& p) { return owned_array(p.rate); })
+        .def_prop_ro("multiplier", [](const BranchPoint& p) { return owned_array(p.multiplier); })
+        .def_ro("sigma", &BranchPoint::sigma);
+    nb::class_<PyBranchMotion>(
+        m, "BranchMotion", nb::type_slots(collected<PyBranchMotion, &PyBranchMotion::owner>()))
+        .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&>())
+        .def("nodes", &PyBranchMotion::nodes, nb::arg("times"), nb::arg("values"),
+             nb::arg("points"), nb::arg("extrapolated"), nb::arg("direct"),
+             nb::arg("curve").none());
+}
+
 // ---- Run ----------------------------------------------------------------------------------------
+
+// Dense output of one step, from copies of its numbers; without neighbours and zone.
+struct PyStepDense {
+    System& system;
+    std::vector<double> times, states, rates, corrections, sigmas, end_rate;
+    DenseOutput dense;
+    std::size_t nx;
+
+    PyStepDense(System& system_, const StepResult& r, double t_new, std::vector<double> start,
+                const std::vector<double>& abscissae, const Extension& extension,
+                const DenseConstants& constants)
+        : system(system_),
+          times{r.t, t_new},
+          states(std::move(start)),
+          rates(r.rates),
+          corrections(r.correction),
+          sigmas(r.sigmas),
+          end_rate(r.end_rate),
+          dense(system.nq, system.nv, extension, abscissae, constants, arrays(r)),
+          nx(r.state.size()) {}
+
+    nb::object at(const Array& t) {
+        const std::size_t k = t.size();
+        std::vector<double> out(k * nx);
+        dense.states(system, t.data(), static_cast<long>(k), out.data());
+        return owned_array(std::move(out), {k, nx});
+    }
+
+private:
+    StepArrays arrays(const StepResult& r) {
+        states.insert(states.end(), r.state.begin(), r.state.end());
+        StepArrays out;
+        out.count = 1;
+        out.end = times[1];
+        out.width = static_cast<int>(r.sigmas.size());
+        out.corrected = !corrections.empty();
+        out.times = times.data();
+        out.states = states.data();
+        out.rates = rates.data();
+        out.corrections = corrections.data();
+        out.sigmas = sigmas.data();
+        out.end_rate = end_rate.data();
+        out.in_zone.assign(1, 0);
+        return out;
+    }
+};
 
 // The records of a run, and the shapes of their arrays.
 struct PyRecords {
@@ -232,20 +344,30 @@ struct PyRun {
         : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
         check_size("ErrorNorm.atol", norm.atol.size());
         check(memory);
-        const double t_end = intervals.ends.back();
-        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm),
-                                    make_control(scheme, constants, options, t_end), memory,
-                                    checked_state(state), intervals, options);
+        std::vector<double> start = checked_state(state);
+        auto control = make_control(scheme, constants, norm, memory, start, intervals, options);
+        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), std::move(control),
+                                    memory, std::move(start), intervals, options);
     }
 
     std::unique_ptr<Control> make_control(const ButcherTableau& scheme, const Constants& constants,
-                                          const RunOptions& options, double t_end) {
+                                          const ErrorNorm& norm, const IntegratorState& memory,
+                                          const std::vector<double>& start,
+                                          const SmoothIntervals& intervals,
+                                          const RunOptions& options) {
+        const double t_end = intervals.ends.back();
         std::unique_ptr<Control> control;
-        if (options.step > 0.0)
+        if (options.step > 0.0) {
             control = std::make_unique<FixedStep>(options.t0, t_end, options.step);
-        else
-            control = std::make_unique<PIControl>(t_end, options.first_step,
-                                                  scheme.controller_order, constants);
+        } else {
+            double first = options.first_step;
+            if (!(first > 0.0))
+                first = initial_step(s, norm, options.t0, start.data(), memory.rate.data(),
+                                     memory.state_scale.data(), t_end - options.t0,
+                                     scheme.controller_order, constants);
+            control =
+                std::make_unique<PIControl>(t_end, first, scheme.controller_order, constants);
+        }
         if (!s.constrained()) return control;
         if (options.placement != "automatic")
             return std::make_unique<SlopeOfSigma>(std::move(control), scheme);
@@ -317,12 +439,46 @@ struct PyRun {
         run->memory = memory;
     }
 
+    // A step to t that was made in Python; its correction is zero.
+    void append(double t, const Array& end, const Array& rates, const Array& end_rate,
+                const Array& sigmas, const Array& state_scale, int rank) {
+        const std::size_t n = 2 * static_cast<std::size_t>(s.nv);
+        const std::size_t stages = static_cast<std::size_t>(run->step.scheme.stages()) + 1;
+        StepResult r;
+        r.state = checked_state(end);
+        r.rates = sized(rates, stages * n, "rates");
+        r.end_rate = sized(end_rate, n, "end_rate");
+        r.sigmas = sized(sigmas, stages, "sigmas");
+        r.state_scale = sized(state_scale, n, "state_scale");
+        r.correction.assign(n, 0.0);
+        r.rank = rank;
+        run->append(r, t);
+    }
+
+    static std::vector<double> sized(const Array& array, std::size_t size, const char* what) {
+        if (array.size() != size)
+            throw nb::value_error((std::string(what) + " has another size").c_str());
+        return to_vector(array);
+    }
+
+    void move_to(double t, const IntegratorState& memory) {
+        check(memory);
+        run->move_to(t, memory);
+    }
+
     // Accepted, rejected and zone steps since the start.
     nb::tuple totals() const {
         long rejected = run->rejected_before;
         for (const Attempt& a : run->attempts) rejected += a.decision == StepDecision::rejected;
         return nb::make_tuple(run->steps_before + run->records.count(), rejected,
                               run->zones_before + static_cast<long>(run->records.zones.size()));
+    }
+
+    // Dense output of the step made last, which began at `start` and used no zone.
+    PyStepDense* step_dense(const Array& start, const std::vector<double>& abscissae,
+                            const Extension& extension, const DenseConstants& constants) const {
+        return new PyStepDense(s, run->step.result, run->t(), checked_state(start), abscissae,
+                               extension, constants);
     }
 
     // The records since the start `state` at `t0`; the run has none any more.
@@ -426,6 +582,8 @@ void bind_run(nb::module_& m) {
     records.def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
         .def_prop_ro("zones", [](const PyRecords& r) { return r.records.zones; });
 
+    nb::class_<PyStepDense>(m, "StepDense").def("__call__", &PyStepDense::at);
+
     nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
         .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&,
                       const IntegratorState&, const Array&, const SmoothIntervals&,
@@ -441,23 +599,26 @@ void bind_run(nb::module_& m) {
         .def("restore", &PyRun::restore)
         .def("memory", [](const PyRun& r) { return r.run->memory; })
         .def("remember", &PyRun::remember)
+        .def("append", &PyRun::append, nb::arg("t"), nb::arg("state"), nb::arg("rates"),
+             nb::arg("end_rate"), nb::arg("sigmas"), nb::arg("state_scale"), nb::arg("rank"))
+        .def("move_to", &PyRun::move_to)
+        .def_prop_ro("passage_time", [](const PyRun& r) { return r.run->passage_time(); })
         .def("last", [](PyRun& r) -> StepResult& { return r.run->step.result; },
              nb::rv_policy::reference_internal)
         .def("last_history", &PyRun::last_history)
+        .def("step_dense", &PyRun::step_dense, nb::rv_policy::take_ownership,
+             nb::keep_alive<0, 1>())
         .def("attempts", &PyRun::attempts)
         .def("suspect_times", &PyRun::suspect_times)
         .def("totals", &PyRun::totals)
         .def("take_records", &PyRun::take_records)
-        .def("time_before", [](const PyRun& r, long steps) {
-            const long count = r.run->records.count();
-            if (steps < 1 || steps > count) throw nb::index_error();
-            return r.run->records.times[static_cast<std::size_t>(count - steps)];
-        })
+        .def_prop_ro("watched_time", [](const PyRun& r) { return r.run->watched_time(); })
         .def_prop_ro("t", [](const PyRun& r) { return r.run->t(); })
         .def_prop_ro("h", [](const PyRun& r) { return r.run->last_h(); })
         .def_prop_ro("state", [](const PyRun& r) { return owned_array(r.run->state); })
         .def_prop_ro("count", [](const PyRun& r) { return r.run->records.count(); })
         .def_prop_ro("at_breakpoint", [](const PyRun& r) { return r.run->at_breakpoint(); })
+        .def_prop_ro("interval_end", [](const PyRun& r) { return r.run->interval_end(); })
         .def_prop_ro("interval", [](const PyRun& r) { return r.run->interval(); })
         .def_prop_ro("evaluation_failed", [](const PyRun& r) { return r.run->evaluation_failed; })
         .def_prop_ro("placed", [](const PyRun& r) { return r.run->control->placed; })
@@ -570,9 +731,12 @@ NB_MODULE(_core, m) {
     m.def("lean_data",
           [](nb::object model) { return nb::steal(lean_data(pinocchio_model_in(model))); });
     sleep_at_exit();
+    m.def("enter_python", &enter_python);
+    m.def("leave_python", &leave_python);
     bind_structs(m);
     bind_algebra(m);
     bind_system(m);
+    bind_branch_motion(m);
     bind_run(m);
     bind_dense_output(m);
 }

@@ -4,6 +4,7 @@
 #include <chrono>
 #include <cmath>
 
+#include "critical.hpp"
 #include "errors.hpp"
 #include "interpreter.hpp"
 #include "linear.hpp"
@@ -64,7 +65,10 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
       t_(options.t0),
       smallest_(constants().smallest_step * std::abs(t_end() - options.t0)),
       open_residual_(constants().open_residual),
-      search_below_(constants().search_below) {
+      search_below_(constants().search_below),
+      examines_(options.examines),
+      abscissae_(step.scheme.c) {
+    abscissae_.push_back(1.0);
     enter_interval();
 }
 
@@ -109,7 +113,7 @@ bool Run::restart_interval() {
     memory.history->clear();
     std::vector<double> multiplier(system.nv);
     system.multiplier(multiplier.data());
-    memory.history->extend(t_, multiplier.data(), {});
+    memory.history->extend(t_, multiplier.data(), {}, {});
     if (memory.sigma >= constants().search_below) search_below_ = constants().search_below;
     if (!(memory.sigma < search_below_) || !(memory.sigma < direct_from())) return true;
     search_below_ = constants().search_factor * memory.sigma;
@@ -170,12 +174,15 @@ Stop Run::attempt(StepDecision& decision) {
     const Proposal proposal = control->propose(t_, limit, memory);
     if (proposal.arriving) return Stop::arrival;
     const double h = h_ = proposal.h;
+    if (examines_) {
+        const double zero = control->next_zero();
+        if (!known_ && zero > t_ && examine(zero)) return Stop::passage;
+    }
     const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
-    const long made = records.count();
     const int steps = constants().standstill_steps;
-    if (made >= steps && made % steps == 0 &&
-        t_ - records.times[made - steps] < constants().standstill * (t_end() - t0_))
+    if (made_ >= steps && made_ % steps == 0 &&
+        t_ - watched_time_ < constants().standstill * (t_end() - t0_))
         return Stop::standstill;
     const StepResult* result = nullptr;
     try {
@@ -185,6 +192,7 @@ Stop Run::attempt(StepDecision& decision) {
     } catch (const EvaluationError&) {
         evaluation_failed = true;
     }
+    if (result && examines_ && passes_residual(*result)) return Stop::passage;
     decision = control->decide(proposal, result);
     const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
     redone_ = decision == StepDecision::replaced;
@@ -194,6 +202,8 @@ Stop Run::attempt(StepDecision& decision) {
         return stuck ? Stop::evaluation : Stop::chunk;
     }
     evaluation_failed = false;
+    // Where sigma rises, the next passage is another one.
+    if (result->sigmas.back() > result->sigmas.front()) known_ = false;
     if (leaves_closures_open(*result)) return Stop::closures;
     if (result->in_zone)
         records.zones.push_back({records.count(), result->zone_threshold, *memory.history});
@@ -202,7 +212,42 @@ Stop Run::attempt(StepDecision& decision) {
     std::copy(result->state.begin(), result->state.end(), state.begin());
     step.accept(memory);
     t_ = proposal.t_new;
+    if (made_++ % steps == 0) watched_time_ = t_;
     return t_ < t_end() ? Stop::chunk : Stop::finished;
+}
+
+// Whether the step passes a critical configuration that has a residual, and was not looked at.
+bool Run::passes_residual(const StepResult& r) {
+    if (known_ || r.quiet) return false;
+    const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
+    if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return false;
+    const double zero = zero_within(abscissae_, r.sigmas);
+    const bool inside = 0.0 < zero && zero <= 1.0;
+    return examine(r.t + (inside ? zero : abscissae_[low - r.sigmas.begin()]) * r.h);
+}
+
+// Whether the critical configuration of the passage expected at `zero` has a residual.
+bool Run::examine(double zero) {
+    const auto residual =
+        residual_of_passage(system, t_, state.data(), memory.rate.data(), zero, constants());
+    known_ = residual.has_value();
+    passage_ = zero;
+    return residual && std::abs(*residual) > constants().rounded_residual;
+}
+
+void Run::append(const StepResult& result, double t) {
+    constexpr int critical = 3;  // STEP_PLACEMENTS of dense_output.py
+    records.append(result, t, critical);
+    if (made_++ % constants().standstill_steps == 0) watched_time_ = t;
+    end_rate = result.end_rate;
+    state = result.state;
+}
+
+void Run::move_to(double t, IntegratorState known) {
+    t_ = t;
+    memory = std::move(known);
+    known_ = false;
+    control->moved(t);
 }
 
 void Run::drop_records() {
@@ -216,6 +261,7 @@ void Run::drop_records() {
 Stop Run::go_on(double end, double first, double last, bool forces_jump,
                 double grid, double seconds) {
     drop_records();
+    made_ = 0;
     t0_ = t_;
     smallest_ = constants().smallest_step * std::abs(end - t_);
     intervals_.ends.assign(1, end);

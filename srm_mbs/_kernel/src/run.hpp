@@ -19,6 +19,7 @@ enum class Stop {
     evaluation = 5,  // a fixed step could not be evaluated
     breakpoint = 6,  // the next interval begins, and Python has to look at it first
     arrival = 7,     // the end lies next to a singular configuration: Python prepares for it
+    passage = 8,     // a step passes a critical configuration with a residual: Python looks at it
 };
 
 #define SRM_SMOOTH_INTERVALS(field)                                                           \
@@ -38,10 +39,11 @@ struct SmoothIntervals {
 #define SRM_RUN_OPTIONS(field)                                                         \
     field(double, t0)                                                                  \
     field(double, step)            /* fixed step (s); 0: step-size control */          \
-    field(double, first_step)                                                          \
+    field(double, first_step)      /* of step-size control (s); 0: what the start allows */ \
     field(double, max_step)                                                            \
     field(std::string, placement)  /* "automatic" or "off" */                          \
     field(bool, arrivals)          /* stop before an end next to a singular configuration */ \
+    field(bool, examines)          /* stop before a critical configuration with a residual */ \
     /* Regularisation eps = eps_factor h^eps_power; eps_factor 0: eps -> 0. */         \
     field(double, eps_factor)                                                          \
     field(double, eps_power)
@@ -114,11 +116,21 @@ public:
     Stop go_on(double end, double first, double last, bool forces_jump, double grid,
                double seconds);
 
+    // Records a step to t that was made in Python.
+    void append(const StepResult& result, double t);
+    // Goes on from t, where such steps have led.
+    void move_to(double t, IntegratorState known);
+
     double t() const { return t_; }
+    // When the passage is expected for which the run stopped.
+    double passage_time() const { return passage_; }
     double last_h() const { return h_; }
     double t_end() const { return intervals_.ends.back(); }
     // Whether the next interval has still to be entered.
     bool at_breakpoint() const { return t_ >= intervals_.ends[interval_] && t_ < t_end(); }
+    // End of the first of the steps over which the progress of the run is measured (s).
+    double watched_time() const { return watched_time_; }
+    double interval_end() const { return intervals_.ends[interval_]; }
     long interval() const { return static_cast<long>(interval_); }
 
     System& system;
@@ -136,6 +148,8 @@ public:
 
 private:
     bool leaves_closures_open(const StepResult& result);
+    bool passes_residual(const StepResult& result);
+    bool examine(double zero);
     void enter_interval();
     void drop_records();
     bool restart_interval();
@@ -152,6 +166,12 @@ private:
     // sigma below which the next interval looks for a singular configuration.
     double search_below_;
     bool redone_ = false;
+    long made_ = 0;  // steps, whether their records are still here or not
+    double watched_time_ = 0.0;
+    bool examines_;
+    std::vector<double> abscissae_;
+    double passage_ = 0.0;
+    bool known_ = false;  // the passage ahead has been examined
 };
 
 }  // namespace srm

@@ -74,6 +74,7 @@ SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& co
       nv_(system.nv),
       n_(2 * system.nv),
       nx_(system.nq + system.nv),
+      nodes_(system, constants_),
       x_(nx_),
       delta_(n_),
       rate_(n_),
@@ -155,7 +156,7 @@ void SplitStep::prepare_branch(const IntegratorState& memory, double end, double
     // All stages of a step are projected or none: a mixture of both loses the order.
     const double reach =
         sigma_change > 0.0 ? constants.near_steps * sigma_change : constants.monitored_below;
-    branch_.near = memory.sigma < reach;
+    branch_.near = memory.sigma < reach || lingers_;
     branch_.projected = false;
     branch_.inaccurate_below = 0.0;
     const MultiplierHistory& history = *memory.history;
@@ -166,7 +167,7 @@ void SplitStep::prepare_branch(const IntegratorState& memory, double end, double
         holds = threshold < constants.zone_largest && holding_suffices(memory, threshold);
         // The tolerance alone sets the width of the zone.  The accuracy that its predictions and
         // projections need is limited by rounding: the weights grow only after that.
-        add_floor(memory, sigma_change);
+        if (!lingers_) add_floor(memory, sigma_change);
         const double error = prediction_error(history, end);
         if (error > 1.0 && !holds) {
             // A prediction that errs by more than the tolerance is no better than a direct solve
@@ -183,6 +184,21 @@ void SplitStep::prepare_branch(const IntegratorState& memory, double end, double
     branch_.zone.threshold = std::max(limit, known);
     branch_.zone.history = &history;
     branch_.zone.predicts = !holds;
+}
+
+// Solves the stage x_, evaluated last, by nodes of its branch; whether they were found.
+bool SplitStep::solve_on_branch(double t, double start, const double* state,
+                                const IntegratorState& memory) {
+    if (result.lost_branch) return false;
+    if (away_.empty()) {
+        away_ = memory.history->away;
+        if (away_.empty()) {
+            nodes_.find_direction(start, state, away_);
+            system_.evaluate(t, x_.data(), System::ZoneView{});
+        }
+    }
+    result.lost_branch = away_.empty() || !nodes_.solve(t, x_.data(), away_);
+    return !result.lost_branch;
 }
 
 // Evaluates the stage x_ at its projection on its branch, by Newton steps that are taken as long as
@@ -226,7 +242,8 @@ void SplitStep::add_floor(const IntegratorState& memory, double sigma_change) {
 // Adds to the weights the effect of rounding on the error estimate.
 void SplitStep::add_rounding(double sigma_change) {
     // Below the threshold of the zone no multiplier is solved for directly.
-    const double least = branch_.zone.history ? branch_.zone.threshold : 0.0;
+    double least = branch_.zone.history ? branch_.zone.threshold : 0.0;
+    if (noded_) least = std::max(least, constants.branch_below);
     double lowest = std::numeric_limits<double>::infinity();
     for (int j = 1; j <= scheme.stages(); ++j)
         if (result.sigmas[j] >= least) lowest = std::min(lowest, result.sigmas[j]);
@@ -247,20 +264,21 @@ const StepResult& SplitStep::make(double t, double h, const double* state,
     h_ = h;
     monitored_ = constrained && memory.sigma < constants.monitored_below +
                                                    constants.far_steps * sigma_change;
+    lingers_ = monitored_ && memory.lingering && theta == 1.0;
     if (monitored_) {
         for (int i = 0; i < n_; ++i) weights_[i] = norm.weight(i, memory.state_scale[i]);
         prepare_branch(memory, t + h, sigma_change);
     }
+    r.residual = 0.0;
     evaluate_stages(t, state, memory, sigma_change);
     system_.state_scale(x_.data(), r.state_scale.data());
-    const double sigma = system_.sigma();
+    const double sigma = r.sigmas[scheme.stages()];
     finish(theta, constrained);
     const double change = std::abs(sigma - memory.sigma);
     r.quiet = !monitored_ && sigma > constants.monitored_below + constants.far_steps * change;
-    r.residual = 0.0;
     const bool due = memory.steps < constants.residual_interval ||
                      memory.steps % constants.residual_interval == 0;
-    if (due && constrained && theta == 1.0) r.residual = system_.closure_residual();
+    if (due && constrained && theta == 1.0 && !noded_end_) r.residual = system_.closure_residual();
     r.t = t;
     r.h = h;
     estimate_error(memory, sigma_change);
@@ -283,6 +301,8 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     r.rank = std::numeric_limits<int>::max();
     r.held = false;
     moved_end_ = false;
+    noded_ = noded_end_ = r.lost_branch = false;
+    if (lingers_) away_.clear();
     for (int j = 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
@@ -292,8 +312,19 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         system_.retract(state, delta_.data(), x_.data());
         const double fraction = end ? 1.0 : scheme.c[j];
         const double time = t + fraction * h_;
-        system_.evaluate(time, x_.data(), monitored_ ? branch_.zone : none);
+        system_.evaluate(time, x_.data(), monitored_ && !lingers_ ? branch_.zone : none);
         r.sigmas[j] = system_.sigma();
+        if (lingers_ && r.sigmas[j] < constants.branch_below) {
+            if (solve_on_branch(time, t, state, memory)) {
+                noded_ = true;
+                noded_end_ = end;
+                x_ = nodes_.state;
+                rate_ = nodes_.rate;
+                system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
+                continue;
+            }
+            system_.evaluate(time, x_.data(), branch_.zone);
+        }
         if (monitored_ && branch_.near && fraction > 0.0) {
             // The chart of the rates is that of the stage before it is projected.
             std::copy(delta_.begin(), delta_.end(), rate_.begin());
@@ -314,12 +345,22 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
 // The end from the last stage: its correction, and what the history of multipliers takes from it.
 void SplitStep::finish(double theta, bool constrained) {
     StepResult& r = result;
-    const double sigma = system_.sigma();
+    const double sigma = r.sigmas[scheme.stages()];
     r.has_multiplier = false;
     r.normals.clear();
+    r.away.clear();
     if (!constrained) {
         std::copy(x_.begin(), x_.end(), r.state.begin());
         std::copy(rate_.begin(), rate_.end(), r.end_rate.begin());
+        return;
+    }
+    if (noded_end_) {
+        r.state = nodes_.state;
+        r.end_rate = nodes_.rate;
+        r.correction = nodes_.moved;
+        r.multiplier = nodes_.multiplier;
+        r.away = nodes_.away;
+        r.has_multiplier = true;
         return;
     }
     const bool rank_deficient = system_.rank_deficient();
@@ -365,7 +406,7 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
                     error_[nv_ + i] += h_ * std::abs(scheme.b[j]) * uncertainty_[i];
             }
         }
-        add_floor(memory, sigma_change);
+        if (!lingers_) add_floor(memory, sigma_change);
         add_rounding(sigma_change);
     }
     r.error_ratio = ErrorNorm::ratio(error_.data(), weights_.data(), n);
@@ -380,7 +421,7 @@ void SplitStep::accept(IntegratorState& memory) {
     std::copy(r.state_scale.begin(), r.state_scale.end(), memory.state_scale.begin());
     if (!memory.history) return;
     if (r.has_multiplier)
-        memory.history->extend(r.t + r.h, r.multiplier.data(), r.normals);
+        memory.history->extend(r.t + r.h, r.multiplier.data(), r.normals, r.away);
     else if (!r.in_zone && memory.history->begun())
         memory.history->clear();
 }

@@ -4,6 +4,7 @@
 #include <optional>
 #include <vector>
 
+#include "branch_nodes.hpp"
 #include "constants.hpp"
 #include "history.hpp"
 #include "struct_fields.hpp"
@@ -53,6 +54,7 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     field(std::vector<double>, state_scale) /* (n,), |x| of the error weights */          \
     field(double, sigma)                                                                  \
     field(double, sigma_slope)              /* |d sigma / dt| of the last steps (1/s) */  \
+    field(bool, lingering)                  /* turns, or is slow, at small sigma */        \
     field(long, steps)                                                                    \
     field(std::optional<MultiplierHistory>, history) /* none without closures */
 
@@ -73,6 +75,7 @@ struct StepResult {
     std::vector<double> sigmas;       // (s + 1,)
     std::vector<double> multiplier;   // (nv,), at the end
     std::vector<double> normals;      // (k, nv), at the end; empty: none
+    std::vector<double> away;         // (nv,), at an end that branch nodes solved; else empty
     double error_ratio = 0.0;
     double residual = 0.0;  // largest of all closure rows before the correction; 0: not evaluated
     int rank = 0;           // smallest of all stages
@@ -80,6 +83,7 @@ struct StepResult {
     bool in_zone = false;  // a stage was in the zone
     bool quiet = false;    // the whole step is far from singular configurations
     bool held = false;     // a stage kept the normals of the last node
+    bool lost_branch = false;  // nodes of the branch were wanted and not found
     double zone_threshold = 0.0;
 };
 
@@ -109,6 +113,8 @@ private:
         System::ZoneView zone;
     };
     void prepare_branch(const IntegratorState& memory, double end, double sigma_change);
+    bool solve_on_branch(double t, double start, const double* state,
+                         const IntegratorState& memory);
     bool project_stage(double t, double c, const IntegratorState& memory, double sigma_change);
     void evaluate_stages(double t, const double* state, const IntegratorState& memory,
                          double sigma_change);
@@ -127,6 +133,11 @@ private:
     double h_ = 0.0;
     bool monitored_ = false;  // the step starts next to a singular configuration
     bool moved_end_ = false;  // the end stage was moved by `moved_`
+    // The motion lingers, its stages next to the singular configuration are solved by nodes of the
+    // branch; one of them was; the end was.
+    bool lingers_ = false, noded_ = false, noded_end_ = false;
+    BranchNodes nodes_;
+    std::vector<double> away_;
     Branch branch_;
     std::vector<double> x_, delta_, rate_, weights_, error_, moved_, uncertainty_;
     mutable std::vector<double> scratch_, noise_;

@@ -503,6 +503,59 @@ void System::correction(double* out) {
     projection_->unwhiten(out + nv);
 }
 
+void System::free_acceleration(double* out) {
+    std::copy(projection_->white_force.begin(), projection_->white_force.end(), out);
+    projection_->unwhiten(out);
+}
+
+void System::normal_part(const double* w, double* out) const {
+    projection_->white_project(w, out);
+    projection_->unwhiten(out);
+}
+
+void System::multiplier_of(const double* a, double* out) {
+    projection_->white_project(a, out);
+    projection_->normal(bias_.data(), white_.data());
+    for (int i = 0; i < nv; ++i) out[i] += white_[i];
+    projection_->unwhiten(out);
+}
+
+void System::closing(const std::vector<double>& allowed, double* out) {
+    std::vector<double> g(g_);
+    for (std::size_t k = 0; k < allowed.size(); ++k) g[data_.drives[k].row] -= allowed[k];
+    projection_->normal(g.data(), out);
+    projection_->unwhiten(out);
+}
+
+void System::driven_residuals(std::vector<double>& out) const {
+    out.resize(data_.drives.size());
+    for (std::size_t k = 0; k < out.size(); ++k) out[k] = g_[data_.drives[k].row];
+}
+
+int System::branch_tangents(std::vector<double>& out) const {
+    const std::size_t free = static_cast<std::size_t>(nv - projection_->rank);
+    out.resize((free + data_.drives.size()) * nv);
+    projection_->complement(out.data());
+    std::size_t count = free;
+    std::vector<double> unit(data_.rows);
+    for (const DrivenRow& drive : data_.drives) {
+        double* const own = &out[count * nv];
+        unit[drive.row] = 1.0;
+        projection_->normal(unit.data(), own);
+        unit[drive.row] = 0.0;
+        const double whole = norm(own, nv);
+        for (int pass = 0; pass < 2; ++pass)
+            for (std::size_t j = free; j < count; ++j)
+                add(-dot(&out[j * nv], own, nv), &out[j * nv], own, nv);
+        const double size = norm(own, nv);
+        if (!(size > 1e-10 * whole)) continue;
+        for (int i = 0; i < nv; ++i) own[i] /= size;
+        ++count;
+    }
+    for (std::size_t j = 0; j < count; ++j) projection_->unwhiten(&out[j * nv]);
+    return static_cast<int>(count);
+}
+
 double System::closure_residual() const {
     double out = 0.0;
     for (int i = 0; i < data_.rows; ++i)
@@ -611,6 +664,29 @@ double System::closure_residual_at(double t, const double* state) {
     update_closures(state, false);
     update_drives(t, false);
     return closure_residual();
+}
+
+void System::closures_at(double t, const double* q, double* g, double* G, int width) {
+    auto& w = *work_;
+    t = std::min(std::max(t, first_), last_);
+    std::copy(q, q + nq, w.q.data());
+    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+    update_closures(q, false);
+    update_drives(t, false);
+    std::copy(g_.begin(), g_.end(), g);
+    std::fill_n(G, static_cast<std::size_t>(data_.rows) * width, 0.0);
+    const auto copy = [&](int row, int j) { G[row * width + j] = projection_->filled(row)[j]; };
+    for (const ClosureRows& closure : data_.closures)
+        for (std::size_t k = 0; k < closure.count(); ++k)
+            for (int j : closure.columns) copy(closure.first_row + static_cast<int>(k), j);
+    for (const JointRow& joints : data_.joint_rows)
+        for (int j : joints.in_v) copy(joints.row, j);
+    for (const Elimination& e : data_.eliminations)
+        for (int j : e.columns) copy(e.row, j);
+    for (const DrivenRow& drive : data_.drives) {
+        if (drive.in_v >= 0) copy(drive.row, drive.in_v);
+        G[drive.row * width + nv] = -pushed_[drive.row];
+    }
 }
 
 }  // namespace srm

@@ -164,6 +164,14 @@ public:
     void multiplier(double* out);        // (nv,)
     void correction(double* out);        // (2 nv,)
     double closure_residual() const;     // the largest, in row units
+    void free_acceleration(double* out);                      // M^-1 f (nv,)
+    void normal_part(const double* w, double* out) const;     // P w (nv,)
+    void multiplier_of(const double* a, double* out);         // E (G a + Gdot v - s'') (nv,)
+    // E g (nv,), without `allowed` of the rows of the drives, and g - s of these.
+    void closing(const std::vector<double>& allowed, double* out);
+    void driven_residuals(std::vector<double>& out) const;
+    // M-orthonormal velocities (k, nv) that satisfy the closures, whatever the drives; their number.
+    int branch_tangents(std::vector<double>& out) const;
     // M-orthonormal normals (k, nv) of the rows in use; empty with drives.
     void normals(std::vector<double>& out) const;
 
@@ -178,6 +186,15 @@ public:
     double step_limit(const double* state) const;
     // The largest residual of all rows at a state, in row units.
     double closure_residual_at(double t, const double* state);
+
+    // All rows at q and t, without velocities: g (rows,), and by rows G (rows, width) with the
+    // derivative by t, where drives are, as its last column.
+    void closures_at(double t, const double* q, double* g, double* G, int width);
+    int rows() const { return data_.rows; }
+    int structural_rank() const { return data_.structural_rank; }
+    bool driven() const { return !data_.drives.empty(); }
+    double unit(int j) const { return data_.unit[j]; }
+    double residual_scale(int row) const { return data_.residual_scale[row]; }
 
     int nq, nv;
     long evaluations = 0;

@@ -21,7 +21,7 @@ from srm_mbs.analysis.report.sections import (
     pictures_data,
     run_data,
 )
-from srm_mbs.errors import InputError, __version__
+from srm_mbs.errors import InputError, __version__, safe_repr
 from srm_mbs.formats.files import checked_path, utf8
 from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.simulation.result import SimulationResult
@@ -88,7 +88,7 @@ def write_report(
     for kind in name_list(pictures, "pictures"):
         if kind not in PICTURES:
             raise InputError(
-                f"reports have no picture of the kind {kind!r}",
+                f"reports have no picture of the kind {safe_repr(kind)}",
                 element="pictures",
                 remedy=f"Known: {', '.join(PICTURES)}",
             )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -117,18 +116,10 @@ def _image(data: bytes, media_type: str, description: str, caption: str) -> dict
     return {"source": source, "description": description, "caption": caption}
 
 
-def without_folders(text: object, mechanism: Mechanism, full_paths: bool) -> str:
+def _about(mechanism: Mechanism, text: object, full_paths: bool) -> str:
     """``text`` about ``mechanism``, without the folders of its files unless ``full_paths``."""
-    words = str(text)
     source = mechanism.source
-    if full_paths or source is None:
-        return words
-    for path in (source.path, source.urdf_path):
-        folder = path.removesuffix(file_name(path))
-        for name in {folder, os.path.abspath(folder) + os.sep} if folder else ():
-            if len(name) > 1:
-                words = words.replace(name, "")
-    return words
+    return str(text) if full_paths or source is None else source.without_folders(str(text))
 
 
 def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict[str, Any]:
@@ -155,7 +146,7 @@ def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict
             f"The mechanism at the start of the run, t = {start:.6g} s.",
         )
     except InputError as error:
-        problem = without_folders(error, mechanism, full_paths)
+        problem = _about(mechanism, error, full_paths)
     return {
         "properties": rows,
         "snapshot": snapshot,
@@ -168,7 +159,7 @@ def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict
         "forces": list(force_rows(mechanism)),
         "drives": list(drive_rows(mechanism)),
         "notes": [
-            without_folders(note, mechanism, full_paths)
+            _about(mechanism, note, full_paths)
             for note in (*mechanism.notes, *mechanism.structure.notes)
         ],
     }
@@ -246,6 +237,7 @@ def _passages(solution: SimulationResult) -> dict[str, Any]:
                 f"{crossing.time:.9g}",
                 crossing.participants.names if named else NOT_COMPUTED,
                 f"{crossing.sigma:.2g}",
+                _residual(crossing) if named else NOT_COMPUTED,
                 _branch(crossing) if followed else NOT_COMPUTED,
                 PRECAUTIONS.get(crossing.placement, "none needed"),
             )
@@ -256,7 +248,13 @@ def _passages(solution: SimulationResult) -> dict[str, Any]:
     }
 
 
+def _residual(crossing: Crossing) -> str:
+    return "none found" if crossing.residual is None else f"{abs(crossing.residual):.1e}"
+
+
 def _branch(crossing: Crossing) -> str:
+    if crossing.kind == "avoided":
+        return "none: the residual keeps the branches apart"
     count, before, after = len(crossing.branches), crossing.arrived_on, crossing.left_on
     if before is None or after is None:
         return "not known"
@@ -287,7 +285,7 @@ def pictures_data(
         try:
             figure = plot_solution(solution, kind=kind)
         except InputError as error:
-            problem = without_folders(error, solution.mechanism, full_paths)
+            problem = _about(solution.mechanism, error, full_paths)
             missing.append(f"{PICTURES[kind]} Not drawn: {problem}")
             continue
         images.append(_plot_image(figure, f"Plot: {PICTURES[kind]}", PICTURES[kind]))

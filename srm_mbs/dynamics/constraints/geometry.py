@@ -75,6 +75,12 @@ class ClosureGeometry:
         return self.rows.g / self.row_unit, self.rows.G / self.row_unit[:, None] * self.unit
 
     @cached_property
+    def commutes(self) -> bool:
+        """Whether moves commute: no ball, planar or free joints."""
+        joints = list(self.model.joints)[1:]
+        return all(joint.nq == joint.nv or joint.nv == 1 for joint in joints)
+
+    @cached_property
     def row_size(self) -> FloatArray:
         """Usual norm of the rows of G in :meth:`closure`: rms over open configurations (rows,).
 

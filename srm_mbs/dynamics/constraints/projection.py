@@ -258,6 +258,10 @@ class Projection:
         falling = np.argsort(-self._pivots[: self.rank], kind="stable")
         return self.unwhiten(self.Q[:, falling])
 
+    def complement(self) -> FloatArray:
+        """Orthonormal white vectors (nv, nv - rank), orthogonal to the rows in use."""
+        return np.linalg.qr(self.Q, mode="complete")[0][:, self.rank :]
+
     def normal(self, right: FloatArray) -> FloatArray:
         """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
         if self.rank == 0:

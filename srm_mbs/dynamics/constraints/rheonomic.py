@@ -101,6 +101,11 @@ class DrivenKinematics(LoopKinematics):
         ]
         return self
 
+    @property
+    def driven_rows(self) -> slice:
+        """Which rows are those of drives."""
+        return slice(self._first, len(self.g))
+
     def constants(self) -> dict[str, Any]:
         """Constants of the closures for the compiled kernel, those of driven points included."""
         own = super().constants()

@@ -16,6 +16,8 @@ the residual of the rates, P v - E s', is an affine function of v.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from srm_mbs._typing import FloatArray
@@ -48,6 +50,10 @@ SPACINGS = (0.03, 0.015, 0.0075, 0.06)
 """Distances of the nodes, in units; the first that is accurate enough is used, else the best."""
 ACCURATE = 1e-11
 """Estimated error of P at which no other spacing is tried."""
+CURVE_MARGIN = 2
+"""Nodes at each end of a curve beyond which it is not used."""
+CURVE_ACCURACY = 1e-10
+"""Largest estimated error of P of a curve that is used for other configurations."""
 CLOSING_ITERATIONS = 15
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of a node, in row units."""
@@ -63,6 +69,69 @@ NEAR = 1e-2
 def _at_zero(times: FloatArray, values: FloatArray) -> FloatArray:
     """The polynomial through ``values`` (k, ...) at ``times`` (k,), at zero."""
     return np.tensordot(lagrange_weights(times, 0.0), values, axes=1)
+
+
+@dataclass(frozen=True, eq=False)
+class BranchCurve:
+    """The constraint algebra along a branch of one degree of freedom, by interpolation.
+
+    The curve of a :class:`BranchLimit` then contains every configuration of the branch close to it.
+    P and -E s' are interpolated to the parameter of a configuration; z, which is quadratic in the
+    velocity of the branch, is known at the nodes for one velocity each.
+
+    Attributes
+    ----------
+    geometry
+        The closures, and the drives if there are any.
+    place
+        The configuration at which the parameter is zero, as the geometry takes it.
+    along : (n,)
+        The parameter of a motion in units.
+    nodes : (k,)
+        Parameters of the nodes.
+    normal : (k, nv, n)
+        [P, -E s'] there, in units.
+    velocities : (k, nv), quadratic : (k, nv)
+        A velocity of the branch at each node, and E (Gdot v - s'') for it.
+    """
+
+    geometry: ClosureGeometry
+    place: FloatArray
+    along: FloatArray
+    nodes: FloatArray
+    normal: FloatArray
+    velocities: FloatArray
+    quadratic: FloatArray
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest parameter at which the curve is used: between inner nodes."""
+        first, *_, last = sorted(self.nodes.tolist())[CURVE_MARGIN:-CURVE_MARGIN]
+        return first, last
+
+    def parameter(self, place: FloatArray) -> float | None:
+        """The parameter of a configuration; None outside of the range."""
+        found = float(self.along @ self.geometry.difference(self.place, place))
+        first, last = self.range
+        return found if first <= found <= last else None
+
+    def off_branch(self, at: float, v: FloatArray) -> FloatArray:
+        """P v - E s' (nv,) at the parameter ``at``, which leads off the branch."""
+        normal = np.tensordot(lagrange_weights(self.nodes, at), self.normal, axes=1)
+        unit = self.geometry.coordinate_unit
+        return normal @ self.geometry.rates(v) * unit
+
+    def multiplier(self, at: float, v: FloatArray, free: FloatArray) -> FloatArray:
+        """yhat (nv,) at the parameter ``at`` for the velocity v of the branch and the acceleration
+        ``free`` = M^-1 f without closures, both (nv,)."""
+        unit = self.geometry.coordinate_unit
+        weights = lagrange_weights(self.nodes, at)
+        normal = np.tensordot(weights, self.normal, axes=1)[:, : len(unit)]
+        own = v - (self.normal @ self.geometry.rates(v)) * unit
+        squares = (self.velocities**2).sum(axis=1)
+        shares = (own * self.velocities).sum(axis=1) / np.where(squares > 0.0, squares, 1.0)
+        z = (weights * shares**2) @ self.quadratic
+        return normal @ (free / unit) * unit + z  # type: ignore[no-any-return]
 
 
 class BranchLimit:
@@ -83,6 +152,8 @@ class BranchLimit:
 
     Attributes
     ----------
+    direction
+        As given, with 1 as its largest part.
     accuracy
         Estimated error of P; infinite if the branch could not be followed.
     """
@@ -98,7 +169,8 @@ class BranchLimit:
         self._centre = centre
         self._geometry = centre.geometry
         self._frame, self._tangent = frame, tangent
-        direction = direction / np.abs(direction).max()
+        self._place = q
+        self.direction = direction = direction / np.abs(direction).max()
         self._unit = self._geometry.coordinate_unit
         self.accuracy = np.inf
         self._normal = np.full((len(self._unit), len(self._geometry.unit)), np.nan)
@@ -192,6 +264,25 @@ class BranchLimit:
             for k, (node, normal) in enumerate(zip(self._nodes, self._normals))
         ]
         return _at_zero(self._times, np.array(values))
+
+    def curve(self) -> BranchCurve | None:
+        """The algebra along the curve; None if the branch has more than one degree of freedom, or
+        the curve is not accurate."""
+        geometry, unit, direction = self._geometry, self._unit, self.direction
+        if self._frame.shape[1] != 1 or not self.accuracy < CURVE_ACCURACY:
+            return None
+        v = direction[: len(unit)] * unit
+        if len(direction) > len(unit):  # time passes at its own rate
+            if direction[-1] == 0.0:
+                return None
+            v = v / (direction[-1] * geometry.unit[-1])
+        own = [v - self._off(normal, v) for normal in self._normals]
+        values = [self._quadratic_at(k, x, w) for k, (x, w) in enumerate(zip(self._nodes, own))]
+        along = self._frame[:, 0] / float(self._frame[:, 0] @ direction)
+        nodes = np.array([along @ geometry.difference(self._place, node) for node in self._nodes])
+        return BranchCurve(
+            geometry, self._place, along, nodes, self._normals, np.array(own), np.array(values)
+        )
 
     def multiplier(self, v: FloatArray, free: FloatArray) -> FloatArray:
         """yhat (nv,) at q for the velocity v and the acceleration ``free`` = M^-1 f without

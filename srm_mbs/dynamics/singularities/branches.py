@@ -21,6 +21,8 @@ from srm_mbs.dynamics.singularities.local_analysis import VANISHING, SingularCon
 MOST_STARTS = 400
 STARTS_PER_TANGENT = 40
 """Random starts of Newton's iteration per possible tangent; MOST_STARTS is enough up to k = 4."""
+LARGEST_NULLITY = 12
+"""Nullity up to which branches are searched: with more there are too many to be listed."""
 ITERATIONS = 60
 SOLVED = 1e-13
 ISOLATED = 1e-4
@@ -96,11 +98,13 @@ def branch_tangents(
         Sorted by the angle with ``arriving``, if given.  Empty if no isolated ones were found (a
         singularity of higher order), or where they need an arriving velocity: where a branch has
         more than one direction that the forms see, which with drives is not done at all.  With
-        nullity above 4 some may be missing.
+        nullity above 4 some may be missing, above LARGEST_NULLITY all are.
     """
+    none = np.zeros((0, len(singular.null)))
+    if singular.nullity > LARGEST_NULLITY:
+        return none
     geometry, null, forms = singular.geometry, singular.null, singular.forms
     n, p = null.shape
-    none = np.zeros((0, n))
     flat_forms = forms.reshape(len(forms), p * p)
     _, size, independent = np.linalg.svd(flat_forms, full_matrices=False)
     independent = independent[size > VANISHING]

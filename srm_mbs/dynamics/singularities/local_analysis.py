@@ -38,6 +38,10 @@ PARTICIPATES = 1e-6
 """Share in a left null vector from which a row takes part."""
 SPARE = 8
 """Values of the forms more than there are forms."""
+MIXED_MOTIONS = 8
+"""Mixtures of weak motions whose loss of rank is followed where there are more of them."""
+POLARISED = 16
+"""Coordinates up to which Hessians follow from the bias by polarisation."""
 BRANCH_ITERATIONS = 8
 SEARCH_ITERATIONS = 20
 SEARCH_DIFFERENCE = 1e-6
@@ -93,32 +97,57 @@ def refine_singular_point(
     """
     free = np.arange(len(geometry.unit)) if free is None else free
 
-    def equations(x: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-        g, G = geometry.closure(x)
+    def schur(G: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
         turned = left.T @ (G / geometry.row_size[:, None])[:, free] @ right.T
         strong, up, down = turned[:rank, :rank], turned[:rank, rank:], turned[rank:, :rank]
-        schur = turned[rank:, rank:] - down @ np.linalg.solve(strong, up)
-        return np.concatenate([g, schur.ravel()])
+        return turned[rank:, rank:] - down @ np.linalg.solve(strong, up)
 
-    rows = len(geometry.row_unit)
+    def equations(x: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+        g, G = geometry.closure(x)
+        return np.concatenate([g, schur(G, left, right).ravel()])
+
+    def differences(x: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+        columns = []
+        for e in SEARCH_DIFFERENCE * np.eye(len(free)):
+            ahead, behind = (equations(geometry.move(x, d, free), left, right) for d in (e, -e))
+            columns.append((ahead - behind) / (2.0 * SEARCH_DIFFERENCE))
+        return np.array(columns).T
+
+    def loss_derivatives(x: FloatArray, left: FloatArray, motions: FloatArray) -> FloatArray:
+        # The blocks beside the strong one vanish at x, so that the Schur complement changes as
+        # u^T G w does; and second derivatives of u^T g commute, where moves do.
+        weak, columns = left[:, rank:].T / geometry.row_size, []
+        for w in SEARCH_DIFFERENCE * motions:
+            ahead, behind = (geometry.closure(geometry.move(x, e, free))[1] for e in (w, -w))
+            columns.append(weak @ (ahead - behind)[:, free] / (2.0 * SEARCH_DIFFERENCE))
+        if not columns:
+            return np.zeros((0, len(free)))
+        return np.stack(columns, axis=1).reshape(-1, len(free))
+
     held = np.zeros((len(free), 0)) if fixed is None else fixed
     x, moved = q, np.zeros(len(free))
     for _ in range(SEARCH_ITERATIONS):
-        left, singular, right = np.linalg.svd(geometry.normalised(x)[:, free])
+        g, G = geometry.closure(x)
+        left, singular, right = np.linalg.svd((G / geometry.row_size[:, None])[:, free])
         if not singular[:rank].min(initial=np.inf) > 1e-12:
             return None
-        value = equations(x, left, right)
-        g_size, loss = np.abs(value[:rows]).max(), np.abs(value[rows:]).max(initial=0.0)
-        if g_size <= closed and loss < 1e-13:
+        loss = schur(G, left, right)
+        if np.abs(g).max() <= closed and np.abs(loss).max(initial=0.0) < 1e-13:
             return x
-        jacobian = np.empty((len(value), len(free)))
-        for k, e in enumerate(SEARCH_DIFFERENCE * np.eye(len(free))):
-            ahead = equations(geometry.move(x, e, free), left, right)
-            behind = equations(geometry.move(x, -e, free), left, right)
-            jacobian[:, k] = (ahead - behind) / (2.0 * SEARCH_DIFFERENCE)
+        if geometry.commutes:
+            # With very many weak motions some mixtures of them determine the step.
+            mixed = np.eye(loss.shape[1])
+            if len(mixed) > MIXED_MOTIONS:
+                rng = np.random.default_rng(0)
+                mixed = rng.standard_normal((MIXED_MOTIONS, len(mixed))) / np.sqrt(len(mixed))
+            value = np.concatenate([g, (loss @ mixed.T).ravel()])
+            jacobian = np.concatenate([G[:, free], loss_derivatives(x, left, mixed @ right[rank:])])
+        else:
+            value = np.concatenate([g, loss.ravel()])
+            jacobian = differences(x, left, right)
         system = np.concatenate([jacobian, held.T])
-        right = np.concatenate([value, held.T @ moved])
-        step = np.linalg.lstsq(system, right, rcond=1e-9)[0]
+        wanted = np.concatenate([value, held.T @ moved])
+        step = np.linalg.lstsq(system, wanted, rcond=1e-9)[0]
         x, moved = geometry.move(x, -step, free), moved - step
         if not np.abs(geometry.difference(q, x)).max() < reach:
             return None
@@ -237,6 +266,10 @@ class SingularConfiguration:
         """u_j^T Gdot (n, p, p), symmetric, on the basis ``null``."""
         geometry, q, left, null = self.geometry, self.q, self.left, self.null
         p = null.shape[1]
+        if len(null) > POLARISED:
+            columns = [self.hessians(direction) @ null for direction in null.T]
+            both = np.stack(columns, axis=2) if columns else np.zeros((left.shape[1], 0, 0))
+            return 0.5 * (both + both.transpose(0, 2, 1))
         forms = np.zeros((left.shape[1], p, p))
         for a in range(p):
             forms[:, a, a] = left.T @ geometry.bias(q, null[:, a])
@@ -258,6 +291,12 @@ class SingularConfiguration:
             return self.left
         # As many values of the forms as there are forms determine which combinations vanish; the
         # forms themselves have an entry for every pair of velocities.
+        if len(self.null) > POLARISED:
+            # Of a generic velocity, u_j^T Gdot(v) itself vanishes only with the form.
+            mixed = np.random.default_rng(0).standard_normal(self.null.shape[1])
+            forms = self.hessians(self.null @ mixed / np.sqrt(self.null.shape[1]))
+            turned, size, _ = np.linalg.svd(forms @ self.null, full_matrices=False)
+            return self.left @ turned[:, size > VANISHING]  # type: ignore[no-any-return]
         count = self.left.shape[1] + SPARE
         motions = self.null @ np.random.default_rng(0).standard_normal((self.null.shape[1], count))
         values = np.array([self.curvature(motion) for motion in motions.T]).T
@@ -278,11 +317,27 @@ class SingularConfiguration:
     def hessians(self, u: FloatArray) -> FloatArray:
         """u_j^T Gdot(v) (n, nv) for the rates u (nv,).
 
-        By polarisation of the bias, which is quadratic in the rates: exact, no differences.
+        By polarisation of the bias, which is quadratic in the rates: exact, no differences.  With
+        many coordinates by differences of u_j^T G along the rates, which costs as many evaluations
+        for any number: second derivatives of u_j^T g commute where u_j^T G vanishes.
         """
         bias, q = self.geometry.bias, self.q
+        if len(u) > POLARISED:
+            return self._difference_hessians(u)
         columns = [0.25 * (bias(q, u + e) - bias(q, u - e)) for e in np.eye(len(u))]
         return self.left.T @ np.array(columns).T
+
+    def _difference_hessians(self, u: FloatArray) -> FloatArray:
+        size = float(np.abs(u).max())
+        total = np.zeros((self.left.shape[1], len(u)))
+        if size == 0.0:
+            return total
+        geometry, left = self.geometry, self.left.T / self.geometry.row_size
+        for k, weight in THIRD_ORDER:
+            step = k * TAU / size * u
+            ahead, behind = (geometry.closure(geometry.move(self.q, e))[1] for e in (step, -step))
+            total += weight / TAU * (left @ (ahead - behind))
+        return total * size
 
     def third_derivative(self, u: FloatArray) -> FloatArray:
         """u_j^T D^3 g[v, v, v] (n,) for the rates u (nv,)."""

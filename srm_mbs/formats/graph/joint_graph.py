@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names
 from srm_mbs.model.anchors import WORLD
 
 Direction = tuple[float, float, float]
@@ -252,7 +252,7 @@ def _check_cut(
     known = [joint.name for joint in joints]
     for name in cut:
         if name not in known:
-            raise fault(f"there is no joint {name!r} to cut", f"Known: {', '.join(known)}")
+            raise fault(f"there is no joint {name!r} to cut", known_names(known))
     cutting = f"cutting {', '.join(map(repr, cut))}"
     proposal = f"Left out, cut is {[joint.name for joint in spanning_tree(joints, root).cut]}"
     for joint in candidates:

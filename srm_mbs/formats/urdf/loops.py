@@ -23,6 +23,7 @@ from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.errors import known_names
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
@@ -237,7 +238,7 @@ def _mimic_problem(
 ) -> tuple[str, str] | None:
     """Problem and remedy of a <mimic> that cannot be a coupling."""
     if leader not in joints:
-        return f"there is no joint {leader!r}", f"Known: {', '.join(joints)}"
+        return f"there is no joint {leader!r}", known_names(joints)
     if leader == name:
         return "the joint mimics itself", "Name another joint"
     for joint in (name, leader):

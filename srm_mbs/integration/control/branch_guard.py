@@ -67,6 +67,11 @@ class BranchGuard(ControlWrapper):
         """The inner proposal, halved after a step that has to be redone."""
         return self._inner.propose(t, min(limit, self._limit), memory)
 
+    def moved(self, t: float) -> None:
+        """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
+        super().moved(t)
+        self._limit, self._tries = np.inf, 0
+
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Redo a step that changes the branch; otherwise the inner decision."""
         if result is not None and result.quiet and not self._tries:

@@ -8,6 +8,8 @@ r"""Steps placed so that no stage lies on a singular configuration.
 * sigma changes by at most 0.5 per step;
 * a posteriori, when a stage came too close, the zero is located from the stages of the step and
   the step is redone, at most three times;
+* where the motion turns back next to a singular configuration, or is slow there, steps are not
+  placed: stages may lie anywhere (:mod:`srm_mbs.integration.methods.branch_nodes`);
 * where the run, or its smooth interval, ends beside a singular configuration, steps are not placed:
   the multipliers up to the end are found first (:mod:`srm_mbs.integration.singular_endpoints`).
 
@@ -34,9 +36,14 @@ from srm_mbs.integration.control.step_size import (
 )
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
 
 PREDICTION_STEPS = 3.0
 """Steps within which zeros of sigma are predicted."""
+EXPECTED_STEPS = 1.5
+"""Steps within which a zero of sigma is examined before it is passed."""
+EXPECTED_SIGMA = 0.3
+"""sigma below which it is examined wherever it lies."""
 SIGMA_CHANGE = 0.5
 """Largest change of sigma in one step, by the slope of the last steps."""
 TOO_CLOSE = 0.05
@@ -48,6 +55,14 @@ MAX_REDONE = 3
 SINGULAR_END_SIGMA = 5e-3
 """A run, or its smooth interval, ends beside a singular configuration if sigma is smaller there:
 rounding in direct solves at smaller sigma exceeds the tightest tolerances."""
+TURNING_SIGMA = 0.02
+"""Extreme value of sigma up to which a motion turns back next to a singular configuration, before
+or behind it."""
+TURNING_MISFIT = 0.01
+"""Largest misfit of the parabola that tells so, over the change of sigma: where several loops pass
+singular configurations one after the other, sigma is no parabola."""
+SLOW_SIGMA_CHANGE = 5e-4
+"""Change of sigma per step of a slow motion."""
 ARRIVAL_SIGMA_CHANGE = 0.2
 """Change of sigma up to such an end from where it is prepared for, unless one step reaches
 further."""
@@ -129,6 +144,48 @@ def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
     if zero <= 1.0:
         zero = line
     return float(zero) if 1.0 < zero < PREDICTION_STEPS else None
+
+
+def expected_zero(sigmas: FloatArray, ahead: float | None) -> float | None:
+    """Where sigma is expected to vanish, in steps from the start of the last one: at the zero
+    ``ahead`` if the next step may reach it, or, where sigma is small and falls, on a line.
+
+    Next to an avoided singular configuration steps stay a fraction of their distance to it, and no
+    zero is ever within their reach.
+    """
+    if ahead is not None and ahead < 1.0 + EXPECTED_STEPS:
+        return ahead
+    start, end = float(sigmas[0]), float(sigmas[-1])
+    if not (end < start and end < EXPECTED_SIGMA):
+        return None
+    return start / (start - end)
+
+
+def extreme_sigma(abscissae: FloatArray, middle: int, sigmas: FloatArray) -> float:
+    """The extreme value of the parabola through sigma at the start, the stage ``middle`` and the
+    end of a step, with its sign changed where the step passes a zero; infinite without one, or if
+    sigma at the other stages does not follow it.
+
+    Parameters
+    ----------
+    abscissae, sigmas : (s + 1,)
+        Fractions of the step, and sigma there.
+    """
+    c = float(abscissae[middle])
+    if not 0.1 < c < 0.9:
+        return np.inf
+    start = float(sigmas[0])
+    best, extreme = np.inf, np.inf
+    for sign, last_sign in ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)):
+        end = last_sign * float(sigmas[-1])
+        b = ((sign * float(sigmas[middle]) - start) / c - (end - start)) / (c - 1.0)
+        a = end - start - b
+        off = np.abs(start + abscissae * (a + abscissae * b)) - sigmas
+        misfit = float(off @ off)
+        if misfit < best:
+            best, extreme = misfit, np.inf if b == 0.0 else start - a * a / (4.0 * b)
+    change = float(sigmas.max() - sigmas.min())
+    return extreme if np.sqrt(best / len(sigmas)) <= TURNING_MISFIT * change else np.inf
 
 
 class Arrival(IntEnum):
@@ -224,11 +281,15 @@ class SingularityPlacement(ControlWrapper):
         self._middle = scheme.middle
         self._slope = 0.0
         self._zero: float | None = None
+        self._expected: float | None = None
         self._redo: float | None = None
         self._redone = 0
         self._watched = Arrival.WATCHED if arrivals and inner.adaptive else Arrival.NONE
         self._arrival = self._watched
         self._known = False
+        self._lingering = False
+        self._turning = False
+        self._lost_branch = False
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where a stage would come too close."""
@@ -240,6 +301,9 @@ class SingularityPlacement(ControlWrapper):
             if longest < limit:
                 limit = longest
         proposal = self._inner.propose(t, limit, memory)
+        self._lingering = memory.lingering = self._lingers(proposal, memory)
+        if self._lingering:
+            return proposal
         if self._arrives(t, proposal):
             self._arrival = Arrival.NONE
             return replace(proposal, singular_arrival=True)
@@ -258,6 +322,29 @@ class SingularityPlacement(ControlWrapper):
         """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
         super().set_target_time(end, grid)
         self._arrival = self._watched
+
+    def moved(self, t: float) -> None:
+        """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
+        super().moved(t)
+        self._zero = self._redo = self._expected = None
+        self._redone = 0
+
+    def next_zero(self) -> float | None:
+        """See :class:`~srm_mbs.integration.control.step_size.StepSizeControl`."""
+        return self._expected
+
+    def _lingers(self, proposal: Proposal, memory: IntegratorState) -> bool:
+        """Whether stages next to a singular configuration are to be solved by nodes of the branch:
+        the motion turns back there, or is slow."""
+        history = memory.history
+        if self._lost_branch or history is None or history.known_until >= proposal.t_new:
+            return False
+        if not self.adaptive:
+            return history.away is not None
+        if not memory.sigma < WATCHED_SIGMA:
+            return False
+        # Where nodes solved the last state, sigma at stages off the branch need not be a parabola.
+        return self._turning or history.away is not None
 
     def _arrives(self, t: float, proposal: Proposal) -> bool:
         """Whether the end beside a singular configuration is to be prepared for."""
@@ -309,12 +396,17 @@ class SingularityPlacement(ControlWrapper):
         else:
             h = proposal.h
             slope = sigma_slope(self._inverse, result.sigmas, h)
+            if self._lingering and result.lost_branch:
+                self._lost_branch, self._redo = True, h
+                self.replaced += 1
+                return StepDecision.REPLACED
             last = proposal.t_new >= self._t_end
-            if last and self._arrival is Arrival.WATCHED and result.sigmas[-1] < SINGULAR_END_SIGMA:
+            ends_beside = last and result.sigmas[-1] < SINGULAR_END_SIGMA
+            if ends_beside and self._arrival is Arrival.WATCHED and not self._lingering:
                 self._arrival, self._redo = Arrival.DUE, h
                 self.replaced += 1
                 return StepDecision.REPLACED
-            if self._redone < MAX_REDONE and not self._known:
+            if self._redone < MAX_REDONE and not (self._known or self._lingering):
                 better = self._better_step(h, result.sigmas, slope, last)
                 if better is not None and 0.0 < better < h:
                     self._redo = better
@@ -327,10 +419,18 @@ class SingularityPlacement(ControlWrapper):
         if decision is StepDecision.ACCEPTED and result is not None:
             slowest = 0.5 * self._slope
             self._slope = slope if slope > slowest else slowest
-            self._zero = None
+            self._zero = self._expected = None
+            self._turning = False
+            self._lost_branch = self._lost_branch and not result.quiet
             if not result.quiet:
+                if result.sigmas[-1] < WATCHED_SIGMA:
+                    extreme = extreme_sigma(self._abscissae, self._middle[0], result.sigmas)
+                    slow = self._slope * proposal.h < SLOW_SIGMA_CHANGE
+                    self._turning = slow or abs(extreme) < TURNING_SIGMA
                 ahead = zero_ahead(*self._middle, result.sigmas)
                 self._zero = None if ahead is None else result.t + proposal.h * ahead
+                expected = expected_zero(result.sigmas, ahead)
+                self._expected = None if expected is None else result.t + proposal.h * expected
         return decision
 
 

@@ -88,6 +88,12 @@ class StepSizeControl(Protocol):
         With ``grid`` fixed steps count from its start; other controls have none.
         """
 
+    def moved(self, t: float) -> None:
+        """The run is at ``t`` (s) by steps that no control proposed."""
+
+    def next_zero(self) -> float | None:
+        """When (s) sigma is expected to vanish; None if that is not to be seen."""
+
 
 class ControlWrapper:
     """Step-size control around ``inner``, which decides unless a subclass does.
@@ -122,6 +128,14 @@ class ControlWrapper:
         """See :class:`StepSizeControl`."""
         self._t_end = end
         self._inner.set_target_time(end, grid)
+
+    def moved(self, t: float) -> None:
+        """See :class:`StepSizeControl`."""
+        self._inner.moved(t)
+
+    def next_zero(self) -> float | None:
+        """See :class:`StepSizeControl`."""
+        return self._inner.next_zero()
 
     def suspect_times(self) -> list[float]:
         """Times (s) up to which the motion may have changed its branch: none."""
@@ -195,6 +209,13 @@ class PIControl:
         """See :class:`StepSizeControl`."""
         self._t_end = end
 
+    def moved(self, t: float) -> None:
+        """See :class:`StepSizeControl`: the step that the error allows stays."""
+
+    def next_zero(self) -> float | None:
+        """See :class:`StepSizeControl`."""
+        return None
+
 
 class FixedStep:
     """Steps on a grid t0 + i step; a shortened step returns to the grid.
@@ -226,9 +247,17 @@ class FixedStep:
         """Accept every step that could be evaluated."""
         if result is None or not np.isfinite(result.state).all():
             return StepDecision.REJECTED
-        while proposal.t_new >= self._t0 + self._index * self._step - self._sliver():
-            self._index += 1
+        self.moved(proposal.t_new)
         return StepDecision.ACCEPTED
+
+    def moved(self, t: float) -> None:
+        """See :class:`StepSizeControl`: the next step ends on the next grid point."""
+        while t >= self._t0 + self._index * self._step - self._sliver():
+            self._index += 1
+
+    def next_zero(self) -> float | None:
+        """See :class:`StepSizeControl`."""
+        return None
 
     def _sliver(self) -> float:
         """Distance (s) before a grid point that is not worth a step."""

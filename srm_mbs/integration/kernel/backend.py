@@ -10,7 +10,7 @@ from functools import cache
 
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, get_logger, warn
+from srm_mbs.errors import InputError, get_logger, safe_repr, warn
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
@@ -59,7 +59,7 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
     if not (isinstance(method, PSRM) and method.correction == "split"):
         return "it has the split PSRM only"
     if placement not in PLACEMENTS:
-        return f"it has no placement {placement!r}"
+        return f"it has no placement {safe_repr(placement)}"
     if len(singular_times):
         return "it has no given singular times"
     return None
@@ -77,7 +77,7 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
     """
     if not isinstance(asked, str) or asked not in BACKENDS:
         raise InputError(
-            f"there is no backend {asked!r}",
+            f"there is no backend {safe_repr(asked)}",
             element="backend",
             remedy=f"Known: {', '.join(BACKENDS)}",
         )

@@ -41,7 +41,7 @@ class CompiledDenseOutput(DenseOutput):
     kernel_system
         The kernel system of the run; None where any idle one of the mechanism serves
         (:func:`~srm_mbs.integration.kernel.system.shared`), so that results hold no workspace.
-    system, scheme, steps
+    system, scheme, steps, end_state
         As for :class:`~srm_mbs.integration.dense_output.DenseOutput`.
     """
 
@@ -51,11 +51,12 @@ class CompiledDenseOutput(DenseOutput):
         system: ClosedSystem | OpenSystem,
         scheme: ButcherTableau,
         steps: StepData,
+        end_state: FloatArray | None = None,
     ) -> None:
-        super().__init__(system, scheme, steps)
+        super().__init__(system, scheme, steps, end_state)
         self._mechanism_system = system
         self._scheme = scheme
-        self._kernel_system = kernel_system
+        self.kernel_system = kernel_system
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy may be loaded where there is no kernel.
@@ -67,8 +68,8 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return super().__call__(t)
         try:
-            if self._kernel_system is not None:
-                return self._states(self._kernel_system, t)
+            if self.kernel_system is not None:
+                return self._states(self.kernel_system, t)
             with workspace(self._mechanism_system) as kernel_system:
                 return self._states(kernel_system, t)
         except ArithmeticError:
@@ -90,13 +91,13 @@ class CompiledDenseOutput(DenseOutput):
     def _by_reference(self) -> bool:
         """Whether only the reference can evaluate it."""
         steps, extension = self._steps, self._extension
-        if steps.count < 2:  # a single step has no neighbours, but perhaps a zone
+        if not steps.count:
             return True
         if len(extension.extra_c) and steps.rates.shape[1] == extension.n_rates:
             return True  # loaded without the controller: no stage is to be evaluated
         # In a step between two breakpoints the state follows from extra stages, which have no zone
         # in the kernel.
-        intervals = (steps.smooth_interval(step) for step in steps.zones)
+        intervals = (steps.smooth_interval(step) for step in steps.between_nodes)
         return any(last - first < 2 for first, last in intervals)
 
     @cached_property

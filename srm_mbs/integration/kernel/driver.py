@@ -13,9 +13,10 @@ from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler
+from srm_mbs.integration.critical_passages import CriticalPassages
 from srm_mbs.integration.dense_output import StepData
-from srm_mbs.integration.driver import RunRecord, Tick
-from srm_mbs.integration.events import EventWatch
+from srm_mbs.integration.driver import RunRecord, StepSink, Tick
+from srm_mbs.integration.events import EventWatch, Stop, step_dense
 from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
 from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.messages import RunFailure, StopReason
@@ -45,7 +46,8 @@ class CompiledRecord(RunRecord):
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        return steps_from(self.run.take_records(self.t0, self.x0), self.stop)
+        start = (self.t0, self.x0) if self.rest is None else self.rest
+        return steps_from(self.run.take_records(*start), self.stop)
 
 
 def integrate(
@@ -55,6 +57,8 @@ def integrate(
     tick: Tick | None = None,
     events: EventWatch | None = None,
     passing: BreakpointHandler | None = None,
+    passages: CriticalPassages | None = None,
+    sink: StepSink | None = None,
 ) -> CompiledRecord:
     """As :func:`srm_mbs.integration.driver.integrate`, on the kernel.
 
@@ -67,8 +71,12 @@ def integrate(
         or one.
     passing
         Handles breakpoints, if there are any.
+    passages
+        Makes the passages of critical configurations that steps cannot make.
+    sink
+        Takes the steps; they remain in the record without one.
     """
-    start = run.start
+    t_start, start = run.t0, run.start
     record = CompiledRecord(run.t0, start, run=run)
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
@@ -77,14 +85,26 @@ def integrate(
             events.begin(run.t0, start)
         reason = ReturnReason.CHUNK_FULL
         while reason is not ReturnReason.FINISHED:
+            if sink is not None and run.count >= sink.block:
+                sink.take(record.data(run.method.scheme, system.tangent_size))
+                record.rest = run.t, run.state
             made = run.count
             stride = getattr(tick, "stride", 1) if events is None else 1  # a tick may change it
-            reason = run.advance(stride if one_by_one else 0)
+            block = 0 if sink is None else sink.block - made
+            reason = run.advance(stride if one_by_one else block)
             if reason is ReturnReason.BREAKPOINT and passing is not None:
                 run.pass_breakpoint(passing)
                 continue
             if reason is ReturnReason.ARRIVAL and passing is not None:
                 run.arrive(passing)
+                continue
+            if reason is ReturnReason.PASSAGE and passages is not None:
+                stop = _pass_critical(system, run, passages, tick, events)
+                if stop is not None:
+                    record.mark_stopped(stop)
+                    break
+                t_start, start = run.t, run.state
+                reason = ReturnReason.CHUNK_FULL if run.t < run.t_end else ReturnReason.FINISHED
                 continue
             if reason not in (ReturnReason.CHUNK_FULL, ReturnReason.FINISHED):
                 failure = why_stopped(reason, system, run)
@@ -92,14 +112,17 @@ def integrate(
                 break
             if not one_by_one or run.count == made:
                 continue
-            result, t = run.last(), run.t
-            stop = None if events is None else events.after_step(start, result, t)
-            start = result.state
-            if stop is not None:
-                record.mark_stopped(stop)
-                break
+            t, state = run.t, run.state
+            if events is not None:
+                if passing is not None:
+                    passing.follow(run.interval)
+                stop = events.after_step(t_start, start, t, state, run.step_dense(system, start))
+                if stop is not None:
+                    record.mark_stopped(stop)
+                    break
+            t_start, start = t, state
             if tick is not None:
-                driver.call_progress(tick, t, result.h, result.state)
+                driver.call_progress(tick, t, run.h, state)
         else:
             record.mark_finished(run.t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
@@ -113,13 +136,40 @@ def integrate(
     return record
 
 
+def _pass_critical(
+    system: ClosedSystem | OpenSystem,
+    run: CompiledRun,
+    passages: CriticalPassages,
+    tick: Tick | None,
+    events: EventWatch | None,
+) -> Stop | None:
+    """Make the passage before which the kernel returned, if steps cannot: why the run ends on the
+    way, or None."""
+    start, memory, end = run.state, run.memory(), run.interval_end
+    past = passages.steps_past(run.t, start, memory.rate, run.passage_time, end)
+    for step, t_new in past:
+        run.append(step, t_new)
+        run.method.accept(memory, step)
+        if events is not None:
+            dense = step_dense(system, run.method.scheme, start, step, t_new)
+            stop = events.after_step(step.t, start, t_new, step.state, dense)
+            if stop is not None:
+                return stop
+        start = step.state
+        if tick is not None:
+            driver.call_progress(tick, t_new, step.h, start)
+    if past:
+        run.move_to(past[-1][1], memory)
+    return None
+
+
 def why_stopped(
     reason: ReturnReason, system: ClosedSystem | OpenSystem, run: CompiledRun
 ) -> RunFailure:
     """The reason why the kernel stopped, from the reference, which repeats the failed attempt."""
     attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
     if reason is ReturnReason.STANDSTILL:
-        return driver.standstill(run.t - run.time_before(driver.WATCHED_STEPS))
+        return driver.standstill(run.t - run.watched_time)
     if reason is ReturnReason.CLOSURES:
         failure = driver.Closures(system, run.norm).failure(run.last())
         return failure or RunFailure.of(StopReason.ERROR_ESTIMATE)

@@ -15,12 +15,19 @@ import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
-from srm_mbs.integration import breakpoints, dense_output, driver, singular_endpoints
+from srm_mbs.dynamics.singularities import critical
+from srm_mbs.integration import (
+    breakpoints,
+    critical_passages,
+    dense_output,
+    driver,
+    singular_endpoints,
+)
 from srm_mbs.integration.breakpoints import SmoothIntervals
 from srm_mbs.integration.control import branch_guard, placement, step_size
 from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.dense_output import StepData
-from srm_mbs.integration.methods import near_singular, split_step
+from srm_mbs.integration.methods import branch_nodes, near_singular, split_step
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
@@ -55,6 +62,17 @@ def constants() -> Any:
         direct_hit=near_singular.DIRECT_HIT_SIGMA,
         max_projections=near_singular.MAX_PROJECTIONS,
         min_history=near_singular.MIN_PREDICTION_NODES,
+        # Branch nodes.
+        known_direction=branch_nodes.KNOWN_DIRECTION_SIGMA,
+        direction_probe=branch_nodes.DIRECTION_PROBE,
+        node_spacing=branch_nodes.NODE_SPACING,
+        node_doublings=branch_nodes.SPACING_DOUBLINGS,
+        node_sigma=branch_nodes.FIRST_NODE_SIGMA,
+        node_iterations=branch_nodes.MAX_CLOSINGS,
+        node_closing=branch_nodes.LARGEST_CLOSING,
+        node_accuracy=branch_nodes.CLOSING_ACCURACY,
+        node_misfit=branch_nodes.LARGEST_MISFIT,
+        branch_below=branch_nodes.BRANCH_SIGMA,
         residual_interval=split_step.RESIDUAL_EVERY,
         # Step-size control.
         safety=step_size.SAFETY,
@@ -76,6 +94,9 @@ def constants() -> Any:
         max_placements=placement.MAX_REDONE,
         singular_end=placement.SINGULAR_END_SIGMA,
         arrival_sigma_change=placement.ARRIVAL_SIGMA_CHANGE,
+        turning_sigma=placement.TURNING_SIGMA,
+        turning_misfit=placement.TURNING_MISFIT,
+        slow_sigma_change=placement.SLOW_SIGMA_CHANGE,
         # Branch guard.
         branch_change=branch_guard.VELOCITY_JUMP,
         max_guard_retries=branch_guard.MAX_REDONE,
@@ -89,6 +110,18 @@ def constants() -> Any:
         search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
         search_factor=breakpoints.REPEATED_SEARCH_SIGMA,
         rounding_share=breakpoints.FIRST_STAGE_ERROR,
+        # Critical configurations.
+        critical_iterations=critical.ITERATIONS,
+        critical_difference=critical.DIFFERENCE,
+        critical_converged=critical.DECIDED,
+        critical_accepted=critical.DECIDED,
+        critical_frozen=critical.FROZEN,
+        critical_ridge=critical.RIDGE,
+        critical_reach=critical_passages.SEARCH,
+        critical_passed=critical_passages.PASSED,
+        rounded_residual=critical_passages.ROUNDED_RESIDUAL,
+        expected_steps=placement.EXPECTED_STEPS,
+        expected_sigma=placement.EXPECTED_SIGMA,
     )
 
 
@@ -126,6 +159,7 @@ def history_struct(history: MultiplierHistory) -> Any:
         known_until=history.known_until,
         known_below=history.known_below,
         normals=_NO_NUMBERS if normals is None else np.ascontiguousarray(normals.T),
+        away=_NO_NUMBERS if history.away is None else history.away,
     )
 
 
@@ -139,6 +173,7 @@ def history_from(struct: Any) -> MultiplierHistory:
         struct.known_until,
         struct.known_below,
         normals.T if len(normals) else None,
+        struct.away if len(struct.away) else None,
     )
 
 
@@ -151,6 +186,7 @@ def state_struct(memory: IntegratorState) -> Any:
         sigma=memory.sigma,
         sigma_slope=memory.sigma_slope,
         steps=memory.steps,
+        lingering=memory.lingering,
         history=None if history is None else history_struct(history),
     )
 
@@ -165,6 +201,7 @@ def state_from(struct: Any) -> IntegratorState:
         None if history is None else history_from(history),
         struct.sigma_slope,
         struct.steps,
+        struct.lingering,
     )
 
 
@@ -178,6 +215,8 @@ _CONTROL_START = {
     "redo": 0.0,
     "redone": 0,
     "arrival": 0,
+    "turning": False,
+    "lost_branch": False,
     "limit": np.inf,
     "tries": 0,
 }
@@ -202,20 +241,22 @@ def options_struct(
     *,
     t0: float,
     step: float | None,
-    first_step: float,
+    first_step: float | None,
     max_step: float,
     placed: str,
     arrivals: bool,
+    examines: bool,
     eps: Regularisation | None,
 ) -> Any:
     """``RunOptions`` of run.hpp."""
     return _core.RunOptions(
         t0=t0,
         step=0.0 if step is None else step,
-        first_step=first_step,
+        first_step=0.0 if first_step is None else float(first_step),
         max_step=max_step,
         placement=placed,
         arrivals=arrivals,
+        examines=examines,
         eps_factor=0.0 if eps is None else eps.factor,
         eps_power=0.0 if eps is None else eps.power,
     )
@@ -237,9 +278,16 @@ def dense_constants() -> Any:
         nodes=list(dense_output.HERMITE_NODES),
         spacing=dense_output.NODE_SPACING,
         close=dense_output.CLOSE_SIGMA,
+        branch_below=branch_nodes.BRANCH_SIGMA,
         probes=dense_output.COMPARED_AT,
         slack=dense_output.TIME_TOLERANCE,
     )
+
+
+@lru_cache(maxsize=64)
+def dense_structs(scheme: ButcherTableau) -> tuple[list[float], Any, Any]:
+    """Abscissae, ``Extension`` and ``DenseConstants`` for the dense output of one step."""
+    return scheme.abscissae.tolist(), extension_struct(scheme.dense), dense_constants()
 
 
 _STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate")
@@ -252,19 +300,21 @@ def steps_struct(steps: StepData) -> Any:
         **{name: getattr(steps, name) for name in _STEP_ARRAYS},
         break_rates=steps.break_rates.reshape(len(steps.breaks), len(steps.end_rate)),
         breaks=steps.breaks.tolist(),
-        zones=list(steps.zones),
+        zones=steps.between_nodes,
         end=steps.end,
     )
 
 
 def steps_from(records: Any, stop: float | None) -> StepData:
     """The accepted steps in ``StepRecords`` of the kernel; its arrays are not copied."""
+    breaks = records.breaks.astype(int)
+    inside = breaks > 0  # others end steps that were taken before
     return StepData(
         **{name: getattr(records, name) for name in (*_STEP_ARRAYS, *_STEP_NUMBERS)},
         zones={zone.step: (zone.threshold, history_from(zone.history)) for zone in records.zones},
         stop=stop,
-        breaks=records.breaks.astype(int),
-        break_rates=records.break_rates,
+        breaks=breaks[inside],
+        break_rates=records.break_rates[inside] if len(breaks) else records.break_rates,
     )
 
 

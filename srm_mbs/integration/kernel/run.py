@@ -8,10 +8,11 @@ from typing import Any
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import Zone
+from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration import driver, singular_endpoints
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals
 from srm_mbs.integration.control.step_size import StepDecision
+from srm_mbs.integration.events import StepDense, step_dense
 from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.kernel.marshalling import CONSTANTS, DECISIONS
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
@@ -43,6 +44,8 @@ class ReturnReason(IntEnum):
     """The next smooth interval begins."""
     ARRIVAL = 7
     """The end lies next to a singular configuration."""
+    PASSAGE = 8
+    """A step would pass a critical configuration that has a residual."""
 
 
 class CompiledRun:
@@ -59,11 +62,20 @@ class CompiledRun:
     t0
         Start of the run (s).
     step, first_step, max_step
-        Fixed step or None, first and longest step of step-size control (s).
+        Fixed step or None, first and longest step of step-size control (s); without a first one,
+        the one that the start allows, as
+        :func:`~srm_mbs.integration.control.step_size.initial_step` has it.
     placed
         ``"automatic"`` or ``"off"``.
     arrivals
         Whether the kernel returns before an end next to a singular configuration.
+    examines
+        Whether the kernel returns before a critical configuration that has a residual.
+
+    Raises
+    ------
+    ArithmeticError
+        If the first step cannot be evaluated.
     """
 
     def __init__(
@@ -77,10 +89,11 @@ class CompiledRun:
         *,
         t0: float = 0.0,
         step: float | None,
-        first_step: float,
+        first_step: float | None,
         max_step: float,
         placed: str,
         arrivals: bool = False,
+        examines: bool = False,
     ) -> None:
         self.kernel_system, self.method, self.norm = kernel_system, method, norm
         self.start, self.t0, self.t_end = state.copy(), t0, float(intervals.ends[-1])
@@ -92,6 +105,7 @@ class CompiledRun:
             max_step=max_step,
             placed=placed,
             arrivals=arrivals,
+            examines=examines,
             eps=method.regularisation,
         )
         self._run = core.Run(  # type: ignore[union-attr]
@@ -145,6 +159,25 @@ class CompiledRun:
             constraint_residual=r.residual,
         )
 
+    def step_dense(self, system: System, start: FloatArray) -> StepDense:
+        """Dense output of the step made last, from the state ``start``."""
+        scheme, t = self.method.scheme, self._run.t
+
+        def by_reference() -> StepDense:
+            return step_dense(system, scheme, start, self.last(), t)
+
+        if self._run.last().in_zone:
+            return by_reference()
+        compiled = self._run.step_dense(start, *marshalling.dense_structs(scheme))
+
+        def states(times: FloatArray) -> FloatArray:
+            try:
+                return compiled(times)  # type: ignore[no-any-return]
+            except ArithmeticError:  # the reference raises the error that says why
+                return by_reference()(times)
+
+        return states
+
     def memory(self) -> IntegratorState:
         """The state of the integrator before the next step."""
         return marshalling.state_from(self._run.memory())
@@ -175,6 +208,22 @@ class CompiledRun:
         """Prepare for the end next to a singular configuration before which the kernel returned."""
         run = self._run
         self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.interval))
+
+    def append(self, step: StepResult, t_new: float) -> None:
+        """Record a ``step`` that ends at ``t_new`` (s), made by the reference."""
+        self._run.append(
+            t_new,
+            step.state,
+            step.rates,
+            step.end_rate,
+            step.sigmas,
+            step.state_scale,
+            step.rank,
+        )
+
+    def move_to(self, t: float, memory: IntegratorState) -> None:
+        """Go on from ``t`` (s), where such steps have led."""
+        self._run.move_to(t, marshalling.state_struct(memory))
 
     def remember(self, memory: IntegratorState) -> None:
         """Start the next step from ``memory``."""

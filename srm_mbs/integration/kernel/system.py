@@ -11,14 +11,9 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
-from srm_mbs.integration.control.step_size import initial_step
-from srm_mbs.integration.kernel.marshalling import (
-    CONSTANTS,
-    norm_struct,
-    state_struct,
-    system_struct,
-)
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
+from srm_mbs.integration.kernel.branch_motion import CompiledNodes
+from srm_mbs.integration.kernel.marshalling import system_struct
+from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 KEPT = 4
@@ -62,11 +57,19 @@ def workspace(system: ClosedSystem | OpenSystem) -> Iterator[Any]:
 
     It returns to the pool afterwards, if it is :func:`shared` and there are not KEPT already.  One
     whose user raised is left to the garbage collector.
+
+    A program that ends waits for the user's thread, which sleeps from its next call of the kernel
+    on: its Python code between such calls may be in C++ of a library, where CPython's end of a
+    daemon thread aborts the program.
     """
-    kernel_system = _idle_or_new(system)
-    yield kernel_system
-    if shared(system):
-        idle_workspaces(system.mechanism).append(kernel_system)
+    core.enter_python()  # type: ignore[union-attr]
+    try:
+        kernel_system = _idle_or_new(system)
+        yield kernel_system
+        if shared(system):
+            idle_workspaces(system.mechanism).append(kernel_system)
+    finally:
+        core.leave_python()  # type: ignore[union-attr]
 
 
 def _idle_or_new(system: ClosedSystem | OpenSystem) -> Any:
@@ -117,22 +120,9 @@ class Evaluator:
         self._system.between(first, last)
         self._kernel_system.between(first, last)
 
-    def first_step(
-        self,
-        state: FloatArray,
-        memory: IntegratorState,
-        norm: ErrorNorm,
-        span: float,
-        order: int,
-        t: float,
-    ) -> float:
-        """:func:`~srm_mbs.integration.control.step_size.initial_step`, in the kernel."""
-        try:
-            return self._kernel_system.first_step(  # type: ignore[no-any-return]
-                t, state, state_struct(memory), norm_struct(norm), span, order, CONSTANTS
-            )
-        except ArithmeticError:  # the reference raises the error that says why
-            return initial_step(self, state, memory, norm, span, order, t)
+    def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
+        """Makes the nodes of the motion next to a singular configuration."""
+        return CompiledNodes(self._kernel_system, norm)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""

@@ -77,6 +77,9 @@ class IntegratorState:
         |d sigma / dt| (1/s) seen by step-size control; it widens the zone for fast passages.
     steps
         Number of accepted steps.
+    lingering
+        Whether the motion turns back next to a singular configuration, or is slow there, so that
+        its stages are solved by nodes of the branch.
     """
 
     rate: FloatArray
@@ -85,6 +88,7 @@ class IntegratorState:
     history: MultiplierHistory | None = None
     sigma_slope: float = 0.0
     steps: int = 0
+    lingering: bool = False
 
     def set_first_stage(
         self, rate: FloatArray, multiplier: FloatArray, history: MultiplierHistory
@@ -127,8 +131,9 @@ class StepResult:
     multiplier : (m,) or None
         yhat at the end point; None if the end point lies in the zone.
     placement
-        How the driver placed it around a singular configuration: ``""``, ``"a priori"`` or
-        ``"redone"``.
+        How the driver placed it around a singular configuration: ``""``, ``"a priori"``,
+        ``"redone"``, or ``"critical"`` for the motion from node to node past a critical
+        configuration (:mod:`srm_mbs.integration.critical_passages`).
     quiet
         Whether the whole step is so far from singular configurations that no check is needed.
     slope
@@ -140,6 +145,10 @@ class StepResult:
         Whether a stage lingered next to a singular configuration and was held on its branch.
     normals
         Normals of the closures at an end point next to a singular configuration, else None.
+    away : (nv,) or None
+        Direction of the branch at an end point that its nodes solved.
+    lost_branch
+        Whether nodes of the branch were wanted and not found.
     """
 
     t: float
@@ -161,6 +170,8 @@ class StepResult:
     constraint_residual: float = 0.0
     held: bool = False
     normals: FloatArray | None = None
+    away: FloatArray | None = None
+    lost_branch: bool = False
 
 
 class Method(Protocol):

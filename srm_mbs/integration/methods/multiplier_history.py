@@ -35,6 +35,9 @@ class MultiplierHistory:
     normals
         Of the last node, if it lies next to a singular configuration; see
         :class:`~srm_mbs.dynamics.system.Zone`.
+    away : (nv,) or None
+        Direction of the branch at the last node, if nodes of the branch solved it; see
+        :mod:`~srm_mbs.integration.methods.branch_nodes`.
     """
 
     times: FloatArray
@@ -42,6 +45,7 @@ class MultiplierHistory:
     known_until: float = -np.inf
     known_below: float = 0.0
     normals: FloatArray | None = None
+    away: FloatArray | None = None
 
     @classmethod
     def begin(cls, t: float, value: FloatArray) -> MultiplierHistory:
@@ -58,7 +62,11 @@ class MultiplierHistory:
         return MultiplierHistory(self.times[:0], self.values[:0])
 
     def extended(
-        self, t: float, value: FloatArray, normals: FloatArray | None = None
+        self,
+        t: float,
+        value: FloatArray,
+        normals: FloatArray | None = None,
+        away: FloatArray | None = None,
     ) -> MultiplierHistory:
         """With the multiplier ``value`` (nv,) at ``t`` added; the newest ``KEPT_NODES`` nodes.
 
@@ -67,7 +75,7 @@ class MultiplierHistory:
         before = self.times < t
         times = np.concatenate([self.times[before], [t]])[-KEPT_NODES:]
         values = np.concatenate([self.values[before], value[None]])[-KEPT_NODES:]
-        return MultiplierHistory(times, values, normals=normals)
+        return MultiplierHistory(times, values, normals=normals, away=away)
 
     def _around(self, t: float) -> slice:
         """The nodes to use at ``t``: all, unless there are more than WINDOW."""

@@ -92,6 +92,9 @@ class BranchStages:
         The multipliers that the zone of the step predicts from; None for sweeps that need no zone.
     end
         End of the step (s).
+    lingering
+        Whether the motion lingers: its stages next to the singular configuration are solved by
+        nodes of the branch.
 
     Attributes
     ----------
@@ -119,6 +122,7 @@ class BranchStages:
     sigma_change: float
     history: MultiplierHistory | None
     end: float
+    lingering: bool = field(default=False, kw_only=True)
     near: bool = field(init=False)
     zone: Zone | None = field(init=False)
     inaccurate_below: float = field(init=False)
@@ -128,25 +132,26 @@ class BranchStages:
     def __post_init__(self) -> None:
         self.floor = np.zeros_like(self.weights)
         # All stages of a step or none: a mixture of both loses the order.
-        self.near = self.memory.sigma < self.reach()
+        self.near = self.memory.sigma < self.reach() or self.lingering
         threshold = LARGEST_ZONE_SIGMA
-        lingering = False
+        holds = False
         self.inaccurate_below = 0.0
         if self.memory.sigma < WATCHED_SIGMA + NEAR_STEPS * self.sigma_change:
             threshold = self.known_from(1.0)
-            lingering = threshold < LARGEST_ZONE_SIGMA and self.lingers(threshold)
+            holds = threshold < LARGEST_ZONE_SIGMA and self.holding_suffices(threshold)
             # The tolerance alone determines the zone; its predictions and projections need to be
             # as accurate as rounding allows.
-            self.floor = self._floor()
-            self.weights = self.weights + self.floor
+            if not self.lingering:
+                self.floor = self._floor()
+                self.weights = self.weights + self.floor
             uncertain = self.uncertainty()
-            if uncertain > 1.0 and not lingering:
+            if uncertain > 1.0 and not holds:
                 # A prediction that errs by more than the tolerance is no better than a direct
                 # solve that does.
                 self.inaccurate_below = threshold
                 threshold = self.known_from(uncertain)
         self.zone = zone_from(self.history, threshold, self.end)
-        if self.zone is not None and lingering:
+        if self.zone is not None and holds:
             self.zone = replace(self.zone, predict=lambda _: None)
 
     def reach(self) -> float:
@@ -223,14 +228,19 @@ class BranchStages:
         return np.minimum(USUAL_ROUNDING * noise, LARGEST_FLOOR * self.norm.one)
 
     def widened(
-        self, weights: FloatArray, scheme: ButcherTableau, sigmas: FloatArray
+        self,
+        weights: FloatArray,
+        scheme: ButcherTableau,
+        sigmas: FloatArray,
+        direct_from: float = 0.0,
     ) -> FloatArray:
         """``weights`` (n,), increased by the effect of rounding on the error estimate of a step of
-        ``scheme`` with ``sigmas`` (s + 1,) at its stages."""
+        ``scheme`` with ``sigmas`` (s + 1,) at its stages, solved directly from ``direct_from`` on.
+        """
         weights = weights + self.floor
         # Below the threshold of the zone nothing is solved for directly.  Where that is smaller
         # than the tolerance requires, shorter steps predict better, and rounding does not count.
-        least = 0.0 if self.zone is None else self.zone.threshold
+        least = max(direct_from, 0.0 if self.zone is None else self.zone.threshold)
         direct = min((sigma for sigma in sigmas[1:].tolist() if sigma >= least), default=np.inf)
         lowest = max(direct, self.inaccurate_below)
         if scheme.error is None or not 0.0 < lowest < NEAR_STEPS * self.sigma_change:
@@ -239,7 +249,7 @@ class BranchStages:
         wide: FloatArray = weights + np.abs(scheme.error).max() * noise
         return wide
 
-    def lingers(self, threshold: float) -> bool:
+    def holding_suffices(self, threshold: float) -> bool:
         """Whether the motion is so slow that holding it tangential to the normals of the last node,
         at ``threshold``, causes an error, |a| threshold + v^2, well below the tolerance."""
         part = self.system.multiplier_part

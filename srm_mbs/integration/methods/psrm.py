@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.split_step import SplitStep
@@ -94,8 +94,8 @@ class PSRM(DelegatingMethod):
             object.__setattr__(self, "correction", forms[0])
         if self.correction not in forms:
             raise InputError(
-                f"there is no PSRM with prediction={self.prediction!r}, "
-                f"correction={self.correction!r}",
+                f"there is no PSRM with prediction={safe_repr(self.prediction)}, "
+                f"correction={safe_repr(self.correction)}",
                 element="method",
                 remedy='Use prediction="exact" with correction="split", "sweep" or "fused", or '
                 'prediction="simple" with correction="sweep"',

@@ -24,8 +24,10 @@ from functools import lru_cache
 import numpy as np
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
+from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA, StageNodes
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import (
@@ -86,10 +88,16 @@ class SplitStep:
         history, start = memory.history, memory.sigma
         sigma_change = h * memory.sigma_slope
         branch: BranchStages | None = None
+        nodes: StageNodes | None = None
         zone = None
         if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
             weights = norm.weights(memory.state_scale)
-            branch = BranchStages(system, memory, norm, weights, h, sigma_change, history, t + h)
+            if memory.lingering and theta == 1.0 and isinstance(system, ClosedSystem):
+                nodes = StageNodes(system, t, state, history.away)
+            lingers = nodes is not None
+            branch = BranchStages(
+                system, memory, norm, weights, h, sigma_change, history, t + h, lingering=lingers
+            )
             zone = branch.zone
 
         # Stages.  Zeros, because each stage weighs all s rates: those still to come with 0.
@@ -101,22 +109,34 @@ class SplitStep:
         for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
             delta = stage_weights.dot(weighed)
             x = system.retract(state, delta)
-            terms = system.evaluate(t + fraction * h, x, zone)
+            time = t + fraction * h
+            terms = system.evaluate(time, x, zone if nodes is None else None)
             all_sigmas.append(terms.sigma)
+            on_branch = nodes is not None and terms.sigma < BRANCH_SIGMA
+            if nodes is not None and on_branch:
+                on_branch = nodes.solve_stage(time, x)
+                if on_branch:
+                    x, rate = nodes.state, nodes.rate
+                    rates[j] = system.chart_rate(delta, rate)
+                    continue
+                terms = system.evaluate(time, x, zone)
             if branch is not None:
-                terms, x, moved = branch(terms, t + fraction * h, fraction, x)
+                terms, x, moved = branch(terms, time, fraction, x)
             rate = terms.rate()
             rates[j] = system.chart_rate(delta, rate)
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
-        sigma = terms.sigma
+        sigma = all_sigmas[-1]
         change = abs(sigma - start)
         quiet = branch is None and sigma > WATCHED_SIGMA + FAR_STEPS * change
         state_scale = system.state_scale(x)
 
         # Correction at the end.
-        multiplier = normals = None
-        if history is None:
+        multiplier = normals = away = None
+        if nodes is not None and on_branch:
+            correction, new_state, end_rate = nodes.moved, x, rate
+            multiplier, away = nodes.multiplier, nodes.away
+        elif history is None:
             correction = np.zeros(0)
             new_state, end_rate = x, rate.copy()
         else:
@@ -147,7 +167,8 @@ class SplitStep:
                         if j < s:
                             uncertainty = history.uncertainty(t + scheme.c[j] * h)
                             error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
-                weights = branch.widened(weights, scheme, sigmas)
+                direct_from = BRANCH_SIGMA if nodes is not None and nodes.used else 0.0
+                weights = branch.widened(weights, scheme, sigmas, direct_from)
             error_ratio = norm(error, weights)
 
         result = StepResult(
@@ -164,7 +185,7 @@ class SplitStep:
             multiplier=multiplier,
         )
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
-        if due and history is not None and theta == 1.0:
+        if due and history is not None and theta == 1.0 and away is None:
             result.constraint_residual = terms.constraint_residual()
         if quiet:
             middle, c = scheme.middle
@@ -172,7 +193,8 @@ class SplitStep:
             result.quiet = True
             result.slope = max(change, halfway) / h
             return result
-        result.normals = normals
+        result.normals, result.away = normals, away
+        result.lost_branch = nodes is not None and nodes.lost
         if deficient:
             result.rank = min(rank for _, rank, _ in deficient)
             result.held = any(held for *_, held in deficient)
@@ -200,7 +222,7 @@ class SplitStep:
 def history_after(history: MultiplierHistory, result: StepResult) -> MultiplierHistory:
     """``history`` after an accepted step."""
     if result.multiplier is not None:
-        return history.extended(result.t + result.h, result.multiplier, result.normals)
+        return history.extended(result.t + result.h, result.multiplier, result.normals, result.away)
     if result.zone is None and history.begun:
         return history.emptied()
     return history

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods import dop853_coefficients
 from srm_mbs.integration.methods.butcher import (
     ButcherTableau,
@@ -40,7 +40,7 @@ def get_tableau(name: str | ButcherTableau) -> ButcherTableau:
     tableau = TABLEAUS.get(name) if isinstance(name, str) else None
     if tableau is None:
         raise InputError(
-            f"there is no tableau {name!r}",
+            f"there is no tableau {safe_repr(name)}",
             element="tableau",
             remedy=f"Known: {', '.join(TABLEAUS)}",
         )

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
 from srm_mbs.visualization.animation.overlays import OverlayOptions
@@ -53,7 +53,7 @@ def check_fps(fps: Any) -> float:
         value = math.nan
     if not (math.isfinite(value) and value > 0.0):
         raise InputError(
-            f"fps = {fps!r} is not a positive number of key frames per second",
+            f"fps = {safe_repr(fps)} is not a positive number of key frames per second",
             element="fps",
             remedy="Give for example fps=60",
         )
@@ -305,7 +305,7 @@ def show_in_notebook(
     """
     if not isinstance(height, int) or height <= 0:
         raise InputError(
-            f"height = {height!r} is not a positive whole number of pixels",
+            f"height = {safe_repr(height)} is not a positive whole number of pixels",
             element="height",
             remedy="Give for example height=420",
         )

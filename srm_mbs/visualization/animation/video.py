@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr
 from srm_mbs.formats.files import whole_file
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import write_file
@@ -208,7 +208,7 @@ def photographer(
     width, height = size
     if not (isinstance(width, int) and isinstance(height, int) and min(size) > 0):
         raise InputError(
-            f"size = {size!r} is not a width and a height in pixels",
+            f"size = {safe_repr(size)} is not a width and a height in pixels",
             element="size",
             remedy="Give for example size=(900, 600)",
         )
@@ -271,7 +271,7 @@ def export_image(
     t = end if t is None else t
     if not start <= t <= end:
         raise InputError(
-            f"t = {t!r} lies outside the run, from {start:g} to {end:g} s",
+            f"t = {safe_repr(t)} lies outside the run, from {start:g} to {end:g} s",
             element="t",
             remedy="Give a time of the run",
         )
@@ -325,7 +325,7 @@ def export_video(
         )
     if not (math.isfinite(speed) and speed > 0.0):
         raise InputError(
-            f"speed = {speed!r} is not a positive number",
+            f"speed = {safe_repr(speed)} is not a positive number",
             element="speed",
             remedy="Give a positive number: 1 is real time",
         )

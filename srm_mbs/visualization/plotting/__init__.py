@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.formats.files import checked_path
 from srm_mbs.visualization.plotting.dae import draw_dae_run, draw_dae_state
 from srm_mbs.visualization.plotting.energy import draw_balance
@@ -56,7 +56,7 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
     """
     if not isinstance(kind, str) or kind not in kinds:
         raise InputError(
-            f"there is no kind of picture {kind!r}",
+            f"there is no kind of picture {safe_repr(kind)}",
             element="kind",
             remedy=f"Known: {', '.join(kinds)}",
         )
@@ -64,7 +64,7 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
     for name in options:
         if name not in known:
             raise InputError(
-                f"a picture of kind {kind!r} has no such option",
+                f"a picture of kind {safe_repr(kind)} has no such option",
                 element=name,
                 remedy=f"Known: {', '.join(known) or 'none'}",
             )

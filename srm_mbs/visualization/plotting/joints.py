@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import coordinate_units, is_angle
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
@@ -124,7 +124,9 @@ def checked_names(names: Any, element: str, remedy: str) -> tuple[str, ...]:
     single = isinstance(names, str)
     found = () if single or not isinstance(names, Sequence) else tuple(names)
     if not found or not all(isinstance(name, str) for name in found):
-        raise InputError(f"{names!r} is not a list of names", element=element, remedy=remedy)
+        raise InputError(
+            f"{safe_repr(names)} is not a list of names", element=element, remedy=remedy
+        )
     for name in found:
         if found.count(name) > 1:
             raise InputError(f"{name!r} is named twice", element=element, remedy="Name it once")
@@ -267,7 +269,7 @@ def draw_phase(solution: SimulationResult, joints: Sequence[str] | None = None) 
                 f"joint {name!r} has {mechanism.joint(name).nv} degrees of freedom, and no "
                 "phase portrait",
                 element="joints",
-                remedy=f"Known: {', '.join(single)}" if single else 'Draw the kind "state"',
+                remedy=known_names(single) if single else 'Draw the kind "state"',
             )
     shown = single if joints is not None else single[:MAX_PORTRAITS]
     run = read_smoothly(solution)

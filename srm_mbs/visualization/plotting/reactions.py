@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srm_mbs.dynamics.scaling import is_angle
-from srm_mbs.errors import ControllerError, EvaluationError, InputError
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, known_names
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     LINES,
@@ -85,7 +85,7 @@ def draw_reactions(
                 raise InputError(
                     f"there is no closure {name!r}",
                     element="loops",
-                    remedy=f"Known: {', '.join(found) or 'none'}",
+                    remedy=known_names(found),
                 )
     run = _readable(solution)
     draws, left = (_by_row if rows else _by_loop)(run, found, loops)

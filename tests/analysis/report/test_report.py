@@ -134,7 +134,8 @@ def test_the_tables_have_the_numbers_of_the_run(page: Page, run: srm.Solution) -
     times = [float(row[0]) for row in passages[1:]]
     assert times == pytest.approx([crossing.time for crossing in run.crossings], rel=1e-8)
     assert len(times) == 2
-    assert {row[3] for row in passages[1:]} == {"kept (2 meet)"}
+    assert {row[4] for row in passages[1:]} == {"kept (2 meet)"}
+    assert {row[3] for row in passages[1:]} == {"0.0e+00"}
 
 
 def test_the_certificate_in_the_page_is_that_of_the_run(
@@ -221,7 +222,7 @@ def test_the_page_of_many_loops_leaves_out_what_takes_minutes_and_says_so() -> N
     page = short_page(run, again=False)
     passages = next(table for table in page.tables if table[0][0] == "time (s)")
     assert passages[1][0] == f"{crossing.time:.9g}"
-    assert (passages[1][1], passages[1][3]) == ("not computed", "not computed")
+    assert passages[1][1] == passages[1][3] == passages[1][4] == "not computed"
     assert "takes minutes to compute" in page.text
     # They were not asked for: one passage takes 9 s.
     assert not {"participants", "_tangents", "singular"} & vars(crossing).keys()

@@ -110,14 +110,16 @@ def test_steps_of_another_shape_are_refused() -> None:
 @pytest.mark.parametrize("normals", [None, np.arange(6.0).reshape(3, 2)])
 def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) -> None:
     values = np.arange(12.0).reshape(4, 3)
-    history = MultiplierHistory(np.arange(4.0), values, 2.5, 1e-3, normals)
-    given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7)
+    away = None if normals is None else np.arange(3.0)
+    history = MultiplierHistory(np.arange(4.0), values, 2.5, 1e-3, normals, away)
+    given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7, True)
     found = marshalling.state_from(marshalling.state_struct(given))
     assert found.history is not None
-    for name in ("times", "values", "normals"):
+    for name in ("times", "values", "normals", "away"):
         np.testing.assert_array_equal(getattr(found.history, name), getattr(history, name))
     assert (found.history.known_until, found.history.known_below) == (2.5, 1e-3)
     assert (found.sigma, found.sigma_slope, found.steps) == (0.5, 0.25, 7)
+    assert found.lingering
     np.testing.assert_array_equal(found.rate, given.rate)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -11,6 +12,8 @@ from srm_mbs.integration.kernel import backend
 
 pytestmark = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
 
+KERNEL = {name: value for name, value in os.environ.items() if name != "SRM_MBS_BACKEND"}
+"""Environment of programs whose runs the kernel makes, whatever backend the tests are for."""
 PROGRAM = """
 import threading, time
 import numpy as np
@@ -26,6 +29,13 @@ def controller(t, q, v):
 def event(t, q, v):
     running.set()
     return 1.0
+
+def event_in_numpy(t, q, v):
+    running.set()
+    np.unique(numbers)  # C++ that gives up the interpreter's lock and takes it again
+    return 1.0
+
+numbers = np.arange(10_000)
 
 def work():
     {started}
@@ -47,8 +57,9 @@ time.sleep(0.2)
         pytest.param(1, "", "controller=controller, sample_time=0.01", marks=pytest.mark.stress),
         pytest.param(4, "running.set()", "", marks=pytest.mark.stress),
         pytest.param(4, "", "events=event", marks=pytest.mark.stress),
+        (1, "", "events=event_in_numpy"),
     ],
-    ids=["run", "controllers", "samples", "runs", "events"],
+    ids=["run", "controllers", "samples", "runs", "events", "events in NumPy"],
 )
 def test_a_program_ends_quietly_while_daemon_threads_run(
     threads: int, started: str, options: str
@@ -56,7 +67,12 @@ def test_a_program_ends_quietly_while_daemon_threads_run(
     program = PROGRAM.format(started=started or "pass", options=options, threads=threads)
 
     ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=240, check=False
+        [sys.executable, "-c", program],
+        env=KERNEL,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
 
     assert ended.returncode == 0, ended.stderr
@@ -82,3 +98,43 @@ import srm_mbs.integration.kernel.run
     )
 
     assert ended.stdout.strip() == "finished"
+
+
+@pytest.mark.stress
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no child processes by fork")
+def test_the_end_of_a_child_process_does_not_wait_for_runs_of_its_parent() -> None:
+    program = """
+import atexit, os, sys, threading, time
+
+atexit.register(lambda: print(time.monotonic() - before < 4.0, flush=True))
+import srm_mbs as srm
+
+mechanism = srm.load("four_bar")
+running = threading.Event()
+
+def event(t, q, v):
+    running.set()
+    return 1.0
+
+def work():
+    while True:
+        srm.simulate(mechanism, 50.0, rtol=1e-9, events=event)
+
+def begin_to_end():
+    global before
+    before = time.monotonic()
+
+threading.Thread(target=work, daemon=True).start()
+running.wait()
+child = os.fork()
+if child:
+    os.waitpid(child, 0)
+    os._exit(0)
+atexit.register(begin_to_end)
+"""
+
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=240, check=True
+    )
+
+    assert ended.stdout.strip() == "True"

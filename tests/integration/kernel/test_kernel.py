@@ -16,11 +16,12 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.control.step_size import initial_step
 from srm_mbs.integration.dense_output import DenseOutput
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.run import CompiledRun
-from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
+from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.simulation.runner import absolute_tolerance
 from tests.support.bundled import load
@@ -327,6 +328,18 @@ def test_the_first_step_agrees(name: str) -> None:
         state = random_state(mechanism, rng)
         memory = method.start(system, 0.2, state, norm)
         expected = initial_step(system, state, memory, norm, span, 8, 0.2)
-        evaluator = Evaluator(system, make_kernel_system(system))
-        found = evaluator.first_step(state, memory, norm, span, 8, 0.2)
+        run = CompiledRun(
+            make_kernel_system(system),
+            method,
+            norm,
+            memory,
+            state,
+            smooth_intervals(np.zeros(0), np.zeros(0), 0.2, 0.2 + span),
+            t0=0.2,
+            step=None,
+            first_step=None,
+            max_step=np.inf,
+            placed="automatic",
+        )
+        found = run.snapshot().control.h
         assert found == pytest.approx(expected, rel=1e-9 / min(1.0, memory.sigma) ** 2)

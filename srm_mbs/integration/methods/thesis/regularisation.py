@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import finite_array
 
@@ -61,7 +61,7 @@ def parse_eps(value: Any) -> Regularisation:
         factor = math.nan if number is None else float(number)
     if not (math.isfinite(factor) and factor > 0.0 and math.isfinite(power)):
         raise InputError(
-            f"eps = {value!r} is neither a positive number nor a power of the step",
+            f"eps = {safe_repr(value)} is neither a positive number nor a power of the step",
             element="eps",
             remedy='Give seconds, or "h", "5h", "h^0.5", "h^(2/3)" with the step h',
         )

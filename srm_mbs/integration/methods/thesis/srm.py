@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
@@ -100,14 +100,14 @@ class SRM(DelegatingMethod):
         object.__setattr__(self, "iterations", m)
         if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise InputError(
-                f"iterations = {m!r} is not a number of sweeps",
+                f"iterations = {safe_repr(m)} is not a number of sweeps",
                 element="iterations",
                 remedy="Give a positive integer",
             )
         for name in ("restart", "carry"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(
-                    f"{name} = {getattr(self, name)!r} is neither True nor False",
+                    f"{name} = {safe_repr(getattr(self, name))} is neither True nor False",
                     element=name,
                     remedy="Give True or False",
                 )

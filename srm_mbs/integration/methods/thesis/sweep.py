@@ -15,7 +15,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms, Zone
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
@@ -45,7 +45,7 @@ def checked_regulariser(T: str) -> None:
     """
     if not isinstance(T, str) or T not in REGULARISERS:
         raise InputError(
-            f"there is no T = {T!r}",
+            f"there is no T = {safe_repr(T)}",
             element="T",
             remedy=f"Known: {', '.join(map(repr, REGULARISERS))}",
         )
@@ -229,7 +229,7 @@ def interpolant(
     """
     if interpolation not in known:
         raise InputError(
-            f"there is no interpolation {interpolation!r}",
+            f"there is no interpolation {safe_repr(interpolation)}",
             element="interpolation",
             remedy=f"Known: {', '.join(map(repr, known))}",
         )

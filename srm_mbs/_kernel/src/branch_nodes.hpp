@@ -1,0 +1,41 @@
+// The motion next to a singular configuration, from configurations of its branch on both sides of
+// it: methods/branch_nodes.py.
+#pragma once
+
+#include <vector>
+
+#include "constants.hpp"
+#include "system.hpp"
+
+namespace srm {
+
+class BranchNodes {
+public:
+    BranchNodes(System& system, const Constants& constants);
+
+    // A direction (nv,) of the branch that leads away from the singular configuration, as long as
+    // nodes are apart; empty if the state (nx,) does not determine it.
+    void find_direction(double t, const double* state, std::vector<double>& away);
+    // Moves the state (nx,) onto its branch, and solves for its multiplier; whether it could.
+    bool solve(double t, const double* state, const std::vector<double>& away);
+
+    // Results of solve(): the state on the branch, the tangent rate there, the multiplier, what was
+    // subtracted from the state, and the direction of the branch there.
+    std::vector<double> state, rate, multiplier, moved, away;
+
+private:
+    static constexpr int each_side = 4, count = 2 * each_side;
+
+    bool follow(int k, double t, const double* state, const std::vector<double>& away);
+    double sigma_at(double t, const double* state, const double* direction, double length);
+
+    System& system_;
+    const Constants constants_;
+    const int nv_, nx_;
+    // Of the nodes (count, nv): positions, motions onto the closures, rates off the branch,
+    // multipliers.
+    std::vector<double> nodes_, closings_, off_, multipliers_;
+    std::vector<double> point_, step_, closing_, change_, allowed_, residuals_, basis_;
+};
+
+}  // namespace srm

@@ -1,0 +1,262 @@
+r"""Critical configurations: where the closures are singular, or would be but for a residual.
+
+A combination u of the closure rows is critical at q* if it is stationary there and all other
+combinations are closed,
+
+    G(q*)^T u = 0,   g(q*) - (u . g(q*)) u = 0,   |u| = 1.
+
+Its residual delta = u . g(q*) decides.  It is 0 at a singular configuration, where two branches of
+closed configurations cross; bars that differ by d leave a residual of about d.  The closed
+configurations then are the two hyperbolas w^T H w / 2 = -delta of which the crossing branches are
+the asymptotes: the motion avoids the singular configuration and leaves along the other asymptote.
+H is the Hessian of u . g, w a displacement that keeps the other combinations closed.
+
+Quantities are in units (:mod:`srm_mbs.dynamics.constraints.geometry`).  With drives, a
+configuration is a place (q, t).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+
+ITERATIONS = 12
+DIFFERENCE = 1e-5
+"""Step (units) of the central differences of G^T u."""
+CONVERGED = 1e-14
+"""Size of the equations of a critical configuration at which the search ends."""
+DECIDED = 1e-8
+"""That at which the residual, which is stationary, is known to rounding."""
+ACCEPTED = 1e-11
+"""Size of them from which the search has failed."""
+FROZEN = 1e-3
+"""Newton step (units) from which on the Hessian is not evaluated again."""
+RIDGE = 1e-5
+"""Added to the Hessian: configurations that are critical together, such as those of a free base,
+stay where they are."""
+CURVE_ITERATIONS = 20
+CURVE_STEP = 1e-15
+"""Newton step (units) at which a point of a curve is found."""
+DEFINITE = 1e-3
+"""Ratio of the two curvatures of a saddle below which branches are almost tangent."""
+
+
+@dataclass(frozen=True, eq=False)
+class CriticalConfiguration:
+    """A critical configuration of the closures.
+
+    Attributes
+    ----------
+    geometry
+        The closures, and drives if there are any.
+    q : (nq,)
+        The configuration, as the geometry takes it.
+    rows : (rank, rows)
+        Independent combinations of the normalised rows.
+    u : (rank,)
+        The critical combination of them, of unit length.
+    hessian : (n, n)
+        H: second derivative of u . g by the coordinates.
+    """
+
+    geometry: ClosureGeometry
+    q: FloatArray
+    rows: FloatArray
+    u: FloatArray
+    hessian: FloatArray
+
+    @cached_property
+    def combination(self) -> FloatArray:
+        """u over the rows of the closures in row units (rows,), of unit length."""
+        weights = (self.u @ self.rows) / self.geometry.row_size
+        out: FloatArray = weights / np.linalg.norm(weights)
+        return out
+
+    @cached_property
+    def residual(self) -> float:
+        """delta, in row units: relative to the size of the mechanism."""
+        return float(self.combination @ self.geometry.closure(self.q)[0])
+
+
+def equations(
+    geometry: ClosureGeometry, rows: FloatArray, q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The independent combinations ``rows`` of g (rank,) and of G (rank, n), normalised, at q."""
+    g, G = geometry.closure(q)
+    return rows @ (g / geometry.row_size), rows @ (G / geometry.row_size[:, None])
+
+
+def complement(u: FloatArray) -> FloatArray:
+    """An orthonormal basis (k - 1, k) of the vectors orthogonal to u (k,), of unit length."""
+    full = np.linalg.qr(u[:, None], mode="complete")[0]
+    return full[:, 1:].T
+
+
+def _hessian(
+    geometry: ClosureGeometry, rows: FloatArray, u: FloatArray, q: FloatArray
+) -> FloatArray:
+    columns = []
+    for e in DIFFERENCE * np.eye(len(geometry.unit)):
+        ahead = equations(geometry, rows, geometry.move(q, e))[1]
+        behind = equations(geometry, rows, geometry.move(q, -e))[1]
+        columns.append(u @ (ahead - behind) / (2.0 * DIFFERENCE))
+    return np.array(columns).T
+
+
+def critical_configuration(
+    geometry: ClosureGeometry, structural_rank: int, q: FloatArray, reach: float
+) -> CriticalConfiguration | None:
+    """The critical configuration near q, found by Newton's iteration for (q, u).
+
+    It starts from the last left singular vector of the normalised G at q.
+
+    Parameters
+    ----------
+    structural_rank
+        Rank of the closures in regular configurations.
+    q : (nq,)
+        A configuration, as the geometry takes it; it need not be closed.
+    reach
+        Largest motion of a coordinate, in units.
+
+    Returns
+    -------
+    CriticalConfiguration or None
+        None if there is none within reach.
+    """
+    left = np.linalg.svd(geometry.normalised(q))[0]
+    rows = left[:, :structural_rank].T
+    u = np.zeros(structural_rank)
+    u[-1] = 1.0
+    n, x = len(geometry.unit), q
+    g, G = equations(geometry, rows, x)
+    delta = float(u @ g)
+    moved, best, found = np.inf, np.inf, (x, u)
+    for _ in range(ITERATIONS):
+        value = np.concatenate([G.T @ u, g - delta * u, [0.0]])
+        size = float(np.abs(value).max())
+        if not size < best and size < ACCEPTED:
+            break
+        if size < best:
+            best, found = size, (x, u)
+        if size <= CONVERGED:
+            break
+        if moved > FROZEN:
+            H = _hessian(geometry, rows, u, x) + RIDGE * np.eye(n)
+        none = np.zeros((n, 1))
+        matrix = np.block(
+            [
+                [H, G.T, none],
+                [G, -delta * np.eye(structural_rank), -u[:, None]],
+                [none.T, u[None], np.zeros((1, 1))],
+            ]
+        )
+        step = np.linalg.solve(matrix, -value)
+        moved = float(np.abs(step[:n]).max())
+        if not moved < reach:
+            return None
+        x, u = geometry.move(x, step[:n]), u + step[n:-1]
+        u = u / np.linalg.norm(u)
+        if not np.abs(geometry.difference(q, x)).max() < reach:
+            return None
+        g, G = equations(geometry, rows, x)
+        delta = float(u @ g)
+    if not best < ACCEPTED:
+        return None
+    x, u = found
+    return CriticalConfiguration(geometry, x, rows, u, _hessian(geometry, rows, u, x))
+
+
+class CurveThroughSaddle:
+    """The closed configurations next to a critical one of a mechanism with one degree of freedom.
+
+    They are curves in the plane of the displacements that keep the other combinations closed:
+    beside a residual each is a hyperbola with a coordinate that grows along it, beta, and one that
+    keeps its sign.
+
+    Parameters
+    ----------
+    critical
+        The critical configuration.
+    q
+        A configuration on the curve, as the geometry takes it.
+    exact
+        Whether the residual counts as zero: the curve then leads straight through q*.
+
+    Attributes
+    ----------
+    beta
+        That of q.
+    width
+        |beta| at which the curve leaves its asymptotes.
+
+    Raises
+    ------
+    ValueError
+        If the critical configuration is no saddle, or q is not on a curve beside it.
+    """
+
+    def __init__(self, critical: CriticalConfiguration, q: FloatArray, exact: bool) -> None:
+        geometry = self._geometry = critical.geometry
+        self._critical = critical
+        rank, n = critical.rows.shape[0], len(geometry.unit)
+        if n - rank != 1:
+            raise ValueError("the closed configurations are no curves")
+        self._strong = complement(critical.u)
+        g, G = equations(geometry, critical.rows, critical.q)
+        plane = np.linalg.svd(self._strong @ G)[2][-2:].T
+        form = plane.T @ critical.hessian @ plane
+        (low, high), axes = np.linalg.eigh(0.5 * (form + form.T))
+        if not (low < 0.0 < high and min(-low, high) > DEFINITE * max(-low, high)):
+            raise ValueError("the critical configuration is no saddle")
+        delta = float(critical.u @ g)
+        # delta > 0: the coordinate of the negative curvature keeps its sign.
+        kept, along = (axes[:, 0], axes[:, 1]) if delta > 0.0 else (axes[:, 1], axes[:, 0])
+        self._kept, self._along = plane @ kept, plane @ along
+        of_kept, of_along = (-low, high) if delta > 0.0 else (high, -low)
+        self._exact = exact
+        self._delta = delta
+        self._level = 0.0 if exact else 2.0 * abs(delta) / of_kept
+        self._ratio = of_along / of_kept
+        self.width = float(np.sqrt(self._level / self._ratio))
+        away = geometry.difference(critical.q, q)
+        self.beta = float(self._along @ away)
+        beside = float(self._kept @ away)
+        self._sign = float(np.sign(beside if not exact else beside * self.beta))
+        on_curve = self.at(self.beta, closed=True)[0]
+        if not np.abs(geometry.difference(on_curve, q)).max() < 1e-6 * abs(self.beta):
+            raise ValueError("the configuration is not on a curve beside the critical one")
+
+    def at(self, beta: float, closed: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The configuration (nq,) at ``beta``, and its first and second derivative (n,) by beta, in
+        units.
+
+        ``closed``: with the residual closed, also if it counts as zero.
+        """
+        critical, geometry = self._critical, self._geometry
+        kept = np.sqrt(self._level + self._ratio * beta * beta)
+        kept *= self._sign * np.sign(beta) if self._exact else self._sign
+        x = geometry.move(critical.q, beta * self._along + kept * self._kept)
+        target = self._delta if self._exact and not closed else 0.0
+        last = np.inf
+        for _ in range(CURVE_ITERATIONS):
+            g, G = equations(geometry, critical.rows, x)
+            off = float(self._along @ geometry.difference(critical.q, x)) - beta
+            value = np.concatenate([self._strong @ g, [critical.u @ g - target, off]])
+            matrix = np.vstack([self._strong @ G, critical.u @ G, self._along])
+            step = np.linalg.solve(matrix, value)
+            size = float(np.abs(step).max())
+            if not size < last and size < 1e-6 * abs(beta):
+                break
+            x, last = geometry.move(x, -step), size
+            if size < CURVE_STEP:
+                break
+        tangent = np.linalg.solve(matrix, np.append(np.zeros(len(value) - 1), 1.0))
+        bias = critical.rows @ geometry.bias(x, tangent)
+        turning = np.concatenate([self._strong @ bias, [critical.u @ bias, 0.0]])
+        return x, tangent, -np.linalg.solve(matrix, turning)

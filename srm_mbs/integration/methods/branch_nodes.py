@@ -1,0 +1,220 @@
+r"""The motion next to a singular configuration, from nodes of its branch on both sides of it.
+
+On a branch the multiplier yhat = P M^-1 f + E (Gdot v - s'') is a smooth function of the state, and
+so are the motion onto the branch and the velocity off it.  At the singular configuration none of
+them can be solved for; next to it rounding grows like 1/sigma^2.  A stage x = (q, v) there takes
+them from the polynomial through eight *nodes*, evaluated at the stage itself:
+
+    q_k = q (+) (k w + d_k),   k = +-1, ..., +-4,
+
+where w is a direction that leads away from the singular configurations, and d_k the motion onto the
+closures along the normals at q_k: q_k is the point of the branch nearest to q (+) k w in the mass
+metric.  The row of a drive goes with the node, which closes it where k w leads it to; its rate and
+acceleration are those of the drive.  Then
+
+    q_on = q (+) d(0),   v_on = v - o(0),   o_k = P_k v - E_k s',
+    yhat_k = E_k (G_k a + Gdot_k v_k - s''),   v_k = v - o_k,   a = M^-1 f at (q_on, v_on).
+
+Nothing is extrapolated in time: a motion may stay as long as it likes, and turn where it likes.
+
+The direction is that in which sigma changes most, among the velocities that satisfy the closures,
+the drives' own included.  Only its being smooth matters: from stage to stage it follows the branch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import ClosedSystem
+
+BRANCH_SIGMA = 3e-3
+"""sigma below which stages of a motion that lingers are solved by nodes."""
+KNOWN_DIRECTION_SIGMA = 1e-6
+"""sigma from which a state determines the direction: below, rounding turns it."""
+DIRECTION_PROBE = 0.1
+"""Motion (rad, scene diagonals) by which the change of sigma is measured, over sigma."""
+NODE_SPACING = 0.02
+"""Distance between nodes (rad, scene diagonals)."""
+SPACING_DOUBLINGS = 2
+"""Times that it is doubled, at most, until it suffices."""
+FIRST_NODE_SIGMA = 0.01
+"""sigma of the first nodes for which the spacing suffices.  Where branches touch, sigma grows with
+the square of the distance, and none does.  Every node needs half of it: where another loop is next
+to its own singular configuration, nodes are no better than the stage."""
+MAX_CLOSINGS = 12
+"""Iterations of one node onto the closures."""
+LARGEST_CLOSING = 0.5
+"""Largest motion of the first of them, over the spacing: beyond it lies another branch."""
+CLOSING_ACCURACY = 1e-12
+"""Motion (rad, scene diagonals) of the last of them; the next one would be a hundredth of it."""
+LARGEST_MISFIT = 1e-6
+"""Largest difference of the multiplier from that of the polynomial without the outermost nodes,
+over the accelerations at the nodes: at the stage, they may balance."""
+
+_PLACES = np.array([-1, 1, -2, 2, -3, 3, -4, 4], dtype=np.float64)
+_VALUE = np.array([0.8, 0.8, -0.4, -0.4, 4 / 35, 4 / 35, -1 / 70, -1 / 70])
+"""Weights of the value at 0 of the polynomial through all nodes."""
+_COARSE = np.array([0.75, 0.75, -0.3, -0.3, 0.05, 0.05, 0.0, 0.0])
+"""The same without the outermost two."""
+_SLOPE = np.array([-0.8, 0.8, 0.2, -0.2, -4 / 105, 4 / 105, 1 / 280, -1 / 280])
+"""Weights of the slope at 0."""
+
+
+class BranchNodes:
+    """Solves stages of ``system`` by nodes of their branch.
+
+    Attributes
+    ----------
+    state : (nx,), rate : (2 nv,), multiplier : (nv,)
+        The stage on its branch, its tangent rate and its multiplier, after :meth:`solve`.
+    moved : (2 nv,)
+        What was subtracted from the stage.
+    away : (nv,)
+        The direction of the branch there, as long as nodes are apart.
+    """
+
+    state: FloatArray
+    rate: FloatArray
+    multiplier: FloatArray
+    moved: FloatArray
+    away: FloatArray
+
+    def __init__(self, system: ClosedSystem) -> None:
+        self._system = system
+
+    def _sigma_at(self, t: float, state: FloatArray, move: FloatArray) -> float:
+        moved = self._system.retract(state, np.concatenate([move, np.zeros_like(move)]))
+        return self._system.evaluate(t, moved).sigma
+
+    def find_direction(self, t: float, state: FloatArray) -> FloatArray | None:
+        """A direction (nv,) of the branch that leads away from the singular configuration, as long
+        as nodes are apart; None if the ``state`` (nx,) does not determine it."""
+        system = self._system
+        terms = system.evaluate(t, state)
+        sigma = terms.sigma
+        if terms.rank_deficient or not sigma > KNOWN_DIRECTION_SIGMA:
+            return None
+        tangents = terms.branch_tangents().T
+        if not len(tangents):
+            return None
+        w = np.zeros(system.nv)
+        for f in tangents:
+            steepness = 1.0
+            if len(tangents) > 1:
+                length = DIRECTION_PROBE * sigma / system.position_norm(f)
+                ahead, behind = (self._sigma_at(t, state, side * f) for side in (length, -length))
+                steepness = (ahead - behind) / length
+            w += steepness * f
+        return self.spaced(t, state, w)
+
+    def spaced(self, t: float, state: FloatArray, w: FloatArray) -> FloatArray | None:
+        """The direction w (nv,), as long as nodes are apart; None if no spacing
+        suffices."""
+        size = self._system.position_norm(w)
+        if not size > 0.0:
+            return None
+        w = w / size
+        for doublings in range(SPACING_DOUBLINGS + 1):
+            spacing = NODE_SPACING * 2.0**doublings
+            sides = [self._sigma_at(t, state, side * spacing * w) for side in (1.0, -1.0)]
+            if min(sides) >= FIRST_NODE_SIGMA:
+                return spacing * w
+        return None
+
+    def _follow(
+        self, t: float, state: FloatArray, move: FloatArray, spacing: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """The node (nx,) at ``state`` (+) ``move`` (nv,), its motion onto the closures (nv,) and
+        the velocity off the branch (nv,)."""
+        system = self._system
+        v = state[-system.nv :]
+        closing = np.zeros_like(move)
+        last = np.inf
+        for iteration in range(MAX_CLOSINGS):
+            node = system.retract(state, np.concatenate([move + closing, np.zeros_like(move)]))
+            terms = system.evaluate(t, node)
+            if terms.rank_deficient or not terms.sigma > 0.5 * FIRST_NODE_SIGMA:
+                return None
+            if iteration == 0:
+                allowed = terms.driven_residuals() - self._residuals
+            further = terms.project(closing) - terms.closing(allowed)
+            change = system.position_norm(further - closing)
+            closing = further
+            if iteration == 0 and change > LARGEST_CLOSING * spacing:
+                return None
+            if iteration > 1 and not change < last:
+                return None
+            last = change
+            if change < CLOSING_ACCURACY:
+                off = terms.correction()[system.nv :]
+                node[-system.nv :] = v - off
+                return node, closing, off
+        return None
+
+    def solve(self, t: float, state: FloatArray, away: FloatArray) -> bool:
+        """Solve the stage ``state`` (nx,) at t (s); whether it could be solved."""
+        system, nv = self._system, self._system.nv
+        self._residuals = system.evaluate(t, state).driven_residuals()
+        spacing = system.position_norm(away)
+        found = []
+        for k in _PLACES.tolist():
+            followed = self._follow(t, state, k * away, spacing)
+            if followed is None:
+                return False
+            found.append(followed)
+        closings = np.array([closing for _, closing, _ in found])
+        off = np.array([off for *_, off in found])
+        self.moved = np.concatenate([-_VALUE @ closings, _VALUE @ off])
+        self.away = away + _SLOPE @ closings
+        self.state = system.retract(state, -self.moved)
+        free = system.evaluate(t, self.state).free_acceleration()
+        multipliers, size = [], 0.0
+        for node, *_ in found:
+            terms = system.evaluate(t, node)
+            multipliers.append(terms.multiplier_of(free))
+            size = max(size, system.position_norm(terms.free_acceleration()))
+        values = np.array(multipliers)
+        self.multiplier = _VALUE @ values
+        size += system.position_norm(self.multiplier)
+        misfit = system.position_norm((_VALUE - _COARSE) @ values)
+        self.rate = np.concatenate([self.state[-nv:], free - self.multiplier])
+        return misfit <= LARGEST_MISFIT * size
+
+
+class StageNodes(BranchNodes):
+    """The nodes for the stages of one step, all with the same direction.
+
+    Parameters
+    ----------
+    system
+        The mechanism.
+    t, state
+        Start of the step (s), and the state there (nx,).
+    direction : (nv,) or None
+        Direction of the branch there; None to find it when a stage needs it.
+
+    Attributes
+    ----------
+    used
+        Whether a stage was solved.
+    lost
+        Whether one could not be solved; then no other is.
+    """
+
+    def __init__(
+        self, system: ClosedSystem, t: float, state: FloatArray, direction: FloatArray | None
+    ) -> None:
+        super().__init__(system)
+        self._start, self._direction = (t, state), direction
+        self.used = self.lost = False
+
+    def solve_stage(self, t: float, state: FloatArray) -> bool:
+        """Solve the stage ``state`` (nx,); whether it could be solved."""
+        if self.lost:
+            return False
+        if self._direction is None:
+            self._direction = self.find_direction(*self._start)
+        solved = self._direction is not None and self.solve(t, state, self._direction)
+        self.used, self.lost = self.used or solved, not solved
+        return solved

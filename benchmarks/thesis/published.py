@@ -168,6 +168,10 @@ class PublishedControl:
             return Proposal(self._t_end - t, self._t_end)
         return Proposal(self._h, t + self._h)
 
+    def next_zero(self) -> float | None:
+        """None: the published control does not look for singular configurations."""
+        return None
+
     def decide(self, proposal: Proposal, result: SweepResult | None) -> StepDecision:
         """Accept if xi <= 1, or if the step cannot be made smaller."""
         xi = math.inf if result is None else result.error_ratio

@@ -342,10 +342,9 @@ class Mechanics(Manifold):
         } | self.chart_constants()
 
     def kinetic_energy(self, q: FloatArray, v: FloatArray) -> float:
-        """Kinetic energy (J), rotors on the joints (armature) included."""
-        energy = float(pin.computeKineticEnergy(self.model, self.data, q, v))
-        # Pinocchio's mass matrix has the armature, its energy does not.
-        return energy + 0.5 * float(self.model.armature @ (v * v))
+        """Kinetic energy v^T M v / 2 (J), rotors on the joints (armature) included."""
+        # computeKineticEnergy of Pinocchio contains the armature of some joint types only.
+        return 0.5 * float(v @ pin.crba(self.model, self.data, q) @ v)
 
     def energy(self, state: FloatArray) -> float:
         """Kinetic plus potential energy (J), of gravity and springs."""

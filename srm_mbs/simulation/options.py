@@ -191,7 +191,7 @@ def checked_singular_tolerance(value: Any) -> float:
     number = finite_array(value, ())
     if number is None or not float(number) >= 0.0:
         raise InputError(
-            f"singular_tolerance = {value!r} is not a number of at least 0",
+            f"singular_tolerance = {safe_repr(value)} is not a number of at least 0",
             element="singular_tolerance",
             remedy="Give the residual, over the size of the mechanism, up to which a configuration "
             "counts as singular; 0 follows the data",

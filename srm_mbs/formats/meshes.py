@@ -404,21 +404,54 @@ PRIMITIVES: dict[str, Callable[[Element, Corners], Polygons]] = {
 READERS: dict[str, Callable[[bytes], Triangles]] = {".stl": _stl, ".obj": _obj, ".dae": _dae}
 
 
-def enclosed(vertices: FloatArray, faces: Any) -> tuple[float, FloatArray, FloatArray]:
+def enclosed(
+    vertices: FloatArray, faces: Any, unsigned: bool = False
+) -> tuple[float, FloatArray, FloatArray]:
     """Volume (m^3), centroid (3,) m, and moments of inertia (3, 3) m^5 about it at unit density of
     the solid that triangles enclose, whose corners run counterclockwise as seen from outside.
 
-    Sums over the tetrahedra of a triangle and the origin, with determinants of sign.
+    Sums over the tetrahedra of a triangle and one point, first the centroid of the surface, then
+    that of the solid.  With ``unsigned`` every tetrahedron counts as positive: the same for a
+    surface that every ray from these points meets once, whichever way its corners run.
     """
     corners = vertices[faces]
-    volumes = np.linalg.det(corners) / 6.0
-    volume = float(volumes.sum())
-    if not abs(volume) > 0.0:
+
+    def tetrahedra(point: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Their corners seen from ``point``, their volumes, and the sum of these."""
+        seen = corners - point
+        volumes = np.linalg.det(seen) / 6.0
+        if unsigned:
+            volumes = np.abs(volumes)
+        return seen, volumes, float(volumes.sum())
+
+    area, point, _ = surface(vertices, faces)
+    seen, volumes, volume = tetrahedra(point)
+    if not (area > 0.0 and abs(volume) > 0.0):
         return 0.0, np.zeros(3), np.zeros((3, 3))
-    sums = corners.sum(axis=1)
-    centre = volumes @ sums / (4.0 * volume)
+    centre = point + volumes @ seen.sum(axis=1) / (4.0 * volume)
+    seen, volumes, volume = tetrahedra(centre)
     # Of x x^T over a tetrahedron: V/20 (sum of c c^T over its corners + s s^T), one in the origin.
-    second = np.einsum("k,kia,kib->ab", volumes, corners, corners)
-    second = (second + np.einsum("k,ka,kb->ab", volumes, sums, sums)) / 20.0
-    second -= volume * np.outer(centre, centre)
-    return volume, centre, np.trace(second) * np.eye(3) - second
+    return volume, centre, _moments(seen, volumes / 20.0)
+
+
+def surface(vertices: FloatArray, faces: Any) -> tuple[float, FloatArray, FloatArray]:
+    """Area (m^2), centroid (3,) m, and moments of inertia (3, 3) m^4 about it at unit density of
+    the triangles themselves."""
+    corners = vertices[faces]
+    edges = np.diff(corners, axis=1)
+    areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    area = float(areas.sum())
+    if not area > 0.0:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    centre = areas @ corners.mean(axis=1) / area
+    # Of x x^T over a triangle: A/12 (sum of c c^T over its corners + s s^T).
+    return area, centre, _moments(corners - centre, areas / 12.0)
+
+
+def _moments(corners: FloatArray, weights: FloatArray) -> FloatArray:
+    """Moments (3, 3) of sum_k w_k (sum of c c^T over corners (k, 3, 3) + s s^T, s their sum)."""
+    sums = corners.sum(axis=1)
+    second = np.einsum("k,kia,kib->ab", weights, corners, corners)
+    second += np.einsum("k,ka,kb->ab", weights, sums, sums)
+    moments: FloatArray = np.trace(second) * np.eye(3) - second
+    return moments

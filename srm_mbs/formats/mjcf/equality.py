@@ -117,7 +117,8 @@ class EqualityReader:
         self._close(name, "point", [(body, _point(at)) for body, at in ends], given)
 
     def _weld(self, name: str, given: Attributes) -> None:
-        if "torquescale" in given:
+        turns = given.number("torquescale", 1.0) == 0.0
+        if "torquescale" in given and not turns:
             self.values.remark("torquescale does not act: closures are rigid", name)
         ends = self._sites(given)
         if not ends:
@@ -133,7 +134,10 @@ class EqualityReader:
                 placements = self.tree.placements
                 in_first = placements[first].actInv(placements[second]) * at
             ends = [(first, in_first), (second, at)]
-        self._close(name, "frame", ends, given)
+        if turns:  # MuJoCo's rows of the rotation are zero
+            self._close(name, "point", [(body, _point(at)) for body, at in ends], given)
+        else:
+            self._close(name, "frame", ends, given)
 
     def _joint(self, name: str, given: Attributes) -> None:
         """q_1 = a_0 + a_1 q_2 with positions that are zero at the references of MuJoCo."""

@@ -14,7 +14,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
-from srm_mbs.formats.meshes import enclosed, read_mesh
+from srm_mbs.formats.meshes import enclosed, read_mesh, surface
 from srm_mbs.formats.mjcf.attributes import GEOMS, Attributes, MjcfValues, z_along
 from srm_mbs.model.reach import Reach
 
@@ -25,18 +25,45 @@ SIZES = {"sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3}
 ALONG = ("capsule", "cylinder", "ellipsoid", "box")
 """Shapes that may be given by two ends."""
 MASSLESS = ("plane", "hfield")
+INERTIAS = ("legacy", "convex", "exact", "shell")
+"""Ways to the inertia of a mesh, the default first."""
 GIVE_INERTIAL = "Give the body an <inertial>"
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh of ``<asset>``: its file as the model names it, its scale (3,), how MuJoCo finds its
-    inertia; empty if it is moved first; and where the axes of the file lie in those of the mesh."""
+    """A mesh of ``<asset>``.
+
+    A vertex x of the file is S R^T (x - p) in the axes of the mesh.
+
+    Attributes
+    ----------
+    file
+        As the model names it.
+    scale : (3,)
+        The diagonal of S.
+    inertia
+        How its inertia is found, one of :data:`INERTIAS`.
+    origin, turn : (3,), (3, 3)
+        p and R.
+    """
 
     file: str
     scale: FloatArray
     inertia: str
-    axes: pin.SE3
+    origin: FloatArray
+    turn: FloatArray
+
+    @property
+    def axes(self) -> pin.SE3:
+        """Placement of the axes of the file in those of the mesh, if S and R commute."""
+        turn = self.turn if self.is_similar else np.eye(3)
+        return pin.SE3(turn.T, -self.scale * (turn.T @ self.origin))
+
+    @property
+    def is_similar(self) -> bool:
+        """Whether S and R commute, as those of a mesh do that is turned or stretched, not both."""
+        return np.ptp(self.scale) == 0.0 or np.allclose(self.turn, np.eye(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +135,7 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], reach: Reach) -> pin.Iner
     if geom.kind in MASSLESS or geom.mass == 0.0 or (geom.mass is None and geom.density == 0.0):
         return None
     if geom.kind == "mesh":
-        own = _enclosed(geom.given, meshes.get(geom.given.text("mesh")), reach)
+        own = _of_mesh(geom.given, meshes.get(geom.given.text("mesh")), reach)
     elif geom.kind in SIZES:
         volume, moments = _solid(geom.kind, geom.sizes)
         own = pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
@@ -120,13 +147,15 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], reach: Reach) -> pin.Iner
     return geom.placement.act(pin.Inertia(density * own.mass, own.lever, density * own.inertia))
 
 
-def _enclosed(given: Attributes, mesh: Mesh | None, reach: Reach) -> pin.Inertia:
-    """Inertia of the solid of density 1 kg/m^3 that a mesh encloses: inertia="exact"."""
-    if mesh is None or mesh.inertia != "exact":
-        raise given.fault(
-            "the inertia of a mesh is read from its triangles only, and only if MuJoCo does so too",
-            f'{GIVE_INERTIAL}, or the <mesh file=...> inertia="exact"',
-        )
+def _of_mesh(given: Attributes, mesh: Mesh | None, reach: Reach) -> pin.Inertia:
+    """Inertia that a mesh stands for, as MuJoCo finds it, at unit density.
+
+    ``exact`` is that of the solid which the triangles enclose, ``convex`` that of its convex hull,
+    ``shell`` that of the triangles; ``legacy`` counts every tetrahedron of a triangle and the
+    centroid as positive.
+    """
+    if mesh is None:
+        raise given.fault("its mesh has no file", f"{GIVE_INERTIAL}, or the <mesh> a file")
     with naming(file=given.values.file, element=given.where):
         path = reach.find(mesh.file, Path(given.values.file).parent, "mesh file")
     try:
@@ -134,10 +163,24 @@ def _enclosed(given: Attributes, mesh: Mesh | None, reach: Reach) -> pin.Inertia
     except InputError as error:
         problem = f"the mesh file {mesh.file!r} cannot be read: {error.problem}"
         raise given.fault(problem, error.remedy) from error
-    volume, centre, about = enclosed(vertices * mesh.scale, faces)
-    if not volume > 0.0:
+    placed = (vertices - mesh.origin) @ mesh.turn * mesh.scale
+    if np.prod(mesh.scale) < 0.0:
+        faces = faces[:, ::-1]
+    if mesh.inertia == "convex":
+        from scipy.spatial import ConvexHull, QhullError
+
+        try:
+            faces = ConvexHull(placed).simplices
+        except QhullError as error:
+            problem = f"the points of {mesh.file!r} have no convex hull of positive volume"
+            raise given.fault(problem, GIVE_INERTIAL) from error
+    if mesh.inertia == "shell":
+        size, centre, about = surface(placed, faces)
+    else:
+        size, centre, about = enclosed(placed, faces, unsigned=mesh.inertia != "exact")
+    if not size > 0.0:
         raise given.fault(f"the triangles of {mesh.file!r} enclose no volume", GIVE_INERTIAL)
-    return pin.Inertia(volume, centre, about)
+    return pin.Inertia(size, centre, about)
 
 
 def _solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:

@@ -10,18 +10,14 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-import numpy as np
-import pinocchio as pin
-
-from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import read_text, shortened
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
-from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, Attributes, MjcfValues
+from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
-from srm_mbs.formats.mjcf.geoms import Mesh
+from srm_mbs.formats.mjcf.geoms import INERTIAS, Mesh
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.xml import check_tree, parse_xml
 from srm_mbs.model.reach import Reach
@@ -113,24 +109,15 @@ def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
         elif "file" in given:
             path = Path(values.compiler.mesh_folder) / given.text("file")
             scale = given.numbers("scale", 3, "1 1 1")
-            moved = "refpos" in given or "refquat" in given
-            inertia = "" if moved else given.text("inertia", "legacy")
+            inertia = given.choice("inertia", INERTIAS)
+            origin = given.numbers("refpos", 3, "0 0 0")
+            quaternion = given.numbers("refquat", 4, "1 0 0 0")
+            turn = values.quaternion(quaternion, given.where, "refquat")
             name = given.text("name") or path.stem
-            tree.meshes[name] = Mesh(path.as_posix(), scale, inertia, _mesh_axes(given, scale))
-
-
-def _mesh_axes(given: Attributes, scale: FloatArray) -> pin.SE3:
-    """Placement of the axes of a mesh file in those of the mesh.
-
-    MuJoCo makes S R^T (x - p) of a vertex x, with the scale S, ``refpos`` p and ``refquat`` R.
-    """
-    p = given.numbers("refpos", 3, "0 0 0")
-    R = given.values.quaternion(given.numbers("refquat", 4, "1 0 0 0"), given.where, "refquat")
-    if np.ptp(scale) > 0.0 and not np.allclose(R, np.eye(3)):
-        what = "a mesh with refquat and an unequal scale is drawn unturned"
-        given.values.remark(what, given.where)
-        R = np.eye(3)
-    return pin.SE3(R.T, -scale * (R.T @ p))
+            tree.meshes[name] = mesh = Mesh(path.as_posix(), scale, inertia, origin, turn)
+            if not mesh.is_similar:
+                what = "a mesh with refquat and an unequal scale is drawn unturned"
+                values.remark(what, given.where)
 
 
 def translate(document: Document, options: Options) -> Translation:

@@ -175,6 +175,18 @@ def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> Non
             np.testing.assert_allclose(ours, other, atol=1e-12)
 
 
+def test_a_weld_without_torque_holds_the_point_that_mujoco_holds() -> None:
+    twins = Twins(TWO_LOOPS.replace("<weld", '<weld torquescale="0"'))
+    state = twins.state
+    assert [loop["type"] for loop in twins.entries["loop"][:2]] == ["point", "point"]
+    for q, v in random_states(twins):
+        twins.put(q, v)
+        kind = state.efc_type[: state.nefc]
+        rows = state.efc_pos[: state.nefc][kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
+        for ours, theirs in zip(twins.residuals(), rows[:12].reshape(2, 6)):
+            np.testing.assert_allclose(theirs, [*ours, 0.0, 0.0, 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_each_file_loads_closes_and_runs_alike_on_both_backends(name: str, tmp_path: Path) -> None:
     """With armatures and dampers, which both must see."""
@@ -224,13 +236,19 @@ def test_one_free_body_is_a_floating_robot_at_its_pose(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.rotation.ravel(), state.xmat[i], atol=1e-14)
 
 
-def test_the_inertia_of_an_exact_mesh_is_that_of_mujoco(tmp_path: Path) -> None:
+@pytest.mark.parametrize("moved", ["", 'refpos="0.3 -0.2 0.5" refquat="0.6 0.8 0 0"'])
+@pytest.mark.parametrize("scale", ["1 2 1", "-1 1 0.5"])
+@pytest.mark.parametrize("kind", ["legacy", "exact", "convex", "shell"])
+def test_the_inertia_of_a_mesh_is_that_of_mujoco(
+    tmp_path: Path, kind: str, scale: str, moved: str
+) -> None:
     mesh = cassie("cassie").parents[1] / "meshes" / "knee.stl"
     geom = '<geom type="mesh" mesh="knee" pos="0.1 0 0" euler="30 0 0" density="500"/>'
     text = file(
         f'<body name="knee"><joint name="j"/>{geom}</body>'
         '<body name="wall"><geom type="mesh" mesh="knee"/></body>',
-        f'<asset><mesh name="knee" inertia="exact" scale="1 2 1" file="{mesh}"/></asset>',
+        f'<asset><mesh name="knee" inertia="{kind}" scale="{scale}" {moved} '
+        f'file="{mesh}"/></asset>',
     )
     theirs = mujoco.MjModel.from_xml_string(text)
     inertia = loaded(tmp_path, text).model.inertias[1]

@@ -25,7 +25,7 @@ def _table(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
 SECTIONS = words("compiler option default asset worldbody equality tendon contact actuator include")
 """Sections that are read, or looked into."""
 IGNORED_SECTIONS = words("size visual statistic sensor keyframe custom extension")
-BODY_READ = words("inertial joint freejoint geom site body frame")
+BODY_READ = words("inertial joint freejoint geom site body frame replicate")
 BODY_IGNORED = ("camera", "light")
 PLACED = "pos quat axisangle xyaxes zaxis euler"
 ATTRIBUTES = _table(
@@ -35,6 +35,7 @@ ATTRIBUTES = _table(
         "option": "gravity wind density viscosity",
         "body": f"name childclass mocap gravcomp {PLACED}",
         "frame": f"name childclass {PLACED}",
+        "replicate": "count sep offset euler",
         "inertial": f"mass diaginertia fullinertia {PLACED}",
         "joint": """name class type pos axis springdamper stiffness range limited ref springref
             armature damping frictionloss actuatorgravcomp""",
@@ -104,6 +105,7 @@ class Compiler:
     inertia_from_geom: str = "auto"
     bound_mass: float = 0.0
     bound_inertia: float = 0.0
+    balance_inertia: bool = False
     total_mass: float = -1.0
     groups: tuple[int, int] = (0, 5)
     mesh_folder: str = ""
@@ -178,6 +180,16 @@ class MjcfValues(XmlValues):
     def angle(self, value: float) -> float:
         """An angle of the file in rad."""
         return float(np.deg2rad(value)) if self.compiler.degrees else value
+
+    def euler(self, angles: FloatArray) -> FloatArray:
+        """The rotation (3, 3) of Euler angles (3,); lower-case letters of the sequence are
+        intrinsic, capitals extrinsic rotations."""
+        out = np.eye(3)
+        for letter, angle in zip(self.compiler.sequence, angles.tolist()):
+            axis = np.array(AXES[letter.lower()])
+            turn = pin.AngleAxis(self.angle(angle), axis).matrix()
+            out = out @ turn if letter.islower() else turn @ out
+        return out
 
     def quaternion(self, wxyz: FloatArray, where: str, what: str) -> FloatArray:
         """The rotation (3, 3) of a quaternion (4,) of any length, the real part first."""
@@ -269,18 +281,8 @@ class Attributes:
             case ["zaxis"]:
                 return z_along(self.direction("zaxis"))
             case ["euler"]:
-                return self._euler()
+                return values.euler(self.numbers("euler", 3))
         return np.eye(3)
-
-    def _euler(self) -> FloatArray:
-        """The rotation (3, 3) of ``euler``; lower-case letters of the sequence are intrinsic,
-        capitals extrinsic rotations."""
-        out = np.eye(3)
-        for letter, angle in zip(self.values.compiler.sequence, self.numbers("euler", 3)):
-            axis = np.array(AXES[letter.lower()])
-            turn = pin.AngleAxis(self.values.angle(angle), axis).matrix()
-            out = out @ turn if letter.islower() else turn @ out
-        return out
 
 
 def z_along(direction: FloatArray) -> FloatArray:

@@ -7,7 +7,8 @@ subtracted from its limits and from the rest position of its spring.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -25,6 +26,8 @@ from srm_mbs.model.reach import Reach
 
 JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""
+MOST_REPLICATED = 10**5
+"""Number of elements that the replicates of a file add."""
 URDF_TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
 
 
@@ -45,6 +48,8 @@ class BodyReader:
         Springs of ball joints.
     references
         ``ref`` of the joints, by name.
+    compensated
+        ``gravcomp`` of moving bodies, by name.
     """
 
     def __init__(self, values: MjcfValues, reach: Reach) -> None:
@@ -56,10 +61,12 @@ class BodyReader:
         self.sites: dict[str, tuple[str, pin.SE3]] = {}
         self.forces: list[dict[str, Any]] = []
         self.references: dict[str, float] = {}
+        self.compensated: dict[str, float] = {}
         self.meshes: dict[str, Mesh] = {}
         self.colours: dict[str, str] = {}
         self._names: set[str] = set()
         self._moving: set[str] = set()
+        self._replicated = 0
 
     def world(self, node: Element) -> None:
         """Read a ``<worldbody>``."""
@@ -77,9 +84,7 @@ class BodyReader:
             raise values.fault(where, problem, "Rename one of them")
         given = values.own(node, where)
         if given.flag("mocap"):
-            raise given.fault("mocap bodies are not read by this version", "Remove mocap")
-        if given.number("gravcomp") != 0.0:
-            raise given.fault("gravcomp is not read by this version", "Remove it")
+            values.remark("a mocap body stays where the file has it", where)
         childclass = given.text("childclass", childclass)
         in_parent = around * given.placement()
         self.placements[name] = self.placements[parent] * in_parent
@@ -90,7 +95,10 @@ class BodyReader:
         # Joints first: they precede those of nested bodies.
         self._joints(node, name, parent, in_parent, childclass)
         self._contents(node, name, pin.SE3.Identity(), childclass, found)
-        self.bodies[name] = self._finished(name, found["inertial"], found["geom"])
+        self.bodies[name] = body = self._finished(name, found["inertial"], found["geom"])
+        compensated = given.number("gravcomp")
+        if compensated and body.inertia is not None and name in self._moving:
+            self.compensated[name] = compensated
 
     def _contents(
         self,
@@ -103,7 +111,7 @@ class BodyReader:
         """Read the elements of a body or of a ``<frame>``; geoms and inertials into ``found``."""
         values = self.values
         where = f"body {name!r}"
-        many = ("geom", "site", "body", "frame", "joint")
+        many = ("geom", "site", "body", "frame", "joint", "replicate")
         values.children(node, where, BODY_READ, BODY_IGNORED, many)
         for child in node:
             match child.tag:
@@ -125,8 +133,38 @@ class BodyReader:
                         )
                     inside = given.text("childclass", childclass)
                     self._contents(child, name, around * given.placement(), inside, found)
+                case "replicate":
+                    for copied, place in self._replicas(child, where):
+                        self._contents(copied, name, around * place, childclass, found)
                 case "joint" | "freejoint" if name == WORLD:
                     raise values.fault("<worldbody>", "the world has no joints", "Put it in a body")
+
+    def _replicas(self, node: Element, where: str) -> Iterator[tuple[Element, pin.SE3]]:
+        """The copies of a ``<replicate>``, whose names end with their numbers, and the placement of
+        each."""
+        values = self.values
+        given = values.own(node, f"{where}, <replicate>")
+        count = int(given.number("count"))
+        if count < 1 or count != given.number("count"):
+            raise given.fault("count is not a positive whole number", "Give the number of copies")
+        self._replicated += count * sum(1 for _ in node.iter())
+        if self._replicated > MOST_REPLICATED:
+            raise given.fault(
+                f"it makes more than {MOST_REPLICATED} elements", "Give a lower count"
+            )
+        if node.find("joint") is not None or node.find("freejoint") is not None:
+            raise given.fault("a joint inside a <replicate> is not read", "Put it into a body")
+        angles = given.numbers("euler", 3, "0 0 0")
+        offset, place = given.numbers("offset", 3, "0 0 0"), pin.SE3.Identity()
+        for k in range(count):
+            copied = deepcopy(node)
+            for inner in copied.iter():
+                if "name" in inner.attrib:
+                    number = str(k).zfill(len(str(count - 1)))
+                    inner.attrib["name"] += given.text("sep") + number
+            yield copied, place
+            # MuJoCo multiplies the angles, not the rotation.
+            place = pin.SE3(values.euler((k + 1) * angles), place.act(offset))
 
     def _site(self, node: Element, body: str, around: pin.SE3, childclass: str) -> None:
         name = node.get("name")
@@ -170,12 +208,28 @@ class BodyReader:
     def _bounded(self, inertia: pin.Inertia | None) -> pin.Inertia | None:
         """The inertia with at least the mass and principal moments that the compiler demands."""
         compiler = self.values.compiler
-        if not (compiler.bound_mass or compiler.bound_inertia):
+        if not (compiler.bound_mass or compiler.bound_inertia or compiler.balance_inertia):
             return inertia
         inertia = pin.Inertia.Zero() if inertia is None else inertia
         principal, axes = np.linalg.eigh(inertia.inertia)
-        about = axes @ np.diag(np.maximum(principal, compiler.bound_inertia)) @ axes.T
+        principal = np.maximum(principal, compiler.bound_inertia)
+        if compiler.balance_inertia and principal[0] + principal[1] < principal[2]:
+            principal[:] = principal.mean()
+        about = axes @ np.diag(principal) @ axes.T
         return pin.Inertia(max(inertia.mass, compiler.bound_mass), inertia.lever, about)
+
+    def compensation(self, gravity: FloatArray) -> list[dict[str, Any]]:
+        """The forces (``gravcomp``) that carry a part of the weight of bodies; ``gravity`` (3,)."""
+        forces = []
+        for name, part in self.compensated.items():
+            inertia = self.bodies[name].inertia
+            if inertia is not None and gravity.any():
+                at = anchor(name, pin.SE3(np.eye(3), inertia.lever))
+                force = (-part * inertia.mass * gravity).tolist()
+                forces.append(
+                    {"type": "wrench", "name": f"{name}::gravcomp", "at": at, "force": force}
+                )
+        return forces
 
     def rescale(self) -> None:
         """Scale all inertias so that the total mass is ``settotalmass``."""

@@ -10,6 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import read_text, shortened
@@ -23,6 +25,8 @@ from srm_mbs.formats.xml import check_tree, parse_xml
 from srm_mbs.model.reach import Reach
 
 GRAVITY = "0 0 -9.81"
+THIN = {"density": (2.0, "kg/m^3"), "viscosity": (1e-4, "Pa s")}
+"""Media whose drag is left out, with a note: gases such as air."""
 FORCES_OFF = ("passive", "spring", "damper", "frictionloss", "constraint")
 """Flags that would disable forces that this package applies."""
 
@@ -63,8 +67,7 @@ def _compiler(values: MjcfValues, node: Element) -> None:
     compiler.autolimits = given.flag("autolimits", compiler.autolimits)
     if "inertiafromgeom" in given:
         compiler.inertia_from_geom = given.choice("inertiafromgeom", ("auto", "true", "false"))
-    if given.flag("balanceinertia"):
-        raise given.fault("balanceinertia is not read by this version", "Remove it")
+    compiler.balance_inertia = given.flag("balanceinertia", compiler.balance_inertia)
     compiler.bound_mass = given.number("boundmass", compiler.bound_mass)
     compiler.bound_inertia = given.number("boundinertia", compiler.bound_inertia)
     compiler.total_mass = given.number("settotalmass", compiler.total_mass)
@@ -82,9 +85,12 @@ def _option(values: MjcfValues, nodes: list[Element]) -> tuple[list[float], bool
         given = values.own(node, "<option>")
         values.children(node, "<option>", ("flag",), ())
         gravity = given.text("gravity", gravity)
-        for key in ("density", "viscosity"):
-            if given.number(key) != 0.0:
-                raise given.fault(f"the {key} of a medium is not read", "Remove it")
+        for key, (most, unit) in THIN.items():
+            if given.number(key) > most:
+                problem = f"the drag of a medium does not act, and its {key} is above {most} {unit}"
+                raise given.fault(problem, f"Remove {key} if the drag is negligible")
+            if given.number(key):
+                values.remark(f"the drag of the medium ({key}) does not act", "<option>")
         for flag in node.findall("flag"):
             off = {key for key, word in flag.attrib.items() if word == "disable"}
             refused = next((key for key in FORCES_OFF if key in off), None)
@@ -192,7 +198,7 @@ def translate(document: Document, options: Options) -> Translation:
         values.notes(),
         gravity=gravity,
         loop=closures.loops,
-        force=[*tree.forces, *closures.forces],
+        force=[*tree.forces, *closures.forces, *tree.compensation(np.array(gravity))],
         lock=closures.lock,
         initial={"q": closures.held} if closures.held else {},
     )

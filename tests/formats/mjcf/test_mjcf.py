@@ -33,7 +33,17 @@ from tests.support.sdf_files import cassie
 
 mujoco = pytest.importorskip("mujoco")
 
-FILES = {"tree": TREE, "four_bar": FOUR_BAR, "two_loops": TWO_LOOPS}
+REPLICATES = """<mujoco><compiler angle="degree" balanceinertia="true"/><worldbody>
+  <body name="hub"><joint name="turn" axis="0 0 1"/><geom size="0.1"/>
+    <replicate count="11" offset="0.1 0 0.02" euler="0 20 30" sep="_">
+      <body name="arm" pos="0.5 0 0" gravcomp="0.7"><joint name="bend" axis="0 1 0"/>
+        <geom name="bar" type="box" size="0.2 0.01 0.02" pos="0.2 0 0"/>
+        <replicate count="2" offset="0 0.1 0"><geom name="tip" size="0.02"/></replicate>
+      </body></replicate>
+    <body name="odd" pos="0 0 1" gravcomp="1"><joint name="j" axis="1 0 0"/>
+      <inertial pos="0 0.1 0" mass="1" diaginertia="0.1 0.2 0.6"/></body>
+  </body></worldbody></mujoco>"""
+FILES = {"tree": TREE, "four_bar": FOUR_BAR, "two_loops": TWO_LOOPS, "replicates": REPLICATES}
 
 
 @pytest.fixture(autouse=True)

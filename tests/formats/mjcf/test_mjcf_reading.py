@@ -52,12 +52,14 @@ def test_included_files_stand_in_the_place_of_the_include(tmp_path: Path) -> Non
 
 def test_what_gives_no_force_is_noted() -> None:
     more = (
+        '<option density="1.2" viscosity="1.8e-5"/>'
         '<actuator><motor joint="j"/></actuator><sensor/><keyframe/>'
         '<contact><exclude body1="one" body2="two"/></contact>'
         '<equality><weld body1="one" body2="two" torquescale="2" solref="0.1 1"/></equality>'
     )
-    notes = " ".join(translated(file(more=more)).notes)
-    for word in ("actuators", "contact", "<sensor>", "<keyframe>", "torquescale", "solref"):
+    notes = " ".join(translated(file(TWO + '<body mocap="true"/>', more)).notes)
+    words = "density viscosity mocap actuators contact <sensor> <keyframe> torquescale solref"
+    for word in words.split():
         assert word in notes
 
 
@@ -104,17 +106,18 @@ FAULTS = {
     "twice": ('name="two"', 'name="one"'),
     "two joints": ('name="k"', 'name="j"'),
     "world": ('name="two"', 'name="world"'),
-    "mocap": ('name="two"', 'name="two" mocap="true"'),
-    "gravcomp": ('name="two"', 'name="two" gravcomp="1"'),
     "two ways": ('name="two"', 'name="two" euler="0 0 1" zaxis="1 0 0"'),
     "size": ('size="0.1"', 'size="0"'),
     "mesh": ('type="sphere" size="0.1"', 'type="mesh" mesh="m"'),
     "world joint": ("<worldbody>", "<worldbody><joint/>"),
-    "replicate": (JOINT, JOINT + '<replicate count="2"/>'),
+    "replicate of a joint": (JOINT, '<replicate count="2"><joint/></replicate>'),
+    "replicate without count": (JOINT, JOINT + '<replicate><geom size="1"/></replicate>'),
+    "replicates": (JOINT, JOINT + '<replicate count="999">' * 3 + "</replicate>" * 3),
+    "composite": (JOINT, JOINT + "<composite/>"),
     "global": ("<worldbody>", '<compiler coordinate="global"/><worldbody>'),
     "order": ("<worldbody>", '<compiler eulerseq="xyw"/><worldbody>'),
     "angle": ("<worldbody>", '<compiler angle="grad"/><worldbody>'),
-    "medium": ("<worldbody>", '<option density="1.2"/><worldbody>'),
+    "medium": ("<worldbody>", '<option density="1000"/><worldbody>'),
     "flag": ("<worldbody>", '<option><flag spring="disable"/></option><worldbody>'),
     "default": ("<worldbody>", "<default><jount/></default><worldbody>"),
     "soft": ("<worldbody>", "<deformable/><worldbody>"),

@@ -209,6 +209,8 @@ def main(fault: str, count: int, folder: Path) -> dict[str, Any]:
     """Outcomes of ``count`` trials of each file: name -> outcome -> number."""
     # A child of one process with threads: none of them is in the middle of anything.
     warnings.simplefilter("ignore", DeprecationWarning)
+    # A shell starts what runs in its background with SIGINT ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     trials = Trials(fault, folder)
     try:
         outcomes = {

@@ -177,7 +177,14 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary: Path | None = None
     held: int | None = None
     try:
-        temporary, held = _locked_beside(target)
+        while temporary is None:
+            # Known before it exists: Ctrl-C may come at any moment.
+            temporary = _beside(target)
+            if fcntl is not None:
+                held = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+                if not _is_locked(held):
+                    os.close(held)
+                    temporary = held = None
         _remove_abandoned(target.parent)
         yield temporary
         _finish(temporary, target)
@@ -192,25 +199,22 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.close(held)
 
 
-def _locked_beside(target: Path) -> tuple[Path, int | None]:
-    """An empty file in the folder of ``target``, and its locked descriptor; where there are no
-    locks, a path without a file and None."""
+def _beside(target: Path) -> Path:
+    """The path of a temporary file in the folder of ``target``."""
     suffix = target.suffix if len(target.suffix) <= LONGEST_SUFFIX else ""
-    while True:
-        path = target.with_name(f".srm-{secrets.token_hex(8)}{suffix}")
-        if fcntl is None:
-            return path, None
-        opened = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        try:
-            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.fstat(opened).st_nlink:
-                return path, opened
-        except BlockingIOError:
-            pass
-        except OSError:  # not every file system can
-            return path, opened
-        # Another writer took it for abandoned before it was locked.
-        os.close(opened)
+    return target.with_name(f".srm-{secrets.token_hex(8)}{suffix}")
+
+
+def _is_locked(opened: int) -> bool:
+    """Lock a temporary file; False if another writer took it for abandoned before that."""
+    assert fcntl is not None
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # not every file system can
+        return True
+    return os.fstat(opened).st_nlink > 0
 
 
 def _remove_abandoned(folder: Path) -> None:

@@ -168,6 +168,7 @@ class Trials:
             return child
         status = 1
         try:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
             before()
             write(path)
             status = 0
@@ -209,8 +210,7 @@ def main(fault: str, count: int, folder: Path) -> dict[str, Any]:
     """Outcomes of ``count`` trials of each file: name -> outcome -> number."""
     # A child of one process with threads: none of them is in the middle of anything.
     warnings.simplefilter("ignore", DeprecationWarning)
-    # A shell starts what runs in its background with SIGINT ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # but in the children
     trials = Trials(fault, folder)
     try:
         outcomes = {

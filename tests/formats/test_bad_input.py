@@ -490,7 +490,6 @@ URDF_FAULTS = {
     "nan damping": ('"0.5"', '"nan"'),
     "negative friction": ('"0.5"', '"0.5" friction="-1"'),
     "nan friction": ('"0.5"', '"0.5" friction="nan"'),
-    "friction of a floating joint": (END, joint_c("floating", '<dynamics friction="2"/>')),
     # the tree
     "no limit": ('<limit lower="-10" upper="10" effort="1" velocity="1"/>', ""),
     "no effort": (' effort="1"', ""),
@@ -500,7 +499,6 @@ URDF_FAULTS = {
     "planar along x": (END, joint_c("planar")),
     "planar along y": (END, joint_c("planar", '<axis xyz="0 1 0"/>')),
     "planar downwards": (END, joint_c("planar", '<axis xyz="0 0 -1"/>')),
-    "damped floating joint": (END, joint_c("floating", '<dynamics damping="2"/>')),
     "joint without name": ('name="hinge" ', ""),
     "link without name": ('<link name="base"/>', "<link/>"),
     "two joints of one name": ('"knee"', '"hinge"'),

@@ -33,6 +33,8 @@ FREEDOM = {
     "floating": 6,
 }
 """Degrees of freedom of the types of joint."""
+ROOT_JOINT = "root_joint"
+"""Pinocchio's name for the joint of a floating or planar base."""
 NO_LIMIT = 1e16
 """The number that SDF writes for "no limit" (any unit); limits do not act."""
 

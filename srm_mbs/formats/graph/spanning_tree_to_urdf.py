@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -19,6 +19,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.joint_graph import (
+    ROOT_JOINT,
     Body,
     Joint,
     SpanningTree,
@@ -314,7 +315,7 @@ class GraphTranslator:
     root
         The body that floats if nothing connects it with the ground.
     free
-        Bodies that move freely beside others, and the names of their joints.
+        Floating joints of bodies that nothing else connects with the ground, by body.
     notes
         Sentences about the translation.
     """
@@ -325,7 +326,7 @@ class GraphTranslator:
     placements: Mapping[str, pin.SE3]
     joints: Sequence[Joint]
     root: str
-    free: Mapping[str, str] = field(default_factory=dict)
+    free: Mapping[str, Joint] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def translate(self, cut: Sequence[str] = ()) -> Translation:
@@ -356,25 +357,30 @@ class GraphTranslator:
         parts = [part for part in components(self.bodies, self.joints) if part != [WORLD]]
         free = [part for part in parts if WORLD not in part]
         if len(parts) == 1 and free:
-            root = self.root
-            if is_identity(self.placements[root]):
+            root, joint = self.root, self.free.get(self.root)
+            if not is_identity(self.placements[root]):
+                self.bodies = {MODEL_FRAME: Body(MODEL_FRAME), **self.bodies}
+                name = f"{MODEL_FRAME}::{root}"
+                held = Joint(name, "fixed", MODEL_FRAME, root, self.placements[root])
+                self.joints = (held, *self.joints)
+                root = MODEL_FRAME
+            if joint is None or not (joint.damping or joint.friction):
                 return "floating", root
-            self.bodies = {MODEL_FRAME: Body(MODEL_FRAME), **self.bodies}
-            name = f"{MODEL_FRAME}::{root}"
-            held = Joint(name, "fixed", MODEL_FRAME, root, self.placements[root])
-            self.joints = (held, *self.joints)
-            return "floating", MODEL_FRAME
+            # With damping it has to stand in the URDF.
+            free_base = replace(joint, name=ROOT_JOINT, child=root, in_parent=pin.SE3.Identity())
+            self.joints = (*self.joints, free_base)
+            return "fixed", WORLD
         for part in free:
-            known = next((body for body in part if body in self.free), None)
-            body = known or (self.root if self.root in part else part[0])
-            name = self.free.get(body, f"{body}::free")
-            moving = Joint(name, "floating", WORLD, body, self.placements[body])
-            self.joints = (*self.joints, moving)
-            if known is None:
+            joint = next((self.free[body] for body in part if body in self.free), None)
+            if joint is None:
+                body = self.root if self.root in part else part[0]
+                name = f"{body}::free"
+                joint = Joint(name, "floating", WORLD, body, self.placements[body])
                 self.notes.append(
                     f"nothing connects {body!r} with the ground: it moves freely by the joint "
                     f"{name!r}"
                 )
+            self.joints = (*self.joints, joint)
         return "fixed", WORLD
 
     def _fault(self, joint: Joint, problem: str, remedy: str) -> InputError:

@@ -52,8 +52,9 @@ ATTRIBUTES = _table(
         "material": "name class rgba",
     }
 )
-"""Attributes that are read; those of a joint equality are in JOINT_EQUALITY."""
+"""Attributes that are read; those of equalities between coordinates follow."""
 JOINT_EQUALITY = words("name class active joint1 joint2 polycoef")
+TENDON_EQUALITY = words("name class active tendon1 tendon2 polycoef")
 CONTACT = "solref solimp margin gap user"
 IGNORED_ATTRIBUTES = _table(
     {
@@ -112,12 +113,16 @@ class Compiler:
 
 
 class MjcfValues(XmlValues):
-    """Values of one file, with its compiler settings and default classes."""
+    """Values of one file, with its compiler settings and default classes.
+
+    ``off`` has the kinds of force that ``<flag>`` disables.
+    """
 
     def __init__(self, file: str) -> None:
         super().__init__(file)
         self.compiler = Compiler()
         self.classes: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
+        self.off: set[str] = set()
 
     def read_defaults(self, node: Element, parent: str | None = None) -> None:
         """Read a ``<default>`` and those inside it."""

@@ -28,6 +28,8 @@ JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""
 MOST_REPLICATED = 10**5
 """Number of elements that the replicates of a file add."""
+FLAGS = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
+"""Properties of a joint, and the flags that switch them off."""
 URDF_TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
 
 
@@ -41,13 +43,15 @@ class BodyReader:
     joints
         One for each joint of MuJoCo; welded bodies have a fixed one.
     free
-        Bodies with a free joint, and its name.
+        Free joints by body.
     sites
         Body and placement in it, by name.
     forces
         Springs of ball joints.
     references
         ``ref`` of the joints, by name.
+    added
+        Armatures of free joints by body.
     compensated
         ``gravcomp`` of moving bodies, by name.
     """
@@ -57,7 +61,8 @@ class BodyReader:
         self.bodies: dict[str, Body] = {}
         self.placements: dict[str, pin.SE3] = {WORLD: pin.SE3.Identity()}
         self.joints: list[Joint] = []
-        self.free: dict[str, str] = {}
+        self.free: dict[str, Joint] = {}
+        self.added: dict[str, float] = {}
         self.sites: dict[str, tuple[str, pin.SE3]] = {}
         self.forces: list[dict[str, Any]] = []
         self.references: dict[str, float] = {}
@@ -219,17 +224,37 @@ class BodyReader:
         return pin.Inertia(max(inertia.mass, compiler.bound_mass), inertia.lever, about)
 
     def compensation(self, gravity: FloatArray) -> list[dict[str, Any]]:
-        """The forces (``gravcomp``) that carry a part of the weight of bodies; ``gravity`` (3,)."""
-        forces = []
-        for name, part in self.compensated.items():
-            inertia = self.bodies[name].inertia
-            if inertia is not None and gravity.any():
-                at = anchor(name, pin.SE3(np.eye(3), inertia.lever))
-                force = (-part * inertia.mass * gravity).tolist()
-                forces.append(
-                    {"type": "wrench", "name": f"{name}::gravcomp", "at": at, "force": force}
-                )
-        return forces
+        """The forces that carry weight, in the field ``gravity`` (3,): a part of that of bodies
+        (``gravcomp``), and all of that of the armatures of free joints, which are added to their
+        bodies here.
+
+        The armature a of a free joint adds a to each diagonal element of its mass matrix: a body
+        with the mass a at the joint and the moments of inertia a does the same.
+        """
+        carried = []
+        compensated = {} if "gravcomp" in self.values.off else self.compensated
+        for name, part in compensated.items():
+            if (inertia := self.bodies[name].inertia) is not None:
+                carried.append((name, "gravcomp", inertia.lever, part * inertia.mass))
+        for name, armature in self.added.items():
+            body = self.bodies[name]
+            rotor = pin.Inertia(armature, np.zeros(3), armature * np.eye(3))
+            inertia = rotor if body.inertia is None else body.inertia + rotor
+            self.bodies[name] = replace(body, inertia=inertia)
+            carried.append((name, "armature", np.zeros(3), armature))
+            self.values.remark(
+                "the armature of a free joint is part of the inertia of its body", f"body {name!r}"
+            )
+        return [
+            {
+                "type": "wrench",
+                "name": f"{name}::{what}",
+                "at": anchor(name, pin.SE3(np.eye(3), lever)),
+                "force": (-mass * gravity).tolist(),
+            }
+            for name, what, lever, mass in carried
+            if gravity.any()
+        ]
 
     def rescale(self) -> None:
         """Scale all inertias so that the total mass is ``settotalmass``."""
@@ -293,17 +318,15 @@ class BodyReader:
                 raise given.fault(
                     "only a body of the world, with no other joint, moves freely", "Use ball"
                 )
-            if any(acting.values()):
-                raise given.fault(
-                    "damping, friction, armature and stiffness of a free joint are not read",
-                    "Set them to 0",
-                )
-            self.free[child] = name
+            self._spring(Joint(name, "floating", parent, child, at), acting.pop("stiffness"))
+            if armature := acting.pop("armature"):
+                self.added[child] = armature
+            self.free[child] = Joint(name, "floating", parent, child, at, **acting)
             return None
         where_it_is = pin.SE3(np.eye(3), given.numbers("pos", 3, "0 0 0"))
         placed = Joint(name, URDF_TYPES[kind], parent, child, at * where_it_is, where_it_is)
         if kind == "ball":
-            self._ball_spring(placed, acting.pop("stiffness"))
+            self._spring(placed, acting.pop("stiffness"))
             return replace(placed, **acting)
         x, y, z = given.direction("axis", "0 0 1").tolist()
         in_si = values.angle if kind == "hinge" else float
@@ -312,16 +335,18 @@ class BodyReader:
         limits = _limits(given, in_si, ref)
         return replace(placed, axis=(x, y, z), rest=rest, **limits, **acting)
 
-    def _ball_spring(self, joint: Joint, stiffness: float) -> None:
-        """The spring of a ball joint, with a moment of -k times the rotation vector: a bushing."""
+    def _spring(self, joint: Joint, stiffness: float) -> None:
+        """The spring of a ball or free joint, with a moment of -k times the rotation vector and a
+        force of -k times the displacement: a bushing."""
         if stiffness:
+            moves = 0.0 if joint.type == "spherical" else stiffness
             self.forces.append(
                 {
                     "type": "bushing",
                     "name": f"{joint.name}::spring",
                     "a": anchor(joint.child, joint.in_child),
                     "b": anchor(joint.parent, joint.in_parent),
-                    "stiffness": [0.0, 0.0, 0.0, stiffness, stiffness, stiffness],
+                    "stiffness": [moves, moves, moves, stiffness, stiffness, stiffness],
                 }
             )
 
@@ -354,6 +379,9 @@ def _acting(given: Attributes) -> dict[str, Any]:
     for key, value in found.items():
         if value < 0.0:
             raise given.fault(f"its {key} is negative", "Give a value >= 0")
+    for key, flag in FLAGS.items():
+        if flag in given.values.off:
+            found[key] = 0.0
     if found["friction"]:
         given.values.remark(
             "frictionloss acts as smoothed Coulomb friction, not as MuJoCo's soft constraint",

@@ -5,7 +5,8 @@ MuJoCo's constraints are soft (``solref``, ``solimp``); the closures are rigid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -13,14 +14,27 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
-from srm_mbs.formats.mjcf.attributes import JOINT_EQUALITY, MAIN, Attributes, MjcfValues
+from srm_mbs.formats.mjcf.attributes import (
+    JOINT_EQUALITY,
+    MAIN,
+    TENDON_EQUALITY,
+    Attributes,
+    MjcfValues,
+)
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.model.anchors import WORLD
 
-KINDS = ("connect", "weld", "joint")
-REFUSED = ("tendon", "flex", "flexvert", "flexstrain", "distance")
-ACTING = ("stiffness", "damping", "frictionloss", "armature")
-"""Attributes by which a tendon acts."""
+KINDS = ("connect", "weld", "joint", "tendon")
+REFUSED = ("flex", "flexvert", "flexstrain", "distance")
+ACTING = {
+    "stiffness": "spring",
+    "damping": "damper",
+    "frictionloss": "frictionloss",
+    "armature": "",
+}
+"""Attributes by which a tendon acts, and the flags that switch them off."""
+POLYNOMIALS = {"joint": JOINT_EQUALITY, "tendon": TENDON_EQUALITY}
+"""Attributes of equality constraints between coordinates."""
 Placed = tuple[str, pin.SE3]
 """A body and a placement in its frame."""
 
@@ -34,8 +48,13 @@ class EqualityReader:
         Entries ``loop``, ``force``, ``lock`` and ``initial.q`` of a description.
     """
 
-    def __init__(self, values: MjcfValues, tree: BodyReader) -> None:
+    def __init__(self, values: MjcfValues, tree: BodyReader, sections: Sequence[Element]) -> None:
         self.values, self.tree = values, tree
+        self._tendons: list[tuple[str, Element]] = []
+        for section in sections:
+            values.children(section, "<tendon>", ("spatial", "fixed"), (), ("spatial", "fixed"))
+            for i, node in enumerate(section):
+                self._tendons.append((node.get("name") or f"{node.tag}_tendon_{i + 1}", node))
         self.loops: list[dict[str, Any]] = []
         self.forces: list[dict[str, Any]] = []
         self.lock: list[str] = []
@@ -43,9 +62,10 @@ class EqualityReader:
 
     # Equality -------------------------------------------------------------------------------
 
-    def equality(self, section: Element, disabled: bool) -> None:
-        """Read an ``<equality>`` section; ``disabled`` by the flag of ``<option>``."""
+    def equality(self, section: Element) -> None:
+        """Read an ``<equality>`` section."""
         values = self.values
+        disabled = "equality" in values.off
         values.children(section, "<equality>", (*KINDS, *REFUSED), (), (*KINDS, *REFUSED))
         for node in section:
             name = node.get("name") or f"{node.tag}_{len(self.loops) + len(self.lock) + 1}"
@@ -60,16 +80,20 @@ class EqualityReader:
                 )
             if given.text("solref") or given.text("solimp"):
                 values.remark("solref and solimp (softness) do not act: closures are rigid", name)
-            {"connect": self._connect, "weld": self._weld, "joint": self._joint}[node.tag](
-                name, given
-            )
+            kinds = {
+                "connect": self._connect,
+                "weld": self._weld,
+                "joint": self._joint,
+                "tendon": self._tendon,
+            }
+            kinds[node.tag](name, given)
 
     def _given(self, node: Element, where: str) -> Attributes:
         values = self.values
         if node.tag in REFUSED:
             return Attributes(values, node.attrib, where)
-        if node.tag == "joint":  # not the joints of the tree
-            values.attributes(node, where, (*JOINT_EQUALITY, "solref", "solimp"))
+        if node.tag in POLYNOMIALS:  # not the joints and tendons of the file
+            values.attributes(node, where, (*POLYNOMIALS[node.tag], "solref", "solimp"))
             name = node.get("class", MAIN)
             if name not in values.classes:
                 raise values.fault(where, f"there is no default class {name!r}", "Define it")
@@ -141,47 +165,90 @@ class EqualityReader:
 
     def _joint(self, name: str, given: Attributes) -> None:
         """q_1 = a_0 + a_1 q_2 with positions that are zero at the references of MuJoCo."""
-        coefficients = given.numbers("polycoef", (1, 2, 3, 4, 5), "0 1 0 0 0")
-        coefficients = np.append(coefficients, [0.0, 1.0, 0.0, 0.0, 0.0][coefficients.size :])
         names = [given.text(key) for key in ("joint1", "joint2") if key in given]
         if "joint1" not in given:
             raise given.fault("it has no joint1", "Name the joint that follows")
-        for joint in names:
-            if joint not in self.tree.references:
-                problem = f"there is no hinge or slide {joint!r}"
-                raise self.values.unknown(given.where, problem, self.tree.references)
-        offset, ratio = float(coefficients[0]), float(coefficients[1])
-        if len(names) == 1:
-            self.lock.append(names[0])
-            if offset:
-                self.held[names[0]] = offset
-            return
-        if coefficients[2:].any():
+        if len(names) == 2 and names[0] == names[1]:
+            raise given.fault("joint1 and joint2 are the same", "Name two joints")
+        self._couple(name, given, [{joint: 1.0} for joint in names])
+
+    def _tendon(self, name: str, given: Attributes) -> None:
+        """L_1 = a_0 + a_1 L_2 of the lengths of fixed tendons, against those of the references."""
+        if "tendon1" not in given:
+            raise given.fault("it has no tendon1", "Name a fixed tendon")
+        sides = []
+        for key in ("tendon1", "tendon2"):
+            if key in given:
+                found = dict(self._tendons).get(given.text(key))
+                if found is None or found.tag != "fixed":
+                    fixed = [known for known, node in self._tendons if node.tag == "fixed"]
+                    problem = f"there is no fixed tendon {given.text(key)!r}"
+                    raise self.values.unknown(given.where, problem, fixed)
+                sides.append(self._coefficients(given.text(key), found))
+        self._couple(name, given, sides)
+
+    def _coefficients(self, name: str, node: Element) -> dict[str, float]:
+        """What the positions of joints are multiplied by in the length of a fixed tendon."""
+        out: dict[str, float] = defaultdict(float)
+        for child in node:
+            given = Attributes(self.values, child.attrib, f"tendon {name!r}, <{child.tag}>")
+            out[given.text("joint")] += given.number("coef")
+        return out
+
+    def _couple(self, name: str, given: Attributes, sides: Sequence[Mapping[str, float]]) -> None:
+        """y_1 = a_0 + a_1 y_2, each y a sum of multiples of joint positions; without y_2,
+        y_1 = a_0."""
+        polynomial = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
+        coefficients = given.numbers("polycoef", (1, 2, 3, 4, 5), "0 1 0 0 0")
+        polynomial[: coefficients.size] = coefficients
+        if len(sides) > 1 and polynomial[2:].any():
             raise given.fault(
                 "the coefficients of the powers 2 to 4 in polycoef are not zero",
                 "Give a linear relation of two joints; others are not read by this version",
             )
-        if names[0] == names[1]:
-            raise given.fault("joint1 and joint2 are the same", "Name two joints")
-        self.loops.append(
-            {"name": name, "type": "coupling", "joints": names, "ratio": ratio, "offset": offset}
-        )
+        factors = defaultdict(float, sides[0])
+        for joint, factor in sides[-1].items() if len(sides) > 1 else ():
+            factors[joint] -= float(polynomial[1]) * factor
+        for joint in factors:
+            if joint not in self.tree.references:
+                problem = f"there is no hinge or slide {joint!r}"
+                raise self.values.unknown(given.where, problem, self.tree.references)
+        match [(joint, factor) for joint, factor in factors.items() if factor]:
+            case [(joint, factor)]:
+                self.lock.append(joint)
+                if polynomial[0]:
+                    self.held[joint] = float(polynomial[0]) / factor
+            case [(joint, factor), (other, its_own)]:
+                self.loops.append(
+                    {
+                        "name": name,
+                        "type": "coupling",
+                        "joints": [joint, other],
+                        "ratio": -its_own / factor + 0.0,
+                        "offset": float(polynomial[0]) / factor,
+                    }
+                )
+            case terms:
+                raise given.fault(
+                    f"it couples {len(terms)} joints, and not one or two",
+                    'Remove it, or write active="false"',
+                )
 
     # Tendons --------------------------------------------------------------------------------
 
-    def tendons(self, section: Element) -> None:
-        """Read a ``<tendon>`` section: springs between two sites act, the rest is no force."""
+    def springs(self) -> None:
+        """Read the forces of tendons: springs between two sites act, the rest is no force."""
         values = self.values
-        values.children(section, "<tendon>", ("spatial", "fixed"), (), ("spatial", "fixed"))
-        for i, node in enumerate(section):
-            name = node.get("name") or f"{node.tag}_tendon_{i + 1}"
+        for name, node in self._tendons:
             where = f"tendon {name!r}"
             if node.tag == "spatial":
                 given = values.resolved(node, "", where, "tendon")
             else:
                 defaults = values.classes[MAIN].get("tendon", {})
                 given = Attributes(values, {**defaults, **node.attrib}, where)
-            stiffness, damping, friction, armature = map(given.number, ACTING)
+            stiffness, damping, friction, armature = (
+                0.0 if flag in values.off else given.number(key) for key, flag in ACTING.items()
+            )
             if not (stiffness or damping or friction or armature):
                 values.ignore("<tendon> without stiffness or damping")
                 continue

@@ -10,8 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-import numpy as np
-
+from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import read_text, shortened
@@ -27,8 +26,11 @@ from srm_mbs.model.reach import Reach
 GRAVITY = "0 0 -9.81"
 THIN = {"density": (2.0, "kg/m^3"), "viscosity": (1e-4, "Pa s")}
 """Media whose drag is left out, with a note: gases such as air."""
-FORCES_OFF = ("passive", "spring", "damper", "frictionloss", "constraint")
-"""Flags that would disable forces that this package applies."""
+INCLUDED = {
+    "passive": ("spring", "damper", "gravcomp"),
+    "constraint": ("equality", "frictionloss"),
+}
+"""Flags that disable several kinds of force, and those kinds."""
 
 
 def _expanded(
@@ -78,9 +80,9 @@ def _compiler(values: MjcfValues, node: Element) -> None:
     compiler.mesh_folder = given.text("meshdir", folder)
 
 
-def _option(values: MjcfValues, nodes: list[Element]) -> tuple[list[float], bool]:
-    """Gravity, and whether equality constraints are switched off."""
-    gravity, disabled = GRAVITY, False
+def _option(values: MjcfValues, nodes: list[Element]) -> FloatArray:
+    """Gravity (3,); kinds of force that are switched off go into ``values``."""
+    gravity = GRAVITY
     for node in nodes:
         given = values.own(node, "<option>")
         values.children(node, "<option>", ("flag",), ())
@@ -93,14 +95,10 @@ def _option(values: MjcfValues, nodes: list[Element]) -> tuple[list[float], bool
                 values.remark(f"the drag of the medium ({key}) does not act", "<option>")
         for flag in node.findall("flag"):
             off = {key for key, word in flag.attrib.items() if word == "disable"}
-            refused = next((key for key in FORCES_OFF if key in off), None)
-            if refused:
-                problem = f'<flag {refused}="disable"> is not read'
-                raise given.fault(problem, "Remove what is disabled")
-            if "gravity" in off:
-                gravity = "0 0 0"
-            disabled |= "equality" in off
-    return values.numbers(gravity, 3, "<option>", "gravity").tolist(), disabled
+            values.off |= off.union(*(INCLUDED.get(key, ()) for key in off))
+    if "gravity" in values.off:
+        gravity = "0 0 0"
+    return values.numbers(gravity, 3, "<option>", "gravity")
 
 
 def _assets(values: MjcfValues, tree: BodyReader, section: Element) -> None:
@@ -162,7 +160,7 @@ def translate(document: Document, options: Options) -> Translation:
         _compiler(values, node)
     for node in root.findall("default"):
         values.read_defaults(node)
-    gravity, disabled = _option(values, root.findall("option"))
+    gravity = _option(values, root.findall("option"))
     tree = BodyReader(values, options.reach)
     for node in root.findall("asset"):
         _assets(values, tree, node)
@@ -171,11 +169,11 @@ def translate(document: Document, options: Options) -> Translation:
     if not tree.bodies:
         raise values.fault("<worldbody>", "there is no <body>", "Add one for every body")
     tree.rescale()
-    closures = EqualityReader(values, tree)
+    carried = tree.compensation(gravity)
+    closures = EqualityReader(values, tree, root.findall("tendon"))
     for node in root.findall("equality"):
-        closures.equality(node, disabled)
-    for node in root.findall("tendon"):
-        closures.tendons(node)
+        closures.equality(node)
+    closures.springs()
     for tag, why in (
         ("contact", "contact between bodies does not act"),
         ("actuator", "actuators give no force"),
@@ -196,9 +194,9 @@ def translate(document: Document, options: Options) -> Translation:
     made = graph.translate()
     return made.extended(
         values.notes(),
-        gravity=gravity,
+        gravity=gravity.tolist(),
         loop=closures.loops,
-        force=[*tree.forces, *closures.forces, *tree.compensation(np.array(gravity))],
+        force=[*tree.forces, *closures.forces, *carried],
         lock=closures.lock,
         initial={"q": closures.held} if closures.held else {},
     )

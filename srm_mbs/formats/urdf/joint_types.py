@@ -23,6 +23,8 @@ import pinocchio as pin
 
 from srm_mbs.formats.xml import words
 
+MULTIPLE = ("floating", "planar")
+"""Types of URDF with several degrees of freedom."""
 EXTENDED_TYPES = ("spherical", "universal", "screw")
 POSITION_LIMITS = ("lowerPositionLimit", "upperPositionLimit", "positionLimitMargin")
 VELOCITY_VECTORS = words(
@@ -125,7 +127,23 @@ def _copy_vectors(model: pin.Model, out: pin.Model, i: int, given: JointData | N
         return
     if new.nq == 1:
         out.lowerPositionLimit[at_q], out.upperPositionLimit[at_q] = given.limits
-    out.damping[at_v] = given.damping
-    out.friction[at_v] = given.friction
-    out.lowerDryFrictionLimit[at_v] = -given.friction
-    out.upperDryFrictionLimit[at_v] = given.friction
+    set_dynamics(out, at_v, damping=given.damping, friction=given.friction)
+
+
+def set_dynamics(
+    model: pin.Model,
+    at_v: slice,
+    armature: float | None = None,
+    damping: float | None = None,
+    friction: float | None = None,
+) -> None:
+    """Set those that are given on the velocity coordinates ``at_v``: kg m^2 (kg), N m s/rad
+    (N s/m), N m (N)."""
+    if armature is not None:
+        model.armature[at_v] = armature
+    if damping is not None:
+        model.damping[at_v] = damping
+    if friction is not None:
+        model.friction[at_v] = friction
+        model.lowerDryFrictionLimit[at_v] = -friction
+        model.upperDryFrictionLimit[at_v] = friction

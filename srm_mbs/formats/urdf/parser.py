@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError, get_logger
-from srm_mbs.formats.urdf.joint_types import take_extended, with_joints
+from srm_mbs.formats.urdf.joint_types import MULTIPLE, set_dynamics, take_extended, with_joints
 from srm_mbs.formats.urdf.validation import UrdfChecker
 
 log = get_logger(__name__)
@@ -77,7 +77,7 @@ def build_urdf(
     checker = UrdfChecker(file)
     checker.check(root, base, locked)
     unlimited = _without_limits(root, set(counting_turns) - set(locked))
-    armature = _armature(root)
+    dynamics = _take_dynamics(root)
     extended = take_extended(root)
     text = tostring(root, encoding="unicode")
     root_joint = ROOT_JOINTS[base]
@@ -101,22 +101,24 @@ def build_urdf(
     for note in checker.notes:
         log.info("%s: %s", file, note)
     model = with_joints(model, extended)
-    for name, value in armature.items():
+    for name, values in dynamics.items():
         joint = model.joints[model.getJointId(name)]
-        model.armature[joint.idx_v : joint.idx_v + joint.nv] = value
+        set_dynamics(model, slice(joint.idx_v, joint.idx_v + joint.nv), **values)
     return UrdfModel(model, tuple(checker.notes))
 
 
-def _armature(root: Element) -> dict[str, float]:
-    """Inertias of motors by joint, from ``armature`` of <dynamics>, which URDF does not have."""
+def _take_dynamics(root: Element) -> dict[str, dict[str, float]]:
+    """The values of <dynamics> by joint that Pinocchio's reader leaves out: ``armature``, which
+    URDF does not have, and damping and friction of joints of several degrees of freedom."""
     found = {}
     for joint in root.findall("joint"):
-        dynamics = joint.find("dynamics")
-        if dynamics is None or "armature" not in dynamics.attrib:
+        dynamics, kind = joint.find("dynamics"), joint.get("type")
+        if dynamics is None:
             continue
-        value = float(dynamics.attrib.pop("armature"))
-        if joint.get("type") != "fixed":
-            found[joint.get("name", "")] = value
+        keys = ("armature", "damping", "friction") if kind in MULTIPLE else ("armature",)
+        taken = {key: float(dynamics.attrib.pop(key)) for key in keys if key in dynamics.attrib}
+        if taken and kind != "fixed":
+            found[joint.get("name", "")] = taken
         if not dynamics.attrib:  # which urdfdom does not read
             joint.remove(dynamics)
     return found

@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from srm_mbs.errors import SrmWarning
-from srm_mbs.formats.graph.joint_graph import inertia_tensor
+from srm_mbs.formats.graph.joint_graph import ROOT_JOINT, inertia_tensor
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
 from srm_mbs.formats.xml import XmlFile, local_name, words
 from srm_mbs.model.anchors import WORLD
@@ -186,8 +186,6 @@ WITH_AXIS = ("revolute", "continuous", "prismatic", "planar", "universal", "scre
 WITH_LIMIT = ("revolute", "continuous", "prismatic", "screw")
 UNIVERSE = "universe"
 """Pinocchio's name for the ground."""
-ROOT_JOINT = "root_joint"
-"""Pinocchio's name for the joint of a floating or planar base."""
 PARALLEL_AXES_TOLERANCE = 1e-6
 """Axes of a universal joint at an angle (rad) below this are parallel."""
 LARGEST_TREE_DEPTH = 1000
@@ -398,12 +396,6 @@ class UrdfChecker(ElementChecker):
             value = self.number(dynamics, key, where)
             if value < 0.0:
                 raise self.fault(where, f"the {key} {value:g} is negative", "Give a value >= 0")
-            if value != 0.0 and kind in ("floating", "planar") and not locked:
-                raise self.fault(
-                    where,
-                    f"the {key} ({value:g}) of a {kind} joint is not simulated by this version",
-                    "Set it to 0; that of one-degree joints acts",
-                )
         if not dynamics.attrib:
             joint.remove(dynamics)
 

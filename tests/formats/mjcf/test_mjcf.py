@@ -43,7 +43,32 @@ REPLICATES = """<mujoco><compiler angle="degree" balanceinertia="true"/><worldbo
     <body name="odd" pos="0 0 1" gravcomp="1"><joint name="j" axis="1 0 0"/>
       <inertial pos="0 0.1 0" mass="1" diaginertia="0.1 0.2 0.6"/></body>
   </body></worldbody></mujoco>"""
-FILES = {"tree": TREE, "four_bar": FOUR_BAR, "two_loops": TWO_LOOPS, "replicates": REPLICATES}
+FREE = """<mujoco><worldbody>
+  <body name="plate" pos="0.1 0 1" euler="20 0 40">
+    <joint name="root" type="free" damping="0.4" armature="0.3" stiffness="2"/>
+    <geom type="box" size="0.1 0.2 0.03" pos="0.1 0 0"/>
+    <body name="arm" pos="0.1 0.2 0"><joint name="j" axis="0 1 0"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0.3 0 0"/></body>
+  </body>
+  <body name="stone" pos="1 0 1"><joint name="rolls" type="free" armature="0.2"/>
+    <geom size="0.1"/></body>
+  </worldbody></mujoco>"""
+TENDONS = FOUR_BAR.replace('name="pin"', 'name="pin" active="false"').replace(
+    "</equality>",
+    '<tendon name="tied" tendon1="pair" polycoef="0.2"/>'
+    '<tendon name="geared" tendon1="one" tendon2="other" polycoef="0.1 3"/></equality>'
+    '<tendon><fixed name="pair"><joint joint="a" coef="1"/><joint joint="d" coef="-2"/></fixed>'
+    '<fixed name="one"><joint joint="b" coef="1"/></fixed>'
+    '<fixed name="other"><joint joint="d" coef="0.5"/></fixed></tendon>',
+)
+FILES = {
+    "tree": TREE,
+    "free": FREE,
+    "tendons": TENDONS,
+    "four_bar": FOUR_BAR,
+    "two_loops": TWO_LOOPS,
+    "replicates": REPLICATES,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -163,7 +188,7 @@ def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
         np.testing.assert_allclose(mine, bias, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", ["four_bar", "two_loops"])
+@pytest.mark.parametrize("name", ["four_bar", "tendons", "two_loops"])
 def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
     twins = Twins(FILES[name])
     state = twins.state

@@ -37,6 +37,29 @@ def test_a_joint_equality_alone_locks_the_joint_where_it_says(tmp_path: Path) ->
     np.testing.assert_allclose(frame.placement.rotation, pin.rpy.rpyToMatrix(0, 0, 0.3), atol=1e-14)
 
 
+def test_flags_switch_forces_off() -> None:
+    one = BODY.format("one", 'j" damping="1" stiffness="2" frictionloss="3')
+    for flag, left in (
+        ("spring", (1.0, 0, 3.0)),
+        ("damper", (0.0, 1, 3.0)),
+        ("frictionloss", (1.0, 1, 0.0)),
+        ("passive", (0.0, 0, 3.0)),
+        ("constraint", (1.0, 1, 0.0)),
+    ):
+        text = file(one, f'<option><flag {flag}="disable"/></option>')
+        model = model_of(text)
+        springs = len(translated(text).entries.get("force", ()))
+        assert (model.damping[0], springs, model.friction[0]) == left, flag
+
+
+def test_a_free_joint_that_is_alone_keeps_its_damping(tmp_path: Path) -> None:
+    one = '<body name="b" pos="0 0 1"><joint type="free" {}/><geom size="0.1"/></body>'
+    plain, damped = (loaded(tmp_path, file(one.format(more))) for more in ("", 'damping="0.3"'))
+    assert plain.joint_names == damped.joint_names == ("root_joint",)
+    np.testing.assert_array_equal(plain.q0, damped.q0)
+    np.testing.assert_array_equal(damped.model.damping, np.full(6, 0.3))
+
+
 def test_limits_count_from_the_pose_of_the_file() -> None:
     text = file(BODY.format("one", 'j" ref="20" range="-10 50" axis="1 0 0'))
     model = model_of(text)
@@ -118,14 +141,15 @@ FAULTS = {
     "order": ("<worldbody>", '<compiler eulerseq="xyw"/><worldbody>'),
     "angle": ("<worldbody>", '<compiler angle="grad"/><worldbody>'),
     "medium": ("<worldbody>", '<option density="1000"/><worldbody>'),
-    "flag": ("<worldbody>", '<option><flag spring="disable"/></option><worldbody>'),
     "default": ("<worldbody>", "<default><jount/></default><worldbody>"),
     "soft": ("<worldbody>", "<deformable/><worldbody>"),
     "include": ("<worldbody>", '<include file="x.xml"/><worldbody>'),
 }  # fmt: skip
 EQUALITIES = {
     "unknown": "<glue/>",
-    "refused": '<tendon tendon1="t"/>',
+    "refused": '<distance geom1="a" geom2="b"/>',
+    "no tendon": '<tendon tendon1="t"/>',
+    "tendon": "<tendon/>",
     "body": '<connect body1="x" anchor="0 0 0"/>',
     "no body": '<connect anchor="0 0 0"/>',
     "no anchor": '<connect body1="one"/>',

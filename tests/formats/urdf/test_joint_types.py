@@ -211,3 +211,25 @@ def test_a_faulty_joint_of_these_types_is_named(tmp_path: Path) -> None:
         text = urdf(OWN | {joint: own})
         messages[fault] = refused(partial(load, tmp_path, text), tmp_path)
     check_messages("joint_types", messages)
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+@pytest.mark.parametrize("by", ["kernel", "python"])
+def test_damping_slows_a_joint_of_several_degrees_exponentially(
+    kind: str, by: str, tmp_path: Path
+) -> None:
+    if by == "kernel" and backend.core is None:
+        pytest.skip("no kernel")
+    path = tmp_path / "puck.urdf"
+    path.write_text(
+        '<robot name="puck"><link name="base"/><link name="puck"><inertial><mass value="2"/>'
+        '<inertia ixx="2" iyy="2" izz="2" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        f'<joint name="slides" type="{kind}"><parent link="base"/><child link="puck"/>'
+        '<axis xyz="0 0 1"/><dynamics damping="0.6"/></joint></robot>'
+    )
+    mechanism = srm.load(path, gravity=[0.0, 0.0, 0.0])
+    v0 = np.arange(1.0, mechanism.model.nv + 1.0)
+    speeds = srm.simulate(mechanism, 3.0, v0=v0, rtol=1e-10, backend=by).v
+    # Equal moments of inertia: the body axes do not matter.
+    kept = np.linalg.norm(speeds[-1]) / np.linalg.norm(v0)
+    np.testing.assert_allclose(kept, np.exp(-0.6 / 2.0 * 3.0), rtol=1e-8)

@@ -188,7 +188,7 @@ class EqualityReader:
         self._couple(name, given, sides)
 
     def _coefficients(self, name: str, node: Element) -> dict[str, float]:
-        """What the positions of joints are multiplied by in the length of a fixed tendon."""
+        """Factors of the positions of joints in the length of a fixed tendon."""
         out: dict[str, float] = defaultdict(float)
         for child in node:
             given = Attributes(self.values, child.attrib, f"tendon {name!r}, <{child.tag}>")

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
-import tomli_w
 
-from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.forces import ForceKinematics
-from srm_mbs.formats.toml.description import check_description, parse_toml
-from srm_mbs.formats.urdf.parser import build_urdf
-from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.integration.kernel.test_kernel import agree
 from tests.support.lockstep import compare
@@ -27,8 +20,8 @@ from tests.support.mjcf_files import (
     file,
     loaded,
     model_of,
-    translated,
 )
+from tests.support.mujoco_twins import Twins, check_dynamics, check_residuals, random_states
 from tests.support.sdf_files import cassie
 
 mujoco = pytest.importorskip("mujoco")
@@ -77,137 +70,14 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-class Twins:
-    """The translated file and MuJoCo's model, in the same state."""
-
-    def __init__(self, text: str) -> None:
-        made = self.made = translated(text)
-        self.entries = made.entries
-        self.model = build_urdf(made.tree, "x.urdf", made.entries.get("base", "fixed")).model
-        self.model.gravity.linear = np.array(made.entries["gravity"])
-        keys = {key: value for key, value in made.entries.items() if key != "loop"}
-        toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})
-        forces = check_description(parse_toml(toml, ""), "").force_elements(None)
-        self.forces = ForceKinematics(self.model, forces)
-        self.theirs = mujoco.MjModel.from_xml_string(text)
-        self.theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        self.data, self.state = self.model.createData(), mujoco.MjData(self.theirs)
-
-    def put(self, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Both in the state (q, v) of ours; returns T (nv, nv): their rates are T times ours, up
-        to what :meth:`bias` adds for a free joint."""
-        self.q = q
-        model, theirs, state = self.model, self.theirs, self.state
-        T = np.zeros((model.nv, model.nv))
-        for i in range(theirs.njnt):
-            name = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_JOINT, i)
-            index = model.getJointId(name)
-            joint = model.joints[index]
-            at_q, at_v = theirs.jnt_qposadr[i], theirs.jnt_dofadr[i]
-            mine = q[joint.idx_q : joint.idx_q + joint.nq]
-            own = slice(joint.idx_v, joint.idx_v + joint.nv)
-            T[at_v : at_v + joint.nv, own] = np.eye(joint.nv)
-            if joint.nq == 1:
-                state.qpos[at_q] = theirs.qpos0[at_q] + mine[0]
-            elif joint.nq == 4:
-                state.qpos[at_q : at_q + 4] = mine[[3, 0, 1, 2]]
-            else:
-                pose = model.jointPlacements[index] * pin.XYZQUATToSE3(mine)
-                state.qpos[at_q : at_q + 7] = pin.SE3ToXYZQUAT(pose)[[0, 1, 2, 6, 3, 4, 5]]
-                T[at_v : at_v + 3, own][:, :3] = pose.rotation
-        state.qvel[:] = T @ v
-        mujoco.mj_forward(theirs, state)
-        pin.computeAllTerms(model, self.data, q, v)
-        pin.computeJointJacobians(model, self.data, q)
-        pin.updateFramePlacements(model, self.data)
-        return T
-
-    def body(self, name: str) -> tuple[pin.SE3, pin.SE3]:
-        """Placement of a body, ours and theirs."""
-        ours = self.data.oMf[self.model.getFrameId(name, pin.FrameType.BODY)]
-        i = mujoco.mj_name2id(self.theirs, mujoco.mjtObj.mjOBJ_BODY, name)
-        return ours, pin.SE3(self.state.xmat[i].reshape(3, 3), self.state.xpos[i])
-
-    def anchor(self, entry: dict[str, Any]) -> pin.SE3:
-        joint, inside = Anchor(**entry).resolve(self.model)
-        return self.data.oMi[joint] * inside
-
-    def residuals(self) -> list[FloatArray]:
-        """What MuJoCo's residuals of the equality constraints should be."""
-        out = []
-        for loop in self.entries.get("loop", ()):
-            if loop["type"] == "coupling":
-                first, second = (
-                    self.q[self.model.joints[self.model.getJointId(name)].idx_q]
-                    for name in loop["joints"]
-                )
-                out.append(np.array([first - loop["ratio"] * second - loop["offset"]]))
-                continue
-            a, b = self.anchor(loop["a"]), self.anchor(loop["b"])
-            out.append(a.translation - b.translation)
-            if loop["type"] == "frame":
-                angle = np.linalg.norm(pin.log3(b.rotation.T @ a.rotation))
-                out.append(np.array([np.sin(0.5 * angle)]))
-        return out
-
-
-def random_states(twins: Twins, count: int = 5) -> list[tuple[FloatArray, FloatArray]]:
-    model = twins.model
-    rng = np.random.default_rng(4)
-    return [
-        (
-            pin.integrate(model, pin.neutral(model), rng.uniform(-1.2, 1.2, model.nv)),
-            rng.standard_normal(model.nv),
-        )
-        for _ in range(count)
-    ]
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
-    twins = Twins(FILES[name])
-    model, theirs, state = twins.model, twins.theirs, twins.state
-    for q, v in random_states(twins):
-        T = twins.put(q, v)
-        for i in range(1, theirs.nbody):
-            body = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_BODY, i)
-            ours, other = twins.body(body)
-            np.testing.assert_allclose(ours.homogeneous, other.homogeneous, atol=1e-12)
-        M = np.zeros((theirs.nv, theirs.nv))
-        mujoco.mj_fullM(theirs, state, M)
-        ours = np.triu(twins.data.M) + np.triu(twins.data.M, 1).T
-        np.testing.assert_allclose(ours, T.T @ M @ T, rtol=1e-10, atol=1e-12)
-        # The linear rate of a free joint is in world axes there: it turns against ours.
-        turning = np.zeros(model.nv)
-        for joint in model.joints:
-            if joint.shortname() == "JointModelFreeFlyer":
-                own = slice(joint.idx_v, joint.idx_v + 3)
-                turning[own] = np.cross(v[own.stop : own.stop + 3], v[own])
-        bias = T.T @ (state.qfrc_bias - state.qfrc_passive) + ours @ turning
-        mine = twins.data.nle + model.damping * v - twins.forces.generalised(twins.data, q, v, 0.0)
-        np.testing.assert_allclose(mine, bias, rtol=1e-9, atol=1e-10)
+    check_dynamics(Twins(FILES[name]))
 
 
 @pytest.mark.parametrize("name", ["four_bar", "tendons", "two_loops"])
 def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
-    twins = Twins(FILES[name])
-    state = twins.state
-    for q, v in random_states(twins):
-        twins.put(q, v)
-        expected = []
-        kind = state.efc_type[: state.nefc]
-        rows = state.efc_pos[: state.nefc][kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
-        at = 0
-        for loop in twins.entries["loop"]:
-            count = {"point": 3, "frame": 6, "coupling": 1}[loop["type"]]
-            own = rows[at : at + count]
-            at += count
-            expected.append(own[:3])
-            if count == 6:
-                expected.append(np.array([np.linalg.norm(own[3:])]))
-        assert at == rows.size
-        for ours, other in zip(twins.residuals(), expected, strict=True):
-            np.testing.assert_allclose(ours, other, atol=1e-12)
+    check_residuals(Twins(FILES[name]))
 
 
 def test_a_weld_without_torque_holds_the_point_that_mujoco_holds() -> None:

@@ -1,0 +1,174 @@
+"""A translated MJCF file beside MuJoCo's own model of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import tomli_w
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.formats.document import Document
+from srm_mbs.formats.mjcf.reader import translate
+from srm_mbs.formats.toml.description import check_description, parse_toml
+from srm_mbs.formats.translation import Options
+from srm_mbs.formats.urdf.parser import build_urdf
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.reach import Reach
+
+mujoco = pytest.importorskip("mujoco")
+
+
+class Twins:
+    """The translated file and MuJoCo's model, in the same state."""
+
+    def __init__(self, text: str, path: Path | None = None) -> None:
+        """``path``: where files lie that the text names."""
+        options = Options() if path is None else Options(reach=Reach.of(path))
+        made = self.made = translate(Document(text, str(path or "robot.xml")), options)
+        self.entries = made.entries
+        self.model = build_urdf(made.tree, "x.urdf", made.entries.get("base", "fixed")).model
+        self.model.gravity.linear = np.array(made.entries["gravity"])
+        keys = {key: value for key, value in made.entries.items() if key != "loop"}
+        toml = tomli_w.dumps({"format": 1, "urdf": "x.urdf", **keys})
+        forces = check_description(parse_toml(toml, ""), "").force_elements(None)
+        self.forces = ForceKinematics(self.model, forces)
+        if path is None:
+            self.theirs = mujoco.MjModel.from_xml_string(text)
+        else:
+            self.theirs = mujoco.MjModel.from_xml_path(str(path))
+        self.theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self.offsets: dict[int, FloatArray] = {}
+        self.data, self.state = self.model.createData(), mujoco.MjData(self.theirs)
+
+    def put(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Both in the state (q, v) of ours; returns T (nv, nv): their rates are T times ours, up
+        to what :meth:`bias` adds for a free joint."""
+        self.q = q
+        model, theirs, state = self.model, self.theirs, self.state
+        T = np.zeros((model.nv, model.nv))
+        for i in range(theirs.njnt):
+            name = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_JOINT, i)
+            index = model.getJointId(name if model.existJointName(name) else "root_joint")
+            joint = model.joints[index]
+            at_q, at_v = theirs.jnt_qposadr[i], theirs.jnt_dofadr[i]
+            mine = q[joint.idx_q : joint.idx_q + joint.nq]
+            own = slice(joint.idx_v, joint.idx_v + joint.nv)
+            T[at_v : at_v + joint.nv, own] = np.eye(joint.nv)
+            if joint.nq == 1:
+                state.qpos[at_q] = theirs.qpos0[at_q] + mine[0]
+            elif joint.nq == 4:
+                state.qpos[at_q : at_q + 4] = mine[[3, 0, 1, 2]]
+            else:
+                body = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_BODY, theirs.jnt_bodyid[i])
+                inside = model.frames[model.getFrameId(body, pin.FrameType.BODY)].placement
+                pose = model.jointPlacements[index] * pin.XYZQUATToSE3(mine)
+                placed = pin.SE3ToXYZQUAT(pose * inside)
+                state.qpos[at_q : at_q + 7] = placed[[0, 1, 2, 6, 3, 4, 5]]
+                # Theirs: the rate of the body's origin in world axes, and its own angular rate.
+                T[at_v : at_v + 3, own][:, :3] = pose.rotation
+                T[at_v : at_v + 3, own][:, 3:] = -pose.rotation @ pin.skew(inside.translation)
+                T[at_v + 3 : at_v + 6, own][:, 3:] = inside.rotation.T
+                self.offsets[index] = inside.translation
+        state.qvel[:] = T @ v
+        mujoco.mj_forward(theirs, state)
+        pin.computeAllTerms(model, self.data, q, v)
+        pin.computeJointJacobians(model, self.data, q)
+        pin.updateFramePlacements(model, self.data)
+        return T
+
+    def body(self, name: str) -> tuple[pin.SE3, pin.SE3]:
+        """Placement of a body, ours and theirs."""
+        ours = self.data.oMf[self.model.getFrameId(name, pin.FrameType.BODY)]
+        i = mujoco.mj_name2id(self.theirs, mujoco.mjtObj.mjOBJ_BODY, name)
+        return ours, pin.SE3(self.state.xmat[i].reshape(3, 3), self.state.xpos[i])
+
+    def anchor(self, entry: dict[str, Any]) -> pin.SE3:
+        joint, inside = Anchor(**entry).resolve(self.model)
+        return self.data.oMi[joint] * inside
+
+    def residuals(self) -> list[FloatArray]:
+        """What MuJoCo's residuals of the equality constraints should be."""
+        out = []
+        for loop in self.entries.get("loop", ()):
+            if loop["type"] == "coupling":
+                first, second = (
+                    self.q[self.model.joints[self.model.getJointId(name)].idx_q]
+                    for name in loop["joints"]
+                )
+                residual = first - loop["ratio"] * second - loop["offset"]
+                # Those of tendons have a factor of their own.
+                out.append(np.abs([residual]) / np.hypot(1.0, loop["ratio"]))
+                continue
+            a, b = self.anchor(loop["a"]), self.anchor(loop["b"])
+            out.append(a.translation - b.translation)
+            if loop["type"] == "frame":
+                angle = np.linalg.norm(pin.log3(b.rotation.T @ a.rotation))
+                out.append(np.array([np.sin(0.5 * angle)]))
+        return out
+
+
+def random_states(twins: Twins, count: int = 5) -> list[tuple[FloatArray, FloatArray]]:
+    model = twins.model
+    rng = np.random.default_rng(4)
+    return [
+        (
+            pin.integrate(model, pin.neutral(model), rng.uniform(-1.2, 1.2, model.nv)),
+            rng.standard_normal(model.nv),
+        )
+        for _ in range(count)
+    ]
+
+
+def check_dynamics(twins: Twins, atol: float = 1e-10) -> None:
+    """Poses of bodies, M and the bias with springs and dampers are those of MuJoCo."""
+    model, theirs, state = twins.model, twins.theirs, twins.state
+    for q, v in random_states(twins):
+        T = twins.put(q, v)
+        for i in range(1, theirs.nbody):
+            body = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_BODY, i)
+            if not body:
+                continue
+            ours, other = twins.body(body)
+            np.testing.assert_allclose(ours.homogeneous, other.homogeneous, atol=1e-12)
+        M = np.zeros((theirs.nv, theirs.nv))
+        mujoco.mj_fullM(theirs, state, M)
+        ours = np.triu(twins.data.M) + np.triu(twins.data.M, 1).T
+        np.testing.assert_allclose(ours, T.T @ M @ T, rtol=1e-10, atol=1e-12)
+        # The linear rate of a free joint is in world axes there: it turns against ours.
+        turning = np.zeros(model.nv)
+        for joint in model.joints:
+            if joint.shortname() == "JointModelFreeFlyer":
+                own = slice(joint.idx_v, joint.idx_v + 3)
+                rate = v[own.stop : own.stop + 3]
+                turning[own] = np.cross(rate, v[own] + np.cross(rate, twins.offsets[joint.id]))
+        bias = T.T @ (state.qfrc_bias - state.qfrc_passive) + ours @ turning
+        mine = twins.data.nle + model.damping * v - twins.forces.generalised(twins.data, q, v, 0.0)
+        np.testing.assert_allclose(mine, bias, rtol=1e-9, atol=atol)
+
+
+def check_residuals(twins: Twins) -> None:
+    """The residuals of the equality constraints are those of MuJoCo."""
+    state = twins.state
+    for q, v in random_states(twins):
+        twins.put(q, v)
+        expected = []
+        kind = state.efc_type[: state.nefc]
+        held = kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        rows = state.efc_pos[: state.nefc][held]
+        lengths = np.linalg.norm(state.efc_J.reshape(state.nefc, -1)[held], axis=1)
+        at = 0
+        for loop in twins.entries["loop"]:
+            count = {"point": 3, "frame": 6, "coupling": 1}[loop["type"]]
+            own = rows[at : at + count]
+            at += count
+            expected.append(own[:3] if count > 1 else np.abs(own) / lengths[at - 1])
+            if count == 6:
+                expected.append(np.array([np.linalg.norm(own[3:])]))
+        assert at == rows.size
+        for ours, other in zip(twins.residuals(), expected, strict=True):
+            np.testing.assert_allclose(ours, other, atol=1e-12)

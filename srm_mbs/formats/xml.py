@@ -148,10 +148,10 @@ class XmlValues(XmlFile):
         return (*remarks, *self.ignored_notes())
 
     def limit(self, text: str, where: str, what: str) -> float:
-        """A number that may be infinite."""
+        """A number of any size, as exporters write the largest double for "no limit"."""
         if LIMIT.fullmatch(text.strip()):
             return -np.inf if text.strip().startswith("-") else np.inf
-        return float(self.numbers(text, 1, where, what)[0])
+        return float(self.numbers(text, 1, where, what, np.inf)[0])
 
     def truth(self, text: str | None, where: str, what: str) -> bool:
         """``true`` or ``1``, ``false`` or ``0``."""

@@ -20,6 +20,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.forces import OPEN_LIMIT
 
 Direction = tuple[float, float, float]
 
@@ -33,8 +34,8 @@ FREEDOM = {
     "floating": 6,
 }
 """Degrees of freedom of the types of joint."""
-NO_LIMIT = 1e16
-"""The number that SDF writes for "no limit" (any unit); limits do not act."""
+NO_LIMIT = OPEN_LIMIT
+"""The number that stands for "no limit" (any unit)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -420,6 +420,31 @@ def test_an_included_model_is_found_beside_the_file(tmp_path: Path) -> None:
     same(placed(mechanism.model, "left::finger", mechanism.q0), of(THREE) * of(ONE))
 
 
+def test_the_largest_numbers_as_limits_mean_no_limit(tmp_path: Path) -> None:
+    """Exporters write the largest double, rounded up or down, or 1e16."""
+
+    def limited(name: str, low: str, high: str) -> str:
+        more = f"<velocity>{high}</velocity><effort>{high}</effort>"
+        limit = f"<limit><lower>{low}</lower><upper>{high}</upper>{more}</limit>"
+        return link(f"{name}_link") + joint(name, "revolute", "world", f"{name}_link", "|" + limit)
+
+    text = sdf(
+        limited("a", "-1.79769e+308", "1.79769e308"),
+        limited("b", "-1.797693135e308", "1.797693135e308"),
+        limited("c", "-1e16", "10000000000000000.000000"),
+        limited("d", "-inf", "inf"),
+        limited("e", "-1e16", "0.5"),
+    )
+    path = tmp_path / "robot.toml"
+    loaded(tmp_path, text)
+    path.write_text('format = 1\nsdf = "robot.sdf"\nlimits = "spring"\n')
+    springs = srm.load(path).forces
+    assert [spring.name for spring in springs] == ["limit_e"]
+    assert isinstance(springs[0], srm.LimitSpring)
+    low, high, _ = springs[0].resolved(srm.load(path).model)
+    assert (low, high) == (-np.inf, 0.5)
+
+
 def test_a_gearbox_is_a_coupling_of_two_hinges() -> None:
     gear = (
         "<gearbox_ratio>3</gearbox_ratio><gearbox_reference_body>base</gearbox_reference_body>"

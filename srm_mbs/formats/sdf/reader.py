@@ -161,9 +161,11 @@ class SdfReader:
             raise values.fault(where, "merge is not read by this version", "Remove it")
         values.check_include(scope.depth, where)
         path = self._included(uri, scope.file, where)
-        text = read_text(path)
-        values.count_included(text, where)
-        root = parse_xml(text, str(path))
+        included = Document(read_text(path), str(path))
+        values.count_included(included.text, where)
+        root = included.xml
+        for note in included.notes:
+            values.remark(note, where)
         version = self.version(root, str(path))
         model = root.find("model")
         if model is None:

@@ -407,12 +407,14 @@ def _with_prefixes(text: str) -> str:
 def _without_dashes(text: str) -> str:
     """``text`` with spaces for the dashes in its comments, which end at the first ``-->``: in XML
     they hold no ``--``, but tinyxml, which most robots are read by, takes it."""
-    out, at = [], 0
+    out: list[str] = []
+    at = 0
     while (begin := OPAQUE.search(text, at)) is not None:
         inside, end = begin.end(), text.find(ENDS[begin[0]], begin.end())
         if end < 0:
             break
         content = text[inside:end]
-        out += text[at:inside], content.replace("-", " ") if begin[0] == "<!--" else content
+        is_comment = begin[0] == "<!--"
+        out += text[at:inside], content.replace("-", " ") if is_comment else content
         at = end
     return "".join((*out, text[at:]))

@@ -234,7 +234,7 @@ class JointReader:
                 'Write <xyz expressed_in="__model__">',
             )
         if frame:
-            turn = self.frames.placement(scope.prefix + frame, where).rotation
+            turn = self.frames.placement(scope.full(frame), where).rotation
             direction = at.rotation.T @ turn @ direction
         if values.child_number(node, "initial_position", where, 0.0) != 0.0:
             raise values.fault(

@@ -65,7 +65,7 @@ def _motor(root: Element, transmission: Element, reader: ElementChecker) -> str 
     """Add the inertia of a motor to the armature of its joint; the name of that, if Drake has an
     actuator there: on no fixed joint, and on none whose limit of effort is zero."""
     actuator, end = transmission.find("actuator"), transmission.find("joint")
-    kind = transmission.findtext("type") or transmission.get("type", "")
+    kind = transmission.findtext("type", "") or transmission.get("type", "")
     if actuator is None or end is None or TRANSMISSION not in kind:
         return None
     found = {local_name(node): node for node in actuator if node.tag != local_name(node)}

@@ -30,7 +30,9 @@ from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
 from srm_mbs.formats.xml import parse_xml
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
+from srm_mbs.model.forces import ForceElement, Wrench
 from srm_mbs.model.mechanism import SimulationDefaults, Source
 from srm_mbs.model.validation import check_inertia, undetermined_joint
 
@@ -218,7 +220,10 @@ def unassembled(
         model,
         description.closures(),
         q0=start,
-        forces=description.force_elements(csv),
+        forces=(
+            *description.force_elements(csv),
+            *_compensation(reading, model, np.array(source.gravity)),
+        ),
         drives=description.drives(csv) if csv else (),
         friction_speed=friction_speed,
         name=description.name or model.name,
@@ -242,6 +247,37 @@ def _with_limit_springs(mechanism: Mechanism) -> Mechanism:
         else "no joint has limits at which a spring could act"
     )
     return replace(mechanism, forces=(*mechanism.forces, *springs), notes=(*mechanism.notes, note))
+
+
+def _compensation(
+    reading: Reading, model: pin.Model, gravity: FloatArray
+) -> Iterator[ForceElement]:
+    """The forces of ``gravity_compensation``, which carry a part of the weight of links.
+
+    ``gravity`` (3,) m/s^2 is that of the model; links on the ground need no force.
+    """
+    links = {link.get("name", ""): link for link in reading.tree.findall("link")}
+    for name, part in reading.description.gravity_compensation.items():
+        if name not in links:
+            raise InputError(
+                f"there is no link {name!r}",
+                element="gravity_compensation",
+                remedy=known_names(links),
+            )
+        inertial = links[name].find("inertial")
+        frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        if inertial is None or frame.parentJoint == 0:
+            continue
+        mass, origin = inertial.find("mass"), inertial.find("origin")
+        given = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
+        x, y, z = map(float, given.split())
+        force = -part * float("0" if mass is None else mass.get("value", "0")) * gravity
+        if force.any():
+            yield Wrench(
+                Anchor(link=name, xyz=(x, y, z)),
+                tuple(force.tolist()),
+                name=f"{name}::gravity_compensation",
+            )
 
 
 def rebuild(source: Source) -> Mechanism:

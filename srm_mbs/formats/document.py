@@ -29,10 +29,13 @@ class Document:
         The root element of an XML text; whoever translates it may change it.
     root_tag
         The tag of the root element, found without parsing; None if the text is no XML.
+    notes
+        Sentences about faults that were passed over in parsing.
     """
 
     def __init__(self, text: str, file: str) -> None:
         self.text, self.file = text, file
+        self.notes: list[str] = []
 
     @classmethod
     def read(cls, path: Path) -> Document:
@@ -58,7 +61,7 @@ class Document:
 
     @cached_property
     def xml(self) -> Element:
-        return parse_xml(self.text, self.file)
+        return parse_xml(self.text, self.file, self.notes)
 
     @property
     def root_tag(self) -> str | None:

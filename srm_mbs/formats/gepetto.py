@@ -78,7 +78,7 @@ def translate(document: Document, options: Options) -> Translation:
     entries["loop"] = [*entries.get("loop", ()), *loops]
     if fixed:
         entries["lock"] = fixed
-    notes = list(plain.notes)
+    notes = [*urdf.notes, *plain.notes]
     motors = lists["name_mot"]
     missing = [name for name in motors if name not in joints]
     for note, names in (

@@ -110,7 +110,8 @@ def _translated(
         reach=reach,
     )
     log.debug("%s: read as %s", model.file, found.name)
-    return Reading(description, entries, translation.tree, source, translation.notes)
+    notes = (*model.notes, *translation.notes)
+    return Reading(description, entries, translation.tree, source, notes)
 
 
 def _of_description(

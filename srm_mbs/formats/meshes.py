@@ -1,4 +1,4 @@
-"""Triangles of STL, OBJ and COLLADA files, read here and by no importer.
+"""Triangles of STL, OBJ and COLLADA files, read here and by no importer, and inertia of solids.
 
 Only positions and faces are read: materials and textures, which name other files, are skipped.
 Polygons become fans of triangles about their first corner, except that a polygon that such a fan
@@ -7,6 +7,7 @@ would leave is cut ear by ear.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -402,6 +403,36 @@ PRIMITIVES: dict[str, Callable[[Element, Corners], Polygons]] = {
 }
 
 READERS: dict[str, Callable[[bytes], Triangles]] = {".stl": _stl, ".obj": _obj, ".dae": _dae}
+
+
+def solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:
+    """Volume (m^3) of a solid shape, and moments per mass (3,) m^2 about its centre.
+
+    ``sizes`` (3,) m are radii and half lengths: of a ``sphere`` the radius; of a ``cylinder`` and a
+    ``capsule`` along z the radius and half the length, of the capsule without its ends; of a
+    ``box`` and an ``ellipsoid`` the halves along x, y and z.
+    """
+    a, b, c = sizes
+    match kind:
+        case "sphere":
+            return 4.0 / 3.0 * math.pi * a**3, np.full(3, 0.4 * a**2)
+        case "ellipsoid":
+            squares = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
+            return 4.0 / 3.0 * math.pi * a * b * c, squares / 5.0
+        case "box":
+            squares = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
+            return 8.0 * a * b * c, squares / 3.0
+        case "cylinder":
+            across = (3.0 * a**2 + 4.0 * b**2) / 12.0
+            return 2.0 * math.pi * a**2 * b, np.array([across, across, 0.5 * a**2])
+        case _:  # a capsule: a cylinder of half length b between two half balls
+            middle, ends = 2.0 * math.pi * a**2 * b, 4.0 / 3.0 * math.pi * a**3
+            volume = middle + ends
+            # A half ball's centre is 3 a/8 from its flat side.
+            apart = 0.4 * a**2 + b**2 + 0.75 * a * b
+            across = middle * (3.0 * a**2 + 4.0 * b**2) / 12.0 + ends * apart
+            axial = middle * 0.5 * a**2 + ends * 0.4 * a**2
+            return volume, np.array([across, across, axial]) / volume
 
 
 def enclosed(

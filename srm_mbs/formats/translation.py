@@ -77,7 +77,7 @@ class Translation:
 
 LISTS = ("lock", "loop", "force", "drive")
 """Keys whose lists in a description and in the file that it names are joined."""
-TABLES = ("simulation",)
+TABLES = ("simulation", "gravity_compensation")
 """Tables that are merged key by key."""
 MODEL_KEYS = ("urdf", "sdf", "mjcf")
 """Keys of a description that name a file of another format."""

@@ -44,6 +44,11 @@ LARGEST_TAG = 4 * 10**6
 """Bytes of a tag with its attributes, or of a comment."""
 BLANK = re.compile(r"\s*+")
 ROOT = re.compile(r"<([^\s/><!?]++)")
+OPAQUE = re.compile(r"<!--|<!\[CDATA\[|<\?")
+"""Beginnings of parts in which no tag is read."""
+ENDS = {"<!--": "-->", "<![CDATA[": "]]>", "<?": "?>"}
+"""Of each such part, where it ends."""
+DASHES = "comments with -- inside, which XML does not allow, are skipped as tinyxml skips them"
 NAMESPACED = re.compile(r"\{[^}]*\}")
 
 
@@ -148,10 +153,10 @@ class XmlValues(XmlFile):
         return (*remarks, *self.ignored_notes())
 
     def limit(self, text: str, where: str, what: str) -> float:
-        """A number that may be infinite."""
+        """A number of any size, as exporters write the largest double for "no limit"."""
         if LIMIT.fullmatch(text.strip()):
             return -np.inf if text.strip().startswith("-") else np.inf
-        return float(self.numbers(text, 1, where, what)[0])
+        return float(self.numbers(text, 1, where, what, np.inf)[0])
 
     def truth(self, text: str | None, where: str, what: str) -> bool:
         """``true`` or ``1``, ``false`` or ``0``."""
@@ -290,8 +295,8 @@ def root_tag(text: str) -> str | None:
     return None if root is None else root[0]
 
 
-def parse_xml(text: str, file: str) -> Element:
-    """Root element of ``text``.
+def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
+    """Root element of ``text``; ``notes`` gets a sentence about faults that are passed over.
 
     Raises
     ------
@@ -312,7 +317,13 @@ def parse_xml(text: str, file: str) -> Element:
         # Drake's own reader takes <drake:...> without a declaration; expat does not.
         declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
         if declared != text:
-            return parse_xml(declared, file)
+            return parse_xml(declared, file, notes)
+        allowed = _without_dashes(text)
+        if allowed != text:
+            root = parse_xml(allowed, file, notes)
+            if notes is not None:
+                notes.append(DASHES)
+            return root
         raise InputError(
             f"this is not well-formed XML: {_explained(error)}",
             file=file,
@@ -391,3 +402,19 @@ def _with_prefixes(text: str) -> str:
     missing = used - set(re.findall(r"\sxmlns:([\w.-]+)\s*=", text)) - {"xml", "xmlns"}
     declarations = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(missing))
     return text[: root[1]] + declarations + text[root[1] :]
+
+
+def _without_dashes(text: str) -> str:
+    """``text`` with spaces for the dashes in its comments, which end at the first ``-->``: in XML
+    they hold no ``--``, but tinyxml, which most robots are read by, takes it."""
+    out: list[str] = []
+    at = 0
+    while (begin := OPAQUE.search(text, at)) is not None:
+        inside, end = begin.end(), text.find(ENDS[begin[0]], begin.end())
+        if end < 0:
+            break
+        content = text[inside:end]
+        is_comment = begin[0] == "<!--"
+        out += text[at:inside], content.replace("-", " ") if is_comment else content
+        at = end
+    return "".join((*out, text[at:]))

@@ -179,8 +179,8 @@ class UserForce(ForceElement):
             resolve_moving(model, [self.at], f"{self._element}, anchor at")
 
 
-OPEN_LIMIT = 1e30
-"""Joint limits (rad, m) beyond this are open; Pinocchio writes the largest double there."""
+OPEN_LIMIT = 1e16
+"""Joint limits (rad, m) from here on are open: SDF writes 1e16 there, others the largest double."""
 
 
 @dataclass(frozen=True)

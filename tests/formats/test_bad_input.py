@@ -206,6 +206,8 @@ DESCRIPTION_FAULTS = {
     "two rates": ("= 2.0", "= [1, 2]"),
     "a list as initial": ("[initial]", "[[initial]]"),
     "zero friction speed": ("lock = []", "friction_speed = 0"),
+    "weight of an unknown link": ("lock = []", "gravity_compensation = { arm = 1.0 }"),
+    "weight that is no number": ("lock = []", 'gravity_compensation = { rod = "all" }'),
     "negative t_end": ("t_end = 1.0", "t_end = -1"),
     "zero rtol": ("t_end = 1.0", "rtol = 0"),
     "infinite t_end": ("t_end = 1.0", "t_end = inf"),

@@ -20,6 +20,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.forces import OPEN_LIMIT
 
 Direction = tuple[float, float, float]
 
@@ -35,8 +36,8 @@ FREEDOM = {
 """Degrees of freedom of the types of joint."""
 ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
-NO_LIMIT = 1e16
-"""The number that SDF writes for "no limit" (any unit); limits do not act."""
+NO_LIMIT = OPEN_LIMIT
+"""The number that stands for "no limit" (any unit)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,6 +94,7 @@ class JointReader:
         name = scope.prefix + node.get("name", "")
         where = f"joint {name!r}"
         values = self.values
+        rotor = self._motor(node, where)
         values.attributes(node, where, ("name", "type"))
         values.children(node, where, JOINT_READ, JOINT_IGNORED)
         kind = node.get("type", "")
@@ -136,8 +137,30 @@ class JointReader:
             case _:
                 # Without limits also "revolute": its angle counts turns, and none of them acts.
                 one = "prismatic" if kind == "prismatic" else "revolute"
-                self.joints.append(_along(replace(joint, type=one), axes[0]))
+                moving = replace(joint, type=one)
+                if rotor and axes[0].acting.get("effort") != 0.0:
+                    values.remark(
+                        "the inertia of a motor, drake:rotor_inertia times the square of "
+                        "drake:gear_ratio, acts as armature",
+                        name,
+                    )
+                    moving = replace(moving, armature=rotor)
+                self.joints.append(_along(moving, axes[0]))
         self._mimics += [(name, scope, axis.mimic) for axis in axes if axis.mimic is not None]
+
+    def _motor(self, node: Element, where: str) -> float:
+        """Take out what Drake says of a motor: the inertia (kg m^2, kg) that the joint sees, which
+        Drake leaves out where the limit of effort is zero."""
+        found = []
+        for tag, default in (("rotor_inertia", 0.0), ("gear_ratio", 1.0)):
+            child = node.find(f"{{*}}{tag}")
+            text = str(default) if child is None else child.text
+            found.append(float(self.values.numbers(text, 1, where, f"<drake:{tag}>")[0]))
+            if child is not None:
+                node.remove(child)
+        if found[0] < 0.0:
+            raise self.values.fault(where, "<drake:rotor_inertia> is negative", "Give it >= 0")
+        return found[0] * found[1] ** 2
 
     def _end(self, node: Element, side: str, scope: Scope, where: str) -> str:
         """The link that a joint's parent or child belongs to."""
@@ -211,7 +234,7 @@ class JointReader:
                 'Write <xyz expressed_in="__model__">',
             )
         if frame:
-            turn = self.frames.placement(scope.prefix + frame, where).rotation
+            turn = self.frames.placement(scope.full(frame), where).rotation
             direction = at.rotation.T @ turn @ direction
         if values.child_number(node, "initial_position", where, 0.0) != 0.0:
             raise values.fault(

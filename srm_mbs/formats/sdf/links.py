@@ -9,18 +9,21 @@ frames.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from urllib.parse import urlsplit
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.joint_graph import Body, inertia_at
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
+from srm_mbs.formats.meshes import enclosed, read_mesh, solid
 from srm_mbs.formats.xml import XmlValues, words
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.coordinates import UNIT_LENGTH_TOLERANCE
+from srm_mbs.model.reach import Reach
 
 MODEL = "__model__"
 SEPARATOR = "::"
@@ -39,16 +42,22 @@ class Scope:
     ----------
     depth
         Number of includes around the file.
+    own
+        Name, without prefix, of the frame of the model; a model that is merged into another has
+        one of its own.
     """
 
     prefix: str
     file: str
     version: tuple[int, int]
     depth: int = 0
+    own: str = MODEL
 
     def full(self, name: str) -> str:
         """Full name of ``name`` in this context; ``world`` means the ground everywhere."""
-        return WORLD if name == WORLD else self.prefix + name
+        if name == WORLD:
+            return WORLD
+        return self.prefix + (self.own if name == MODEL else name)
 
 
 def joint_frame(name: str, version: tuple[int, int]) -> str:
@@ -83,15 +92,6 @@ def pose(values: XmlValues, node: Element, where: str, scope: Scope) -> tuple[pi
             raise values.fault(where, problem, "Give a unit quaternion")
         R = pin.Quaternion(turn / length).matrix()
     return pin.SE3(R, xyz), relative_to
-
-
-def own_pose(values: XmlValues, node: Element, where: str, scope: Scope) -> pin.SE3:
-    """The ``<pose>`` of an element inside a link, which may be relative to the link only."""
-    placement, relative_to = pose(values, node, where, scope)
-    if relative_to:
-        problem = f"the pose inside a link is relative to {relative_to!r}"
-        raise values.fault(where, problem, "Give it relative to the link")
-    return placement
 
 
 @dataclass
@@ -187,64 +187,19 @@ LINK_IGNORED = words(
     "collision self_collide enable_wind must_be_base_link velocity_decay sensor projector "
     "audio_sink audio_source battery light particle_emitter plugin"
 )
-INERTIAL_READ = ("pose", "frame", "mass", "inertia")
+INERTIAL_READ = ("pose", "frame", "mass", "inertia", "density")
+INERTIAL_IGNORED = ("auto_inertia_params",)
 MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 """With the defaults of SDF."""
 DEFAULTS = "without <inertial>, <mass> or <inertia> SDF's defaults count (1 kg, 1 kg m^2)"
 
 
-def read_link(values: XmlValues, node: Element, name: str, scope: Scope) -> Body:
-    """One link; its pose is not read here.
-
-    Parameters
-    ----------
-    values, node
-        The file and the ``<link>``.
-    name
-        Its full name.
-    scope
-        Where it is.
-    """
-    where = f"link {name!r}"
-    values.attributes(node, where, ("name",))
-    values.children(node, where, LINK_READ, LINK_IGNORED, ("visual",))
-    for tag, acts in (("gravity", True), ("kinematic", False), ("static", False)):
-        if values.child_truth(node, tag, where, acts) != acts:
-            problem = f"<{tag}>{node.findtext(tag)}</{tag}> is not simulated by this version"
-            raise values.fault(where, problem, "Remove it")
-    visuals = [_visual(values, visual, name, scope) for visual in node.findall("visual")]
-    return Body(
-        name,
-        _inertia(values, node.find("inertial"), where, scope),
-        tuple(visual for visual in visuals if visual is not None),
-    )
-
-
-def _inertia(values: XmlValues, node: Element | None, where: str, scope: Scope) -> pin.Inertia:
-    if node is None:
-        values.remark(DEFAULTS, where)
-        return pin.Inertia(1.0, np.zeros(3), np.eye(3))
-    values.attributes(node, where, ("auto",))
-    if values.truth(node.get("auto", "false"), where, "auto"):
-        raise values.fault(
-            where,
-            "<inertial auto> (inertia from the collision shapes) is not read by this version",
-            "Write <mass> and <inertia>",
-        )
-    for tag in ("fluid_added_mass", "density"):
-        if node.find(tag) is not None:
-            raise values.fault(where, f"<{tag}> is not read by this version", "Remove it")
-    values.children(node, where, INERTIAL_READ, ())
-    inertia = node.find("inertia")
-    if inertia is None or node.find("mass") is None:
-        values.remark(DEFAULTS, where)
-    if inertia is not None:
-        values.children(inertia, where, MOMENTS, ())
-    mass = values.child_number(node, "mass", where, 1.0)
-    moments = [values.child_number(inertia, key, where, MOMENTS[key]) for key in MOMENTS]
-    return inertia_at(own_pose(values, node, where, scope), mass, moments)
-
-
+WEIGHTLESS = (
+    "gravity does not act (<gravity>false): a force carries the weight; the energy contains its "
+    "potential, and the balance the work of the force"
+)
+DENSITY = 1000.0
+"""kg/m^3, SDF's default."""
 SHAPES = {
     "box": {"size": (3, "1 1 1")},
     "sphere": {"radius": (1, "1")},
@@ -252,28 +207,162 @@ SHAPES = {
     "mesh": {"scale": (3, "1 1 1")},
 }
 """Shapes that URDF has as well: their elements, with count and defaults of the numbers in these."""
+SOLIDS = {
+    **SHAPES,
+    "capsule": {"radius": (1, "0.5"), "length": (1, "1")},
+    "ellipsoid": {"radii": (3, "1 1 1")},
+}
+"""Shapes whose inertia is computed, likewise."""
+HALVES: dict[str, tuple[float, ...]] = {
+    "box": (0.5, 0.5, 0.5),
+    "sphere": (1.0,),
+    "cylinder": (1.0, 0.5),
+    "capsule": (1.0, 0.5),
+    "ellipsoid": (1.0, 1.0, 1.0),
+}
+"""Factors from their sizes to radii and half lengths."""
 
 
-def _visual(values: XmlValues, node: Element, link: str, scope: Scope) -> Element | None:
-    """A ``<visual>`` of URDF; None, counted, if URDF has no such shape."""
-    where = f"link {link!r}, visual {node.get('name', '')!r}"
-    placement = own_pose(values, node, where, scope)
-    shape = node.find("geometry/*")
-    if shape is None or shape.tag not in SHAPES:
-        tag = "no geometry" if shape is None else shape.tag
-        values.remark(f"a <visual> of the shape <{tag}> is not drawn", f"link {link!r}")
-        return None
-    sizes = {
-        key: numbers(values.numbers(shape.findtext(key, default), count, where, f"<{key}>"))
-        for key, (count, default) in SHAPES[shape.tag].items()
-    }
-    if shape.tag == "mesh":
-        sizes = {"filename": mesh_name(shape.findtext("uri", "")), **sizes}
-    colour = node.findtext("material/diffuse") or node.findtext("material/ambient")
-    rgba = None
-    if colour is not None:
-        rgba = [*values.numbers(colour, (3, 4), where, "its colour"), 1.0][:4]
-    return visual(placement, shape.tag, sizes, rgba)
+class LinkReader:
+    """Reads links when all frames are known.
+
+    Parameters
+    ----------
+    values, frames
+        The file and its frames.
+    reach
+        Where mesh files may lie.
+
+    Attributes
+    ----------
+    weightless
+        Links on which gravity does not act.
+    """
+
+    def __init__(self, values: XmlValues, frames: Frames, reach: Reach) -> None:
+        self.values, self.frames, self.reach = values, frames, reach
+        self.weightless: list[str] = []
+
+    def read(self, node: Element, name: str, scope: Scope) -> Body:
+        """One ``<link>`` of this full name; its pose has been added to the frames."""
+        values, where = self.values, f"link {name!r}"
+        values.attributes(node, where, ("name",))
+        values.children(node, where, LINK_READ, LINK_IGNORED, ("visual",))
+        for tag in ("kinematic", "static"):
+            if values.child_truth(node, tag, where, False):
+                problem = f"<{tag}>{node.findtext(tag)}</{tag}> is not simulated by this version"
+                raise values.fault(where, problem, "Remove it")
+        if not values.child_truth(node, "gravity", where, True):
+            values.remark(WEIGHTLESS, name)
+            self.weightless.append(name)
+        visuals = [self._visual(visual, name, scope) for visual in node.findall("visual")]
+        return Body(
+            name,
+            self._inertia(node, name, scope),
+            tuple(visual for visual in visuals if visual is not None),
+        )
+
+    def _placement(self, node: Element, link: str, where: str, scope: Scope) -> pin.SE3:
+        """Placement in its link of an element that may be posed relative to any frame."""
+        placement, relative_to = pose(self.values, node, where, scope)
+        if not relative_to:
+            return placement
+        at = self.frames.placement(scope.full(relative_to), where)
+        return self.frames.placement(link, where).actInv(at * placement)
+
+    def _inertia(self, link: Element, name: str, scope: Scope) -> pin.Inertia:
+        values, where, node = self.values, f"link {name!r}", link.find("inertial")
+        if node is None:
+            values.remark(DEFAULTS, where)
+            return pin.Inertia(1.0, np.zeros(3), np.eye(3))
+        values.attributes(node, where, ("auto",))
+        if node.find("fluid_added_mass") is not None:
+            raise values.fault(where, "<fluid_added_mass> is not read", "Remove it")
+        values.children(node, where, INERTIAL_READ, INERTIAL_IGNORED)
+        if values.truth(node.get("auto", "false"), where, "auto"):
+            return self._of_collisions(link, node, name, scope)
+        inertia = node.find("inertia")
+        if inertia is None or node.find("mass") is None:
+            values.remark(DEFAULTS, where)
+        if inertia is not None:
+            values.children(inertia, where, MOMENTS, ())
+        mass = values.child_number(node, "mass", where, 1.0)
+        moments = [values.child_number(inertia, key, where, MOMENTS[key]) for key in MOMENTS]
+        return inertia_at(self._placement(node, name, where, scope), mass, moments)
+
+    def _of_collisions(
+        self, link: Element, inertial: Element, name: str, scope: Scope
+    ) -> pin.Inertia:
+        """The sum of the inertias of the collision shapes, as libsdformat has it: ``<density>`` of
+        a collision counts before that of ``<inertial>``; a given ``<mass>`` is that of all."""
+        values, where = self.values, f"link {name!r}"
+        density = values.child_number(inertial, "density", where, DENSITY)
+        total = pin.Inertia.Zero()
+        for node in link.findall("collision"):
+            inside = f"{where}, collision {node.get('name', '')!r}"
+            shape = node.find("geometry/*")
+            if shape is None or shape.tag not in SOLIDS:
+                tag = "no geometry" if shape is None else f"the shape <{shape.tag}>"
+                problem = f"<inertial auto> of {tag} is not computed by this version"
+                raise values.fault(inside, problem, "Write <mass> and <inertia>")
+            own = self._solid(shape, inside, Path(scope.file).parent)
+            rho = values.child_number(node, "density", inside, density)
+            at = self._placement(node, name, inside, scope)
+            total += at.act(pin.Inertia(rho * own.mass, own.lever, rho * own.inertia))
+        if not total.mass > 0.0:
+            problem = "<inertial auto> finds no <collision> with mass"
+            raise values.fault(where, problem, "Write <mass> and <inertia>")
+        factor = values.child_number(inertial, "mass", where, total.mass) / total.mass
+        values.remark("<inertial auto>: mass and inertia are those of the collision shapes", name)
+        return pin.Inertia(factor * total.mass, total.lever, factor * total.inertia)
+
+    def _solid(self, shape: Element, where: str, folder: Path) -> pin.Inertia:
+        """Inertia of a shape at unit density, in its own frame."""
+        values, kind = self.values, shape.tag
+        sizes = [
+            size
+            for key, (count, default) in SOLIDS[kind].items()
+            for size in values.numbers(shape.findtext(key, default), count, where, f"<{key}>")
+        ]
+        if kind != "mesh":
+            if min(sizes) <= 0.0:
+                raise values.fault(where, f"a size of its <{kind}> is not positive", "Correct it")
+            halves = np.zeros(3)
+            halves[: len(sizes)] = np.multiply(sizes, HALVES[kind])
+            volume, moments = solid(kind, halves)
+            return pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
+        if shape.find("submesh") is not None:
+            problem = "the inertia of a <submesh> is not computed by this version"
+            raise values.fault(where, problem, "Write <mass> and <inertia>")
+        with naming(file=values.file, element=where):
+            path = self.reach.find(shape.findtext("uri", "").strip(), folder, "mesh file")
+        vertices, faces = read_mesh(path)
+        volume, centre, moments = enclosed(vertices * sizes, faces)
+        if not volume > 0.0:
+            problem = f"the triangles of {path.name!r} enclose no volume, or are inside out"
+            raise values.fault(where, problem, "Write <mass> and <inertia>")
+        return pin.Inertia(volume, centre, moments)
+
+    def _visual(self, node: Element, link: str, scope: Scope) -> Element | None:
+        """A ``<visual>`` of URDF; None, counted, if URDF has no such shape."""
+        values, where = self.values, f"link {link!r}, visual {node.get('name', '')!r}"
+        placement = self._placement(node, link, where, scope)
+        shape = node.find("geometry/*")
+        if shape is None or shape.tag not in SHAPES:
+            tag = "no geometry" if shape is None else shape.tag
+            values.remark(f"a <visual> of the shape <{tag}> is not drawn", f"link {link!r}")
+            return None
+        sizes = {
+            key: numbers(values.numbers(shape.findtext(key, default), count, where, f"<{key}>"))
+            for key, (count, default) in SHAPES[shape.tag].items()
+        }
+        if shape.tag == "mesh":
+            sizes = {"filename": mesh_name(shape.findtext("uri", "")), **sizes}
+        colour = node.findtext("material/diffuse") or node.findtext("material/ambient")
+        rgba = None
+        if colour is not None:
+            rgba = [*values.numbers(colour, (3, 4), where, "its colour"), 1.0][:4]
+        return visual(placement, shape.tag, sizes, rgba)
 
 
 def mesh_name(uri: str) -> str:

@@ -24,10 +24,10 @@ from srm_mbs.formats.sdf.links import (
     RESERVED,
     SEPARATOR,
     Frames,
+    LinkReader,
     Scope,
     joint_frame,
     pose,
-    read_link,
 )
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.xml import XmlValues, parse_xml, words
@@ -56,23 +56,32 @@ class SdfReader:
         self.bodies: dict[str, Body] = {}
         self.fixed: list[str] = []
         self._has_model = True  # and not a world with several
+        self.links = LinkReader(self.values, self.frames, reach)
         self.joints = JointReader(self.values, self.frames)
+        self._link_nodes: list[tuple[Element, str, Scope]] = []
         self._joint_nodes: list[tuple[Element, Scope]] = []
 
     def name(self, node: Element, scope: Scope) -> str:
         """Full name of an element."""
         name = (node.get("name") or "").strip()
-        if not name or name in RESERVED or SEPARATOR in name:
+        if not name or name in RESERVED:
             problem = f"the name {name!r} is reserved" if name else "it has no name"
             raise self.values.fault(f"<{node.tag}>", problem, f"Give the {node.tag} a name")
         return scope.prefix + name
 
     # Models ---------------------------------------------------------------------------------
 
-    def model(self, node: Element, scope: Scope, around: str, placed: pin.SE3 | None = None) -> str:
+    def model(
+        self,
+        node: Element,
+        scope: Scope,
+        outer: Scope | None = None,
+        placed: pin.SE3 | None = None,
+    ) -> str:
         """Read a model whose names begin with ``scope.prefix``; returns its canonical link.
 
-        ``around`` is the prefix of the enclosing model; ``placed`` the pose of an ``<include>``.
+        ``outer`` is the context of an enclosing model or world; ``placed`` the pose of an
+        ``<include>``.
         """
         where = f"model {scope.prefix.removesuffix(SEPARATOR) or node.get('name', '')!r}"
         values = self.values
@@ -81,12 +90,12 @@ class SdfReader:
         placement, relative_to = pose(values, node, where, scope)
         if placed is not None:
             placement, relative_to = placed, ""
-        reference = f"{around}{relative_to}" if relative_to not in ("", WORLD) else ""
-        if not reference:
-            nested = around or (scope.prefix and self._has_model)
-            reference = f"{around}{MODEL}" if nested else WORLD
-        links = [self.link(link, scope) for link in node.findall("link")]
-        links += self.contents(node, scope)
+        reference = WORLD
+        if outer is not None:
+            around = relative_to not in ("", WORLD)
+            reference = outer.full(relative_to) if around else self.frame_around(outer)
+        before = len(self.bodies)
+        links = self.contents(node, scope)
         if not links:
             raise values.fault(where, "there is no <link>", "Add one for every body")
         canonical = links[0]
@@ -96,23 +105,37 @@ class SdfReader:
             if canonical not in self.bodies:
                 problem = f"there is no link {chosen!r} (canonical_link)"
                 raise values.fault(where, problem, "Name one of its links")
-        own = f"{scope.prefix}{MODEL}"
+        own = scope.full(MODEL)
         self.frames.add(own, reference, placement, where, body=canonical)
-        if scope.prefix:  # outside, the name of a model means its own frame
+        if outer is not None and scope.prefix != outer.prefix:
+            # Outside, the name of a model means its own frame.
             name = scope.prefix.removesuffix(SEPARATOR)
             self.frames.add(name, own, pin.SE3.Identity(), where, body=canonical)
         if values.child_truth(node, "static", where, False):
-            self.fixed += [link for link in self.bodies if link.startswith(scope.prefix)]
+            self.fixed += list(self.bodies)[before:]
         return canonical
 
+    def frame_around(self, scope: Scope) -> str:
+        """The frame in which what has no other reference is placed: the model's, or the world."""
+        in_model = scope.prefix or self._has_model or scope.own != MODEL
+        return scope.full(MODEL) if in_model else WORLD
+
     def contents(self, node: Element, scope: Scope) -> list[str]:
-        """Read models, includes, frames and joints of a model or world; returns the canonical links
-        of the models."""
-        canonical = []
+        """Read the contents of a model or world; returns its links and the canonical links of its
+        models, own and merged ones first."""
+        canonical, merged = [], [part for part in node.findall("include") if self._merges(part)]
+        for part in node:
+            if part.tag == "link":
+                canonical.append(self.link(part, scope))
+            elif part in merged:
+                canonical.append(self.include(part, scope))
         for model in node.findall("model"):
-            inner = replace(scope, prefix=self.name(model, scope) + SEPARATOR)
-            canonical.append(self.model(model, inner, scope.prefix))
-        canonical += [self.include(model, scope) for model in node.findall("include")]
+            inner = Scope(
+                self.name(model, scope) + SEPARATOR, scope.file, scope.version, scope.depth
+            )
+            canonical.append(self.model(model, inner, scope))
+        others = [part for part in node.findall("include") if part not in merged]
+        canonical += [self.include(part, scope) for part in others]
         for frame in node.findall("frame"):
             self.frame(frame, scope)
         for joint in node.findall("joint"):
@@ -123,9 +146,9 @@ class SdfReader:
         name = self.name(node, scope)
         where = f"link {name!r}"
         placement, relative_to = pose(self.values, node, where, scope)
-        reference = scope.prefix + (relative_to or MODEL)
-        self.frames.add(name, reference, placement, where, body=name)
-        self.bodies[name] = read_link(self.values, node, name, scope)
+        self.frames.add(name, scope.full(relative_to or MODEL), placement, where, body=name)
+        self.bodies[name] = Body(name)
+        self._link_nodes.append((node, name, scope))
         return name
 
     def frame(self, node: Element, scope: Scope) -> None:
@@ -134,10 +157,10 @@ class SdfReader:
         self.values.attributes(node, where, ("name", "attached_to"))
         self.values.children(node, where, ("pose",), ())
         placement, relative_to = pose(self.values, node, where, scope)
-        outside = MODEL if scope.prefix or self._has_model else WORLD
-        held = node.get("attached_to") or outside
-        to = scope.full(relative_to or held)
-        self.frames.add(name, to, placement, where, attached_to=scope.full(held))
+        held = node.get("attached_to")
+        attached_to = scope.full(held) if held else self.frame_around(scope)
+        to = scope.full(relative_to) if relative_to else attached_to
+        self.frames.add(name, to, placement, where, attached_to=attached_to)
 
     def joint_frame(self, node: Element, scope: Scope) -> None:
         """Place a joint's frame; the joint is read when all frames are known."""
@@ -150,6 +173,10 @@ class SdfReader:
         self.frames.add(own, to, placement, where, attached_to=held)
         self._joint_nodes.append((node, scope))
 
+    def _merges(self, node: Element) -> bool:
+        """Whether the contents of an included model become those of the model around it."""
+        return self.values.truth(node.get("merge", "false"), "<include>", "merge")
+
     def include(self, node: Element, scope: Scope) -> str:
         """A model in another file, beside this one."""
         uri = (node.findtext("uri") or "").strip()
@@ -157,13 +184,13 @@ class SdfReader:
         values = self.values
         values.attributes(node, where, ("merge",))
         values.children(node, where, ("uri", "name", "pose", "static"), ("plugin",))
-        if node.get("merge") is not None:
-            raise values.fault(where, "merge is not read by this version", "Remove it")
         values.check_include(scope.depth, where)
         path = self._included(uri, scope.file, where)
-        text = read_text(path)
-        values.count_included(text, where)
-        root = parse_xml(text, str(path))
+        included = Document(read_text(path), str(path))
+        values.count_included(included.text, where)
+        root = included.xml
+        for note in included.notes:
+            values.remark(note, where)
         version = self.version(root, str(path))
         model = root.find("model")
         if model is None:
@@ -181,7 +208,10 @@ class SdfReader:
         if static is not None and model.find("static") is None:
             model.append(static)
         inner = Scope(name + SEPARATOR, str(path), version, scope.depth + 1)
-        return self.model(model, inner, scope.prefix, placed)
+        if self._merges(node):
+            local = name.removeprefix(scope.prefix)
+            inner = replace(inner, prefix=scope.prefix, own=f"_merged__{local}__model__")
+        return self.model(model, inner, scope, placed)
 
     def _included(self, uri: str, file: str, where: str) -> Path:
         """Path of an included file; a folder means the model in it."""
@@ -231,7 +261,7 @@ class SdfReader:
         model, world = root.find("model"), root.find("world")
         gravity: list[float] = []
         if model is not None and world is None:
-            canonical = self.model(model, scope, "")
+            canonical = self.model(model, scope)
             name = self.name(model, scope)
         elif world is not None and model is None:
             # Names of its models are prefixes of those of their links.
@@ -245,8 +275,10 @@ class SdfReader:
             gravity = values.numbers(text, 3, "<world>", "<gravity>").tolist()
         else:
             raise values.fault("<sdf>", "a file holds one <model> or one <world>", "Give one")
-        for node, where in self._joint_nodes:
-            self.joints.read(node, where)
+        for node, link, inside in self._link_nodes:
+            self.bodies[link] = self.links.read(node, link, inside)
+        for node, inside in self._joint_nodes:
+            self.joints.read(node, inside)
         return name, canonical, gravity
 
     def static(self) -> None:
@@ -287,4 +319,9 @@ def translate(document: Document, options: Options) -> Translation:
     bodies = {**reader.bodies, **reader.joints.between}
     graph = GraphTranslator(document.file, name, bodies, where, reader.joints.joints, root)
     made = graph.translate(options.cut)
-    return made.extended(reader.values.notes(), gravity=gravity, loop=couplings)
+    return made.extended(
+        reader.values.notes(),
+        gravity=gravity,
+        loop=couplings,
+        gravity_compensation=dict.fromkeys(reader.links.weightless, 1.0),
+    )

@@ -198,6 +198,7 @@ class TopEntry(StrictEntry):
     cut: list[StrictStr] = []
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]
+    gravity_compensation: dict[StrictStr, Number] = {}
     lock: list[StrictStr] = []
     limits: Literal["reported", "spring"] = "reported"
     friction_speed: Positive = FRICTION_SPEED

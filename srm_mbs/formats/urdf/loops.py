@@ -4,7 +4,8 @@
 * a child link with two parents: the second joint becomes a closure of its freedom, closed at the
   joint's zero;
 * ``<mimic>``: a coupling q = multiplier q_other + offset;
-* pairs of frames ``closing_<name>_1`` and ``closing_<name>_2`` of onshape-to-robot.
+* pairs of frames ``closing_<name>_1`` and ``closing_<name>_2`` of onshape-to-robot;
+* Drake's joints and motors are rewritten (:mod:`srm_mbs.formats.urdf.drake`).
 
 A URDF without any of them remains as it is.
 
@@ -26,8 +27,10 @@ import pinocchio as pin
 from srm_mbs.errors import known_names
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.translation import Options, Translation
+from srm_mbs.formats.urdf.drake import rewrite
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
 from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
+from srm_mbs.formats.urdf.validation import ElementChecker
 
 CLOSING = re.compile(r"(closing_.+)_1\Z")
 
@@ -86,9 +89,11 @@ def translate(document: Document, options: Options) -> Translation:
         Naming the element that cannot be read.
     """
     root = document.xml
+    extended = ElementChecker(document.file)
+    found = rewrite(root, extended)
+    notes = extended.notes
     elements = LoopElements(document.file, Graph(root))
-    notes: list[str] = []
-    found = _cut_second_parents(root, elements, options, notes)
+    found |= _cut_second_parents(root, elements, options, notes)
     elements.graph = graph = Graph(root)
     found |= elements.read(root)
     found |= _mimics(elements, options, notes)

@@ -19,13 +19,15 @@ import numpy as np
 from srm_mbs.errors import SrmWarning
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT, inertia_tensor
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import XmlFile, local_name, words
+from srm_mbs.formats.xml import NAMESPACED, XmlFile, local_name, words
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 LOOP_ELEMENTS = ("loop_joint", "loop", "constraint", "coupling")
 IGNORED = {
-    "robot": words("material transmission gazebo sensor ros2_control verbose"),
+    "robot": words(
+        "material transmission gazebo sensor ros2_control verbose frame collision_filter_group"
+    ),
     "link": words(
         "visual collision contact self_filter sensor self_collision_checking collision_checking "
         "surface kinematic gravity"
@@ -54,12 +56,17 @@ ATTRIBUTES = {
 }
 INFORMATIVE = {
     "joint": ("independent",),
-    "limit": ("command_effort", "current", "gear_velocity"),
-    "dynamics": ("D", "K", "mu_coulomb", "mu_viscous"),
+    "limit": words("command_effort current gear_velocity acceleration deceleration jerk"),
+    "dynamics": ("D", "K", "mu_coulomb", "mu_viscous", "coulomb_window"),
 }
-"""Attributes of other tools found in published files: ignored, with a note."""
-DRAWN_ONLY = ("material", "visual", "collision")
+"""Attributes of other tools found in published files, with or without a prefix: ignored, with a
+note."""
+PREFIXED = ("collision_filter_group",)
+"""Elements of a robot that Drake writes with a prefix: ignored, with a note."""
+DRAWN_ONLY = ("material", "visual")
 """Elements that are removed without a note: they do not act."""
+SHAPES = (*DRAWN_ONLY, "collision")
+"""Elements in which an inertia would be lost."""
 MANY = ("link", "joint")
 """Elements that may be there several times."""
 DESCRIBE_LOOP = "Describe the loop as [[loop]] in a TOML description and remove the element"
@@ -99,12 +106,13 @@ class ElementChecker(XmlFile):
 
     def attributes(self, node: Element, where: str, count: bool = True) -> None:
         """Refuse unknown attributes; count and remove those that are ignored, or leave them."""
-        ignored = [key for key in INFORMATIVE.get(node.tag, ()) if key in node.attrib]
+        known = INFORMATIVE.get(node.tag, ())
+        ignored = [key for key in node.attrib if NAMESPACED.sub("", key) in known]
         if node.tag in ATTRIBUTES:
             self.only(node, where, ATTRIBUTES[node.tag], ignored)
         if count:
             for key in ignored:
-                self.ignore(f"<{node.tag} {key}> attribute")
+                self.ignore(f"<{node.tag} {NAMESPACED.sub('', key)}> attribute")
                 del node.attrib[key]
 
     def children(self, node: Element, where: str) -> None:
@@ -118,10 +126,12 @@ class ElementChecker(XmlFile):
                 if tag not in READ and len(child):
                     problem = f"unknown element <{child[0].tag}> in <{tag}>"
                     raise self.fault(where, problem, "Remove it")
-            elif tag in ignored:
+            elif tag in ignored or (node.tag == "robot" and local in PREFIXED):
                 self.nothing_acts_in(child, f"{before}<{local}>")
                 if tag not in DRAWN_ONLY:
-                    self.ignore(f"<{tag}> element")
+                    self.ignore(f"<{local}> element")
+                for _ in child.iter("plugin"):
+                    self.ignore("<plugin> element")
                 node.remove(child)
             elif "xacro" in tag.rsplit("}", 1)[0] and tag != local:
                 raise self.fault(
@@ -154,7 +164,7 @@ class ElementChecker(XmlFile):
                     "read by this version",
                     DESCRIBE_LOOP,
                 )
-            if node.tag in DRAWN_ONLY and inner.tag in ("inertial", "mass", "inertia"):
+            if node.tag in SHAPES and inner.tag in ("inertial", "mass", "inertia"):
                 raise self.fault(
                     where,
                     f"<{inner.tag}> inside <{node.tag}> would not act",

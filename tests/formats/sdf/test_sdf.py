@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
@@ -18,6 +19,7 @@ from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, rpy
 from srm_mbs.formats.sdf.reader import translate
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf.parser import build_urdf
+from tests.support.backends import on_both
 from tests.support.sdf_files import CASSIES, cassie, four_bar, joint, link, sdf
 
 
@@ -285,6 +287,228 @@ def test_a_double_pendulum_accelerates_as_its_equations_say(tmp_path: Path) -> N
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@on_both
+def test_gravity_does_not_act_on_a_link_that_says_so(tmp_path: Path, backend: str) -> None:
+    """A double pendulum whose lower rod has no weight, by SciPy on its equations; and the base."""
+    m1, m2, l1, c1, c2, g = 1.3, 0.8, 1.0, 0.45, 0.6, 3.7
+    off = "<gravity>false</gravity>"
+    text = sdf(
+        link("foot").replace("<inertial>", off + "<inertial>"),
+        link("upper", "0 0 2 0 0 0", m1, f"0 0 {-c1} 0 0 0"),
+        link("lower", "0 0 1 0 0 0", m2, f"0 0 {-c2} 0 0 0").replace("<in", off + "<in", 1),
+        joint("weld", "fixed", "world", "foot", axis=""),
+        joint("shoulder", "revolute", "foot", "upper"),
+        joint("elbow", "revolute", "upper", "lower"),
+    )
+    mechanism = loaded(tmp_path, text, gravity=[0.0, 0.0, -g])
+    assert any("gravity does not act" in note and "lower" in note for note in mechanism.notes)
+    assert [force.name for force in mechanism.forces] == ["lower::gravity_compensation"]
+    i1, i2 = 0.01 * m1, 0.01 * m2
+
+    def rates(t: float, y: FloatArray) -> FloatArray:
+        q, v = y[:2], y[2:]
+        cos, sin = np.cos(q[1]), np.sin(q[1])
+        m12 = i2 + m2 * c2 * (c2 + l1 * cos)
+        m11 = i1 + i2 + m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2 * cos)
+        M = np.array([[m11, m12], [m12, i2 + m2 * c2**2]])
+        h = m2 * l1 * c2 * sin
+        coriolis = np.array([-h * (2 * v[0] * v[1] + v[1] ** 2), h * v[0] ** 2])
+        weight = np.array([g * m1 * c1 * np.sin(q[0]), 0.0])
+        return np.concatenate([v, np.linalg.solve(M, -coriolis - weight)])
+
+    start = np.array([0.4, -0.9, 0.7, 1.6])
+    reference = solve_ivp(rates, (0.0, 1.0), start, rtol=1e-12, atol=1e-13).y[:, -1]
+    run = srm.simulate(mechanism, 1.0, q0=start[:2], v0=start[2:], rtol=1e-10, backend=backend)
+    np.testing.assert_allclose(np.concatenate([run.q[-1], run.v[-1]]), reference, atol=1e-8)
+    assert run.energy_balance.relative < 1e-9
+    assert np.abs(run.energy_balance.works["force lower::gravity_compensation"]).max() > 0.1
+
+
+def test_gravity_of_a_link_survives_conversion(tmp_path: Path) -> None:
+    text = four_bar().replace("<inertial>", "<gravity>0</gravity><inertial>", 1)
+    mechanism = loaded(tmp_path, text)
+    srm.convert(tmp_path / "robot.sdf", tmp_path / "out.toml")
+    assert srm.load(tmp_path / "out.toml").forces == mechanism.forces
+    assert len(mechanism.forces) == 1
+    assert not loaded(tmp_path, text, gravity=[0.0, 0.0, 0.0]).forces
+
+
+# Inertia of collisions ------------------------------------------------------------------------
+
+SHAPES = {
+    "box": ("<size>0.2 0.4 0.6</size>", lambda x, y, z: (abs(2 * np.array([x, y, z]))
+            <= [[0.2], [0.4], [0.6]]).all(axis=0)),
+    "sphere": ("<radius>0.3</radius>", lambda x, y, z: x**2 + y**2 + z**2 <= 0.09),
+    "cylinder": ("<radius>0.2</radius><length>0.5</length>",
+                 lambda x, y, z: (x**2 + y**2 <= 0.04) & (abs(z) <= 0.25)),
+    "capsule": ("<radius>0.2</radius><length>0.2</length>",
+                lambda x, y, z: x**2 + y**2 + np.maximum(abs(z) - 0.1, 0.0) ** 2 <= 0.04),
+    "ellipsoid": ("<radii>0.1 0.2 0.3</radii>",
+                  lambda x, y, z: (x / 0.1) ** 2 + (y / 0.2) ** 2 + (z / 0.3) ** 2 <= 1.0),
+}  # fmt: skip
+
+
+def auto(shape: str, inside: str = "", density: str = "", pose: str = "", more: str = "") -> str:
+    """A link without numbers, whose collision is of this shape."""
+    return (
+        f'<link name="arm"><collision name="c"><pose>{pose}</pose>{density}<geometry>'
+        f'<{shape}>{inside}</{shape}></geometry></collision>{more}<inertial auto="true"/></link>'
+    )
+
+
+def of_arm(text: str) -> pin.Inertia:
+    return tree(sdf(text, joint("hinge", "revolute", "world", "arm"))).inertias[1]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_inertia_of_a_collision_is_that_of_its_solid(shape: str) -> None:
+    """Against the sum over cubes of 5 mm."""
+    inside, contains = SHAPES[shape]
+    n, half = 120, 0.3
+    axis = (np.arange(n) + 0.5) / n * 2.0 * half - half
+    x, y, z = (part[None] for part in np.meshgrid(axis, axis, axis, indexing="ij"))
+    points = np.array([part.ravel() for part in (x, y, z)])
+    points = points[:, contains(*points)]
+    mass = 500.0 * points.shape[1] * (2.0 * half / n) ** 3
+    second = mass * points @ points.T / points.shape[1]
+    found = of_arm(auto(shape, inside, "<density>500</density>"))
+    assert found.mass == pytest.approx(mass, rel=0.005)
+    expected = np.trace(second) * np.eye(3) - second
+    np.testing.assert_allclose(found.inertia, expected, rtol=0.01, atol=1e-3 * expected.max())
+
+
+def test_collisions_add_up_and_a_mass_is_that_of_all() -> None:
+    """Two boxes side by side are one of twice the length; the density of <inertial> counts last."""
+    half = "<size>0.5 0.2 0.1</size>"
+    right = (
+        '<collision name="right"><pose>0.25 0 1 0 0 0</pose><geometry><box>'
+        f"{half}</box></geometry></collision>"
+    )
+    two = auto("box", half, "<density>300</density>", "-0.25 0 1 0 0 0", right).replace(
+        "/></link>", "><density>300</density><pose>9 9 9 0 0 0</pose></inertial></link>"
+    )
+    one = auto("box", "<size>1 0.2 0.1</size>", "<density>300</density>", "0 0 1 0 0 0")
+    both, single = of_arm(two), of_arm(one)
+    assert both.isApprox(single, 1e-12)
+    assert single.mass == pytest.approx(6.0)
+    heavy = of_arm(one.replace("/></link>", "><mass>12</mass></inertial></link>"))
+    assert heavy.isApprox(pin.Inertia(12.0, single.lever, 2.0 * single.inertia), 1e-12)
+
+
+def test_inertia_of_a_mesh_is_that_of_the_solid_it_encloses(tmp_path: Path) -> None:
+    """A box of 1 m x 2 m x 3 m as a mesh of 1 m, scaled; turned inside out it is refused."""
+    corners = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+    for name, order in (("box.obj", 1), ("out.obj", -1)):
+        lines = [f"v {x} {y} {z}" for x, y, z in corners]
+        lines += [f"f {' '.join(face.split()[::order])}" for face in faces]
+        (tmp_path / name).write_text("\n".join(lines))
+
+    def text(name: str) -> str:
+        arm = auto("mesh", f"<uri>{name}</uri><scale>1 2 3</scale>", pose="-0.5 -1 -1.5 0 0 0")
+        return sdf(arm, joint("hinge", "revolute", "world", "arm"))
+
+    found = loaded(tmp_path, text("box.obj")).model.inertias[1]
+    own = 6000.0 / 12.0 * np.diag([13.0, 10.0, 5.0])
+    np.testing.assert_allclose(found.inertia, own, atol=1e-9)
+    assert found.mass == pytest.approx(6000.0)
+    np.testing.assert_allclose(found.lever, 0.0, atol=1e-12)
+    with pytest.raises(srm.InputError, match="inside out"):
+        loaded(tmp_path, text("out.obj"))
+
+
+# Names and merged models ------------------------------------------------------------------------
+
+
+def test_a_visual_and_an_inertial_may_be_placed_relative_to_any_frame() -> None:
+    shape = "<geometry><box><size>1 1 1</size></box></geometry>"
+    arm = link("arm", ONE).replace(
+        "</link>", f"<visual name='v'><pose relative_to='hand'>{TWO}</pose>{shape}</visual></link>"
+    )
+    arm = arm.replace("<inertial><pose>", "<inertial><pose relative_to='hand'>")
+    text = sdf(
+        arm,
+        f"<frame name='hand' attached_to='arm'><pose>{THREE}</pose></frame>",
+        joint("hinge", "revolute", "world", "arm"),
+    )
+    made = translated(text)
+    origin = made.tree.find("link[@name='arm']/visual/origin")
+    assert origin is not None
+    xyz, turn = (list(map(float, origin.get(key, "").split())) for key in ("xyz", "rpy"))
+    same(at(*xyz, *turn), of(THREE) * of(TWO))
+    np.testing.assert_allclose(tree(text).inertias[1].lever, of(THREE).translation, atol=1e-14)
+
+
+def test_names_may_hold_the_separator() -> None:
+    """As flattened nested models of older files have it."""
+    text = sdf(
+        link("base"),
+        link("left::arm", ONE),
+        link("left::hand", TWO),
+        '<frame name="left::__model__"/>',
+        joint("left::hinge", "revolute", "base", "left::arm"),
+        joint("left::wrist", "revolute", "left::arm", "left::hand"),
+        version="1.7",
+    )
+    model = tree(text)
+    assert list(model.names)[2:] == ["left::hinge", "left::wrist"]
+    same(placed(model, "left::hand"), of(TWO))
+
+
+def test_a_merged_model_is_part_of_the_model_around_it(tmp_path: Path) -> None:
+    """Its own frame stays that of its elements; they have no prefix."""
+    (tmp_path / "arm.sdf").write_text(
+        sdf(
+            link("upper", ONE),
+            link("lower", TWO),
+            "<frame name='tip' attached_to='lower'/>",
+            f"<frame name='own'><pose relative_to='__model__'>{THREE}</pose></frame>",
+            joint("elbow", "revolute", "upper", "lower").replace(
+                "<xyz>", "<xyz expressed_in='__model__'>"
+            ),
+            f'<model name="deep"><pose>{ONE}</pose>{link("box")}</model>',
+            joint("weld", "fixed", "lower", "deep::box", axis=""),
+            name="arm",
+        )
+    )
+    include = f"<include merge='true'><uri>arm.sdf</uri><pose>{THREE}</pose></include>"
+    text = sdf(
+        link("base"),
+        include,
+        link("hand", "").replace("<inertial>", "<pose relative_to='own'/><inertial>"),
+        joint("shoulder", "revolute", "base", "upper"),
+        joint("wrist", "revolute", "tip", "hand"),
+    )
+    mechanism = loaded(tmp_path, text)
+    assert mechanism.joint_names[1:] == ("shoulder", "elbow", "wrist")
+    for name, expected in {
+        "base": pin.SE3.Identity(),
+        "upper": of(THREE) * of(ONE),
+        "lower": of(THREE) * of(TWO),
+        "deep::box": of(THREE) * of(ONE),
+        "hand": of(THREE) * of(THREE),
+    }.items():
+        same(placed(mechanism.model, name, mechanism.q0), expected)
+    urdf = ElementTree.fromstring(mechanism.source.urdf)  # type: ignore[union-attr]
+    axis = urdf.find("joint[@name='elbow']/axis").get("xyz", "")  # type: ignore[union-attr]
+    expected = of(TWO).rotation.T @ [0.0, 1.0, 0.0]
+    np.testing.assert_allclose(list(map(float, axis.split())), expected, atol=1e-12)
+    twice = text.replace(include, include * 2)
+    with pytest.raises(srm.InputError, match=r"'upper'"):
+        loaded(tmp_path, twice)
+
+
+def test_a_world_merges_models(tmp_path: Path) -> None:
+    (tmp_path / "arm.sdf").write_text(
+        sdf(link("upper", ONE), joint("hinge", "revolute", "world", "upper"), name="arm")
+    )
+    text = (
+        '<sdf version="1.10"><world name="w"><include merge="1"><uri>arm.sdf</uri>'
+        f"<pose>{THREE}</pose></include></world></sdf>"
+    )
+    same(placed(loaded(tmp_path, text).model, "upper"), of(THREE) * of(ONE))
+
+
 # Graphs -------------------------------------------------------------------------------------
 
 
@@ -418,6 +642,31 @@ def test_an_included_model_is_found_beside_the_file(tmp_path: Path) -> None:
     )
     mechanism = loaded(tmp_path, text)
     same(placed(mechanism.model, "left::finger", mechanism.q0), of(THREE) * of(ONE))
+
+
+def test_the_largest_numbers_as_limits_mean_no_limit(tmp_path: Path) -> None:
+    """Exporters write the largest double, rounded up or down, or 1e16."""
+
+    def limited(name: str, low: str, high: str) -> str:
+        more = f"<velocity>{high}</velocity><effort>{high}</effort>"
+        limit = f"<limit><lower>{low}</lower><upper>{high}</upper>{more}</limit>"
+        return link(f"{name}_link") + joint(name, "revolute", "world", f"{name}_link", "|" + limit)
+
+    text = sdf(
+        limited("a", "-1.79769e+308", "1.79769e308"),
+        limited("b", "-1.797693135e308", "1.797693135e308"),
+        limited("c", "-1e16", "10000000000000000.000000"),
+        limited("d", "-inf", "inf"),
+        limited("e", "-1e16", "0.5"),
+    )
+    path = tmp_path / "robot.toml"
+    loaded(tmp_path, text)
+    path.write_text('format = 1\nsdf = "robot.sdf"\nlimits = "spring"\n')
+    springs = srm.load(path).forces
+    assert [spring.name for spring in springs] == ["limit_e"]
+    assert isinstance(springs[0], srm.LimitSpring)
+    low, high, _ = springs[0].resolved(srm.load(path).model)
+    assert (low, high) == (-np.inf, 0.5)
 
 
 def test_a_gearbox_is_a_coupling_of_two_hinges() -> None:

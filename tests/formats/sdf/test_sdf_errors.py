@@ -38,7 +38,17 @@ FAULTS = {
     "mass": ("<mass>1.0</mass>", "<mass>heavy</mass>"),
     "negative": ("<mass>1.0</mass>", "<mass>-1</mass>"),
     "auto": ("<inertial>", '<inertial auto="true">'),
-    "gravity": ("<inertial>", "<gravity>0</gravity><inertial>"),
+    "auto of a plane": ("<inertial>", '<collision name="c"><geometry><plane/></geometry>'
+                        '</collision><inertial auto="1">'),
+    "auto of nothing": ("<inertial>", '<collision name="c"><geometry><sphere><radius>0</radius>'
+                        '</sphere></geometry></collision><inertial auto="1">'),
+    "auto of a submesh": ("<inertial>", '<collision name="c"><geometry><mesh><submesh/></mesh>'
+                          '</geometry></collision><inertial auto="1">'),
+    "auto without the mesh": ("<inertial>", '<collision name="c"><geometry><mesh><uri>no.stl</uri>'
+                              '</mesh></geometry></collision><inertial auto="1">'),
+    "gravity": ("<inertial>", "<gravity>off</gravity><inertial>"),
+    "kinematic": ("<inertial>", "<kinematic>1</kinematic><inertial>"),
+    "visual": ("<inertial>", '<visual name="v"><pose relative_to="x"/></visual><inertial>'),
     "type": ('type="revolute"', 'type="hinge"'),
     "parent": ("<parent>world", "<parent>wall"),
     "no parent": ("<parent>world</parent>", ""),
@@ -63,7 +73,7 @@ FAULTS = {
     "mimic": ("<xyz>", '<mimic joint="x" axis="axis"/><xyz>'),
     "include": (LAST, "<include><uri>model://nowhere</uri></include></model>"),
     "far": (LAST, "<include><uri>https://a.b/c</uri></include></model>"),
-    "merge": (LAST, '<include merge="true"><uri>a</uri></include></model>'),
+    "merge": (LAST, '<include merge="maybe"><uri>a</uri></include></model>'),
     "canonical": ('name="robot"', 'name="robot" canonical_link="x"'),
     "placement": ('name="robot"', 'name="robot" placement_frame="arm"'),
 }  # fmt: skip

@@ -1,0 +1,83 @@
+"""XML that expat refuses and robots are written in: comments with two dashes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree.ElementTree import tostring
+
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.formats import xml
+from srm_mbs.formats.xml import DASHES, parse_xml
+from tests.support import sdf_files
+from tests.support.urdf_files import tree
+
+DASHED = "<!-- a -- b --- <link/> &x; \n -- --->"
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        (f"<a>{DASHED}<b/></a>", "<a><b/></a>"),
+        (f"{DASHED}<a/>{DASHED}", "<a/>"),
+        ("<a><!-- -- --><b/><!-- > --></a>", "<a><b/></a>"),
+        # A comment ends at the first -->, and begins in no other part.
+        (f"<a>{DASHED}<![CDATA[<!-- -- ]]>-->", None),
+        (f"<a>{DASHED}<![CDATA[<!-- -- -->]]></a>", "<a>&lt;!-- -- --&gt;</a>"),
+        (f"<a>{DASHED}<?x <!-- ?>--</a>", "<a>--</a>"),
+        (f"<p:a>{DASHED}</p:a>", '<p:a xmlns:p="p"/>'),
+    ],
+)
+def test_dashes_in_comments_are_skipped(text: str, same: str | None) -> None:
+    notes: list[str] = []
+    if same is None:
+        with pytest.raises(srm.InputError, match="not well-formed"):
+            parse_xml(text, "x", notes)
+        return
+    assert tostring(parse_xml(text, "x", notes)) == tostring(parse_xml(same, "x"))
+    assert notes == [DASHES]
+
+
+@pytest.mark.parametrize(
+    "text", ["<a><!-- -- </a>", "<a><!-- -- --></b>", "<a b='<!-- -- -->'/>", "<a>&amp</a>"]
+)
+def test_other_faults_are_refused_where_they_are(text: str) -> None:
+    with pytest.raises(srm.InputError, match="not well-formed XML"):
+        parse_xml(text, "x")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<!-- -- --><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>',
+        '<!DOCTYPE a [<!-- -- --><!ENTITY b SYSTEM "file:///etc/passwd">]><a>&b;</a>',
+        '<!DOCTYPE a [<!ENTITY b "<!-- -- -->">]><!-- -- --><a>&b;</a>',
+    ],
+)
+def test_dashes_do_not_let_entities_in(text: str) -> None:
+    with pytest.raises(srm.InputError, match="refused for safety"):
+        parse_xml(text, "x")
+
+
+@pytest.mark.timeout(5)
+@pytest.mark.parametrize("part", ["<!-- -- ", "<!-- -- -->", "<!-- -", "<![CDATA[", "<?"])
+def test_a_file_of_comments_is_read_in_linear_time(
+    part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(xml, "MOST_ELEMENTS", 10**7)
+    text = "<a><!-- -- -->" + part * 200_000
+    with pytest.raises(srm.InputError):
+        parse_xml(text, "x")
+
+
+def test_every_format_notes_it_once(tmp_path: Path) -> None:
+    for name, text in (
+        ("robot.urdf", tree().replace("<link", "<!-- -- --><link", 2)),
+        ("robot.sdf", sdf_files.four_bar("<!-- -- -->")),
+    ):
+        path = tmp_path / name
+        path.write_text(text)
+        plain = path.with_stem("plain")
+        plain.write_text(text.replace("<!-- -- -->", ""))
+        assert srm.load(path).notes == (DASHES, *srm.load(plain).notes)

@@ -31,6 +31,14 @@ class Twins:
         options = Options() if path is None else Options(reach=Reach.of(path))
         made = self.made = translate(Document(text, str(path or "robot.xml")), options)
         self.entries = made.entries
+        inertials = {link.get("name"): link.find("inertial") for link in made.tree.findall("link")}
+        self._carried = {
+            name: (
+                part * float(inertials[name].find("mass").get("value")),
+                np.array(inertials[name].find("origin").get("xyz").split(), dtype=float),
+            )
+            for name, part in made.entries.get("gravity_compensation", {}).items()
+        }
         self.model = build_urdf(made.tree, "x.urdf", made.entries.get("base", "fixed")).model
         self.model.gravity.linear = np.array(made.entries["gravity"])
         keys = {key: value for key, value in made.entries.items() if key != "loop"}
@@ -86,6 +94,19 @@ class Twins:
         ours = self.data.oMf[self.model.getFrameId(name, pin.FrameType.BODY)]
         i = mujoco.mj_name2id(self.theirs, mujoco.mjtObj.mjOBJ_BODY, name)
         return ours, pin.SE3(self.state.xmat[i].reshape(3, 3), self.state.xpos[i])
+
+    def forces_on(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) of springs and compensated weights, after :meth:`put`."""
+        model, data = self.model, self.data
+        out = np.array(self.forces.generalised(data, q, v, 0.0))
+        for name, (mass, centre) in self._carried.items():
+            frame = model.getFrameId(name, pin.FrameType.BODY)
+            J = pin.computeFrameJacobian(
+                model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            )
+            arm = data.oMf[frame].rotation @ centre
+            out -= mass * (J[:3] - pin.skew(arm) @ J[3:]).T @ model.gravity.linear
+        return out
 
     def anchor(self, entry: dict[str, Any]) -> pin.SE3:
         joint, inside = Anchor(**entry).resolve(self.model)
@@ -147,7 +168,7 @@ def check_dynamics(twins: Twins, atol: float = 1e-10) -> None:
                 rate = v[own.stop : own.stop + 3]
                 turning[own] = np.cross(rate, v[own] + np.cross(rate, twins.offsets[joint.id]))
         bias = T.T @ (state.qfrc_bias - state.qfrc_passive) + ours @ turning
-        mine = twins.data.nle + model.damping * v - twins.forces.generalised(twins.data, q, v, 0.0)
+        mine = twins.data.nle + model.damping * v - twins.forces_on(q, v)
         np.testing.assert_allclose(mine, bias, rtol=1e-9, atol=atol)
 
 

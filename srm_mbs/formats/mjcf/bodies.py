@@ -53,7 +53,7 @@ class BodyReader:
     added
         Armatures of free joints by body.
     compensated
-        ``gravcomp`` of moving bodies, by name.
+        Part of the weight that does not act (``gravcomp``), by body.
     """
 
     def __init__(self, values: MjcfValues, reach: Reach) -> None:
@@ -101,7 +101,7 @@ class BodyReader:
         self._joints(node, name, parent, in_parent, childclass)
         self._contents(node, name, pin.SE3.Identity(), childclass, found)
         self.bodies[name] = body = self._finished(name, found["inertial"], found["geom"])
-        compensated = given.number("gravcomp")
+        compensated = 0.0 if "gravcomp" in values.off else given.number("gravcomp")
         if compensated and body.inertia is not None and name in self._moving:
             self.compensated[name] = compensated
 
@@ -223,38 +223,18 @@ class BodyReader:
         about = axes @ np.diag(principal) @ axes.T
         return pin.Inertia(max(inertia.mass, compiler.bound_mass), inertia.lever, about)
 
-    def compensation(self, gravity: FloatArray) -> list[dict[str, Any]]:
-        """The forces that carry weight, in the field ``gravity`` (3,): a part of that of bodies
-        (``gravcomp``), and all of that of the armatures of free joints, which are added to their
-        bodies here.
-
-        The armature a of a free joint adds a to each diagonal element of its mass matrix: a body
-        with the mass a at the joint and the moments of inertia a does the same.
+    def add_rotors(self) -> None:
+        """Add the armatures a of free joints, which add a to each diagonal element of their mass
+        matrices: so does a weightless body with the mass a at the joint and moments of inertia a.
         """
-        carried = []
-        compensated = {} if "gravcomp" in self.values.off else self.compensated
-        for name, part in compensated.items():
-            if (inertia := self.bodies[name].inertia) is not None:
-                carried.append((name, "gravcomp", inertia.lever, part * inertia.mass))
         for name, armature in self.added.items():
-            body = self.bodies[name]
-            rotor = pin.Inertia(armature, np.zeros(3), armature * np.eye(3))
-            inertia = rotor if body.inertia is None else body.inertia + rotor
-            self.bodies[name] = replace(body, inertia=inertia)
-            carried.append((name, "armature", np.zeros(3), armature))
-            self.values.remark(
-                "the armature of a free joint is part of the inertia of its body", f"body {name!r}"
-            )
-        return [
-            {
-                "type": "wrench",
-                "name": f"{name}::{what}",
-                "at": anchor(name, pin.SE3(np.eye(3), lever)),
-                "force": (-mass * gravity).tolist(),
-            }
-            for name, what, lever, mass in carried
-            if gravity.any()
-        ]
+            rotor = self._name(f"{name}::rotor", "")
+            inertia = pin.Inertia(armature, np.zeros(3), armature * np.eye(3))
+            self.bodies[rotor] = Body(rotor, inertia)
+            self.placements[rotor] = self.placements[name]
+            self.joints.append(Joint(rotor, "fixed", name, rotor))
+            self.compensated[rotor] = 1.0
+            self.values.remark("the armature of a free joint is a body without weight", rotor)
 
     def rescale(self) -> None:
         """Scale all inertias so that the total mass is ``settotalmass``."""

@@ -169,7 +169,7 @@ def translate(document: Document, options: Options) -> Translation:
     if not tree.bodies:
         raise values.fault("<worldbody>", "there is no <body>", "Add one for every body")
     tree.rescale()
-    carried = tree.compensation(gravity)
+    tree.add_rotors()
     closures = EqualityReader(values, tree, root.findall("tendon"))
     for node in root.findall("equality"):
         closures.equality(node)
@@ -196,7 +196,8 @@ def translate(document: Document, options: Options) -> Translation:
         values.notes(),
         gravity=gravity.tolist(),
         loop=closures.loops,
-        force=[*tree.forces, *closures.forces, *carried],
+        force=[*tree.forces, *closures.forces],
+        gravity_compensation=tree.compensated,
         lock=closures.lock,
         initial={"q": closures.held} if closures.held else {},
     )

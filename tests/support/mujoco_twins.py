@@ -31,14 +31,14 @@ class Twins:
         options = Options() if path is None else Options(reach=Reach.of(path))
         made = self.made = translate(Document(text, str(path or "robot.xml")), options)
         self.entries = made.entries
-        inertials = {link.get("name"): link.find("inertial") for link in made.tree.findall("link")}
-        self._carried = {
-            name: (
-                part * float(inertials[name].find("mass").get("value")),
-                np.array(inertials[name].find("origin").get("xyz").split(), dtype=float),
-            )
-            for name, part in made.entries.get("gravity_compensation", {}).items()
-        }
+        self._carried = {}
+        for link in made.tree.findall("link"):
+            part = made.entries.get("gravity_compensation", {}).get(link.get("name"))
+            if part is not None:
+                origin = link.find("inertial/origin")
+                centre = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
+                mass = part * float(link.find("inertial/mass").get("value"))
+                self._carried[link.get("name")] = mass, np.array(centre.split(), dtype=float)
         self.model = build_urdf(made.tree, "x.urdf", made.entries.get("base", "fixed")).model
         self.model.gravity.linear = np.array(made.entries["gravity"])
         keys = {key: value for key, value in made.entries.items() if key != "loop"}

@@ -32,6 +32,7 @@ from srm_mbs.cli.output import (
     RUN_FAILED,
     AllowOutside,
     Html,
+    Keyframe,
     Lines,
     Model,
     check_output,
@@ -168,6 +169,7 @@ def simulate(
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
     live: playback.Live = False,
     allow_outside: AllowOutside = False,
+    keyframe: Keyframe = None,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -186,7 +188,7 @@ def simulate(
     check_output(html, "--html", HTML_SUFFIXES)
     playback.check_pictures(image, at, video)
 
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside, keyframe=keyframe)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     if full_paths and out is None:
@@ -264,7 +266,7 @@ def convert(
 
 @app.command()
 @reported
-def info(model: Model, allow_outside: AllowOutside = False) -> None:
+def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe = None) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
@@ -278,7 +280,7 @@ def info(model: Model, allow_outside: AllowOutside = False) -> None:
         mechanism_rows,
     )
 
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
+    mechanism = srm_mbs.load(model, allow_outside=allow_outside, keyframe=keyframe)
     table(mechanism_rows(mechanism))
     for header, rows in (
         (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),

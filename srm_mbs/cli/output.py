@@ -60,6 +60,10 @@ AllowOutside = Annotated[
     bool,
     typer.Option("--allow-outside", help="Let the file name meshes and other files anywhere."),
 ]
+Keyframe = Annotated[
+    str | None,
+    typer.Option("--keyframe", metavar="NAME", help="Start in this keyframe of an MJCF file."),
+]
 HTML_SUFFIXES = (".html", ".htm")
 
 

@@ -51,7 +51,8 @@ class Overrides:
     """Arguments of :func:`load`.
 
     ``gravity``, ``base`` and ``cut`` replace values of the file (None or empty: the file's);
-    ``mesh_dirs`` and ``allow_outside`` say which other files it may name.
+    ``keyframe`` names one of its states; ``mesh_dirs`` and ``allow_outside`` say which other files
+    it may name.
     """
 
     gravity: Sequence[float] | None = None
@@ -59,6 +60,7 @@ class Overrides:
     cut: tuple[str, ...] = ()
     mesh_dirs: tuple[str | Path, ...] = ()
     allow_outside: bool = False
+    keyframe: str | None = None
 
 
 def _gravity(value: Any) -> tuple[float, float, float]:
@@ -83,7 +85,14 @@ def _translated(
     reach: Reach,
 ) -> Reading:
     """Translate ``model``, the file that the description names, and merge the two."""
-    options = Options(overrides.cut or tuple(description.cut), entries, reach)
+    keyframe = overrides.keyframe
+    if keyframe is not None and not (isinstance(keyframe, str) and found.key == "mjcf"):
+        raise InputError(
+            f"{safe_repr(keyframe)} is no keyframe: the model file is a {found.name}",
+            element="keyframe",
+            remedy="Give the name of a keyframe of an MJCF file",
+        )
+    options = Options(overrides.cut or tuple(description.cut), entries, reach, keyframe)
     translation = found.translate(model, options)
     text = own.text
     if translation.entries or found.key != "urdf":
@@ -193,6 +202,7 @@ def load(
     cut: Sequence[str] = (),
     mesh_dirs: Sequence[str | Path] = (),
     allow_outside: bool = False,
+    keyframe: str | None = None,
 ) -> Mechanism:
     """Load a mechanism and assemble its initial state.
 
@@ -215,6 +225,10 @@ def load(
         Whether it may name files anywhere.  By default they lie, symbolic links resolved, in its
         folder, in its package, in packages found through the environment, or in ``mesh_dirs``
         (``docs/formats.md``); the mechanism keeps the decision for its animations.
+    keyframe
+        Name of the keyframe of an MJCF file in which the mechanism starts (its number from 0, as
+        text, if it has no name), instead of the pose of the file.  With closures its positions are
+        the guess from which they close, and its rates are left out.
 
     Raises
     ------
@@ -223,7 +237,9 @@ def load(
     AssemblyError
         If the loops cannot close or held values contradict each other.
     """
-    overrides = Overrides(gravity, base, name_list(cut, "cut"), tuple(mesh_dirs), allow_outside)
+    overrides = Overrides(
+        gravity, base, name_list(cut, "cut"), tuple(mesh_dirs), allow_outside, keyframe
+    )
     reading = read(path, overrides)
     with naming(file=reading.source.path):
         return assembled(reading)

@@ -26,11 +26,14 @@ class Options:
         The tables of the description that names the file; empty if none does.
     reach
         Where files that the file names may lie.
+    keyframe
+        Name of the state of the file in which the mechanism starts; None: the pose of the file.
     """
 
     cut: tuple[str, ...] = ()
     own: Mapping[str, Any] = field(default_factory=dict)
     reach: Reach = field(default_factory=Reach)
+    keyframe: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,11 @@ def _table(rows: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     return {tag: words(names) for tag, names in rows.items()}
 
 
-SECTIONS = words("compiler option default asset worldbody equality tendon contact actuator include")
+SECTIONS = words(
+    "compiler option default asset worldbody equality tendon contact actuator keyframe include"
+)
 """Sections that are read, or looked into."""
-IGNORED_SECTIONS = words("size visual statistic sensor keyframe custom extension")
+IGNORED_SECTIONS = words("size visual statistic sensor custom extension")
 BODY_READ = words("inertial joint freejoint geom site body frame replicate")
 BODY_IGNORED = ("camera", "light")
 PLACED = "pos quat axisangle xyaxes zaxis euler"
@@ -50,6 +52,7 @@ ATTRIBUTES = _table(
         "spatial": "name class stiffness damping frictionloss springlength armature",
         "mesh": "name class file scale inertia refpos refquat",
         "material": "name class rgba",
+        "key": "name qpos qvel",
     }
 )
 """Attributes that are read; those of equalities between coordinates follow."""
@@ -77,6 +80,7 @@ IGNORED_ATTRIBUTES = _table(
         "tendon": f"{CONTACT} group limited range width material rgba",
         "spatial": f"""{CONTACT} group limited range width material rgba actuatorfrclimited
             actuatorfrcrange solreflimit solimplimit solreffriction solimpfriction""",
+        "key": "time act ctrl mpos mquat",
         "mesh": """content_type smoothnormal vertex normal texcoord face maxhullvert builtin params
             material""",
         "material": """texture texrepeat texuniform emission specular shininess reflectance metallic

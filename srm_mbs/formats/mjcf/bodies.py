@@ -42,6 +42,8 @@ class BodyReader:
         By name; placements in the world in the pose of the file.
     joints
         One for each joint of MuJoCo; welded bodies have a fixed one.
+    order
+        Name, type and body of each joint of MuJoCo, in the order of the file.
     free
         Free joints by body.
     sites
@@ -61,6 +63,7 @@ class BodyReader:
         self.bodies: dict[str, Body] = {}
         self.placements: dict[str, pin.SE3] = {WORLD: pin.SE3.Identity()}
         self.joints: list[Joint] = []
+        self.order: list[tuple[str, str, str]] = []
         self.free: dict[str, Joint] = {}
         self.added: dict[str, float] = {}
         self.sites: dict[str, tuple[str, pin.SE3]] = {}
@@ -292,6 +295,7 @@ class BodyReader:
         else:
             given = values.resolved(node, childclass, where)
             kind = given.choice("type", JOINT_TYPES)
+        self.order.append((name, kind, child))
         acting = _acting(given)
         if kind == "free":
             if parent != WORLD or not alone:

@@ -14,11 +14,13 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import read_text, shortened
+from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.mjcf.attributes import IGNORED_SECTIONS, SECTIONS, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
 from srm_mbs.formats.mjcf.geoms import INERTIAS, Mesh
+from srm_mbs.formats.mjcf.keyframes import KeyframeReader
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.xml import check_tree, parse_xml
 from srm_mbs.model.reach import Reach
@@ -192,6 +194,17 @@ def translate(document: Document, options: Options) -> Translation:
         tree.free,
     )
     made = graph.translate()
+    joints = [
+        joint.get("name", "")
+        for joint in made.tree.findall("joint")
+        if joint.get("name") not in closures.lock
+    ]
+    if made.entries.get("base") == "floating":
+        joints.append(ROOT_JOINT)
+    keyframes = KeyframeReader(values, tree, root.findall("keyframe"))
+    start = keyframes.start(options.keyframe, bool(closures.loops), joints)
+    if closures.held:
+        start["q"] = start.get("q", {}) | closures.held
     return made.extended(
         values.notes(),
         gravity=gravity.tolist(),
@@ -199,5 +212,5 @@ def translate(document: Document, options: Options) -> Translation:
         force=[*tree.forces, *closures.forces],
         gravity_compensation=tree.compensated,
         lock=closures.lock,
-        initial={"q": closures.held} if closures.held else {},
+        initial=start,
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import srm_mbs as srm
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.integration.kernel.test_kernel import agree
 from tests.support.lockstep import compare
@@ -78,6 +79,59 @@ def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
 @pytest.mark.parametrize("name", ["four_bar", "tendons", "two_loops"])
 def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
     check_residuals(Twins(FILES[name]))
+
+
+KEYED = """<mujoco><worldbody>
+  <body name="base" pos="0.1 0.2 0.3" euler="0 0 30"><freejoint name="root"/><geom size="0.2"/>
+    <body name="arm" pos="0.2 0 0"><joint name="hip" ref="20" axis="0 1 0"/><geom size="0.1"/>
+      <body name="hand" pos="0.2 0 0"><joint name="wrist" type="ball"/>
+        <geom type="box" size="0.1 0.02 0.03" pos="0.1 0 0"/></body></body></body>{}
+  </worldbody>
+  <keyframe><key name="home" qpos="1 2 3 0.8 0 0.6 0 0.5 0.6 0 0 0.8 {}"/></keyframe></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("more", "own"),
+    [
+        ("", ""),
+        (
+            '<body name="far" pos="3 0 0"><joint name="far" type="slide"/><geom size="1"/></body>',
+            "2",
+        ),
+    ],
+)
+def test_a_run_starts_in_a_keyframe(tmp_path: Path, more: str, own: str) -> None:
+    """Alone, the base is on the root joint; beside another body, on a floating joint."""
+    text = KEYED.format(more, own)
+    path = tmp_path / "keyed.xml"
+    path.write_text(text)
+    mechanism = srm.load(path, keyframe="home")
+    theirs = mujoco.MjModel.from_xml_string(text)
+    state = mujoco.MjData(theirs)
+    mujoco.mj_resetDataKeyframe(theirs, state, 0)
+    mujoco.mj_forward(theirs, state)
+    data = mechanism.model.createData()
+    pin.framesForwardKinematics(mechanism.model, data, mechanism.q0)
+    for i in range(1, theirs.nbody):
+        name = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_BODY, i)
+        found = data.oMf[mechanism.model.getFrameId(name, pin.FrameType.BODY)]
+        np.testing.assert_allclose(found.translation, state.xpos[i], atol=1e-14)
+        np.testing.assert_allclose(found.rotation.ravel(), state.xmat[i], atol=1e-14)
+
+
+def test_a_keyframe_of_a_mechanism_with_closures_is_the_guess(tmp_path: Path) -> None:
+    text = FOUR_BAR.replace(
+        "</mujoco>",
+        '<keyframe><key qpos="0.4 0 0.3" qvel="1 0 0"/><key name="other" qvel="0 0 2"/></keyframe>'
+        "</mujoco>",
+    )
+    path = tmp_path / "keyed.xml"
+    path.write_text(text)
+    start, zero, other = (srm.load(path, keyframe=key) for key in (None, "0", "other"))
+    assert any("--keyframe other" in note for note in start.notes)
+    assert np.abs(zero.q0 - start.q0).max() > 0.1
+    np.testing.assert_array_equal(other.q0, start.q0)
+    assert any("rates" in note for note in other.notes)
 
 
 def test_a_weld_without_torque_holds_the_point_that_mujoco_holds() -> None:

@@ -76,12 +76,12 @@ def test_included_files_stand_in_the_place_of_the_include(tmp_path: Path) -> Non
 def test_what_gives_no_force_is_noted() -> None:
     more = (
         '<option density="1.2" viscosity="1.8e-5"/>'
-        '<actuator><motor joint="j"/></actuator><sensor/><keyframe/>'
+        '<actuator><motor joint="j"/></actuator><sensor/>'
         '<contact><exclude body1="one" body2="two"/></contact>'
         '<equality><weld body1="one" body2="two" torquescale="2" solref="0.1 1"/></equality>'
     )
     notes = " ".join(translated(file(TWO + '<body mocap="true"/>', more)).notes)
-    words = "density viscosity mocap actuators contact <sensor> <keyframe> torquescale solref"
+    words = "density viscosity mocap actuators contact <sensor> torquescale solref"
     for word in words.split():
         assert word in notes
 
@@ -181,6 +181,15 @@ def test_a_fault_is_named_with_its_place(tmp_path: Path) -> None:
     for name, text in texts.items():
         path.write_text(text)
         messages[name] = refused(partial(srm.load, path), tmp_path)
+    keyed = file(more='<keyframe><key name="home" qpos="1 2"/></keyframe>')
+    for name, text, key in (
+        ("no such keyframe", keyed, "away"),
+        ("keyframe of another model", keyed.replace("1 2", "1 2 3"), "home"),
+    ):
+        path.write_text(text)
+        messages[name] = refused(partial(srm.load, path, keyframe=key), tmp_path)
+    path.write_text('<robot name="r"><link name="l"/></robot>')
+    messages["keyframe of a URDF"] = refused(partial(srm.load, path, keyframe="a"), tmp_path)
     check_messages("mjcf", messages)
 
 

@@ -58,6 +58,7 @@ SAME_TIME_ROUNDING = 16.0 * float(np.finfo(float).eps)
 """The same, over the time itself: the search finds each of two equal zeros to 8 eps."""
 MAX_HALVINGS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
+_HALVES: FloatArray = 0.5 ** np.arange(1, MAX_HALVINGS + 1)
 MAX_BISECTIONS = 40
 """Halvings of the time in which a value leaves zero."""
 MAX_ROOT_STEPS = 200
@@ -362,13 +363,12 @@ class EventWatch:
         """A node of the first step between the start and the first of ``nodes`` where the value
         still has the sign with which it departs, if it returns to zero that soon; else None."""
         event, (t, _), (after, value) = self._events[i], *nodes[:2]
-        length = after - t
-        for _ in range(MAX_HALVINGS):
-            length *= 0.5
-            now = _value_at(event, dense, t + length)
+        times = t + (after - t) * _HALVES
+        for at, x in zip(times.tolist(), dense(times)):
+            now = event(at, x)
             if now * value < 0.0:
                 self._signs[i] = float(np.sign(now))
-                return t + length, now
+                return at, now
         return None
 
     def _zeros(

@@ -702,8 +702,7 @@ def _half_turns(names: tuple[str, ...]) -> str:
         return ""
     return (
         " Bushings turned by more than half a turn, where their moments jump to the opposite "
-        f"({', '.join(names)}): from there the error is not controlled. Use torsion springs, whose "
-        "angles count turns."
+        f"({', '.join(names)}). Torsion springs have none of these jumps: their angles count turns."
     )
 
 

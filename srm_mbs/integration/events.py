@@ -487,7 +487,12 @@ def _zero_between(
     for _ in range(MAX_ROOT_STEPS):
         new = _interpolated_zero(points)
         step = abs(new - at)
-        interpolated = a < new < b and step < 0.5 * steps[-2]
+        if step <= precision and not a < new < b:
+            # Rounding places it on an end of the bracket, which is the zero up to rounding.
+            new = min(max(new, a), b)
+            interpolated = True
+        else:
+            interpolated = a < new < b and step < 0.5 * steps[-2]
         if not interpolated:
             new = 0.5 * (a + b)
             step = abs(new - at)
@@ -500,12 +505,12 @@ def _zero_between(
             # Of the times beside it the nearest.
             near = _interpolated_zero([points[-1], (new, value)])
             beside = [near, math.nextafter(new, a), math.nextafter(new, b)]
+            beside = [x for x in beside if x != new and a <= x <= b]
             best = abs(value)
-            for x in beside:
-                if x != new and a <= x <= b:
-                    found = abs(_value_at(event, dense, x))
-                    if found < best:
-                        best, new = found, x
+            for x, state in zip(beside, dense(np.array(beside))):
+                found = abs(event(x, state))
+                if found < best:
+                    best, new = found, x
             return new
         if (value > 0.0) == rising:
             b = new

@@ -487,6 +487,16 @@ class DaeSystem:
         """No limit."""
         return np.inf
 
+    def begin_step(self, t: float, state: FloatArray) -> None:
+        """Nothing jumps."""
+
+    def end_step(self) -> None:
+        """Nothing jumps."""
+
+    def past_jump(self, t: float, state: FloatArray) -> float:
+        """Nothing jumps."""
+        return -np.inf
+
     # --- multipliers --------------------------------------------------------------------------
 
     def factor_of(self, yhat: FloatArray, B: FloatArray) -> FloatArray:

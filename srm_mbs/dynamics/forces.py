@@ -11,13 +11,18 @@ are spatial, in world axes at the world origin; that of a point p is v_lin + w x
 Each element of :mod:`srm_mbs.model.forces` has an :class:`Evaluator`: first those between links
 (springs, wrenches, bushings), then those on one joint (torques, springs, limits), then functions of
 the user.  :class:`ForceKinematics` has all elements of a mechanism.
+
+The rotation vector of a bushing, and with it its moment, jumps to the opposite at half a turn.  In
+the stages of a step it goes on smoothly beyond: of the two rotation vectors of less than a turn,
+the stages take the one nearest to that at the start of the step.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from math import sqrt
+from collections.abc import Mapping, Sequence
+from math import copysign, inf, pi, sqrt
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -202,6 +207,12 @@ class WrenchEvaluator(Evaluator):
         } | self.wrench.constants()
 
 
+HALF_TURN_ROUNDING = 1e-12
+"""Distance (rad) from half a turn that is rounding."""
+LOCATED_HALF_TURN = 1e-9
+"""Distance (rad) from half a turn of the ends of steps that lie there."""
+
+
 class BushingEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
 
@@ -222,12 +233,28 @@ class BushingEvaluator(Evaluator):
         relative = self.b.placement(data).actInv(self.a.placement(data))
         return pin.log3(relative.rotation)  # type: ignore[no-any-return]
 
-    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+    def rotation_rate(self, data: pin.Data, turn: FloatArray) -> float:
+        """Rate (rad/s) of the angle of the rotation vector ``turn`` (3,)."""
+        spin = self.a.velocity(data).angular - self.b.velocity(data).angular
+        return float(turn @ (self.b.placement(data).rotation.T @ spin)) / sqrt(turn @ turn)
+
+    def add(
+        self,
+        tau: FloatArray,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        t: float,
+        step: BushingStep | None = None,
+    ) -> None:
+        """See :class:`Evaluator`; ``step``: to which the stage belongs."""
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         relative = Tb.actInv(Ta)
         turn = pin.log3(relative.rotation)
+        if step is not None:
+            turn = step.nearest(turn)
         # dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
-        L = pin.Jlog3(relative.rotation)
+        L = pin.Jlog3(relative.rotation) if turn @ turn <= pi**2 else _log_jacobian(turn)
         force = self.stiffness[:3] * relative.translation
         moment = self.stiffness[3:] * turn
         if self.damping.any():
@@ -253,6 +280,77 @@ class BushingEvaluator(Evaluator):
             "support": self.support,
             "numbers": np.concatenate([self.stiffness, self.damping]),
         }
+
+
+def _other_way(turn: FloatArray) -> FloatArray:
+    """The rotation vector (3,) of the same rotation about the opposite axis."""
+    angle = sqrt(turn @ turn)
+    return turn if angle == 0.0 else turn * (1.0 - 2.0 * pi / angle)
+
+
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    apart = a - b
+    return float(apart @ apart)
+
+
+class BushingStep:
+    """The rotation vector of a bushing over a step.
+
+    Parameters
+    ----------
+    bushing
+        The bushing.
+    data
+        Workspace with placements and velocities at the start of the step.
+    t
+        Start of the step (s).
+    """
+
+    def __init__(self, bushing: BushingEvaluator, data: pin.Data, t: float) -> None:
+        self._bushing = bushing
+        self._passed = False
+        self._start = bushing.rotation(data)
+        # At half a turn, the one that gets smaller; a step that ends there measured the same, but
+        # for rounding.
+        if self._past_half_turn(data, t, self._start, 2.0) == 0.0:
+            self._start = _other_way(self._start)
+
+    def nearest(self, turn: FloatArray) -> FloatArray:
+        """Of the two rotation vectors (3,) that are less than a turn, ``turn`` and the opposite
+        one, that closest to the start."""
+        other = _other_way(turn)
+        if not _distance(other, self._start) < _distance(turn, self._start):
+            return turn
+        self._passed |= float(other @ other) > (pi + LOCATED_HALF_TURN) ** 2
+        return other
+
+    def past_half_turn(self, data: pin.Data, t: float) -> float:
+        """Time (s) since it passed half a turn outwards, in a step that ends at t (s): 0 up to
+        rounding, negative before; infinite if it passed and returned."""
+        passed = self._passed
+        late = self._past_half_turn(data, t, self.nearest(self._bushing.rotation(data)))
+        return inf if passed and late == -inf else late
+
+    def _past_half_turn(
+        self, data: pin.Data, t: float, turn: FloatArray, roundings: float = 1.0
+    ) -> float:
+        angle = sqrt(turn @ turn)
+        if angle < 0.5 * pi:
+            return -inf
+        speed, beyond = self._bushing.rotation_rate(data, turn), angle - pi
+        if speed > 0.0:
+            rounding = HALF_TURN_ROUNDING + speed * 4.0 * float(np.spacing(abs(t)))
+            return 0.0 if abs(beyond) <= roundings * rounding else beyond / speed
+        return copysign(inf, beyond - HALF_TURN_ROUNDING)
+
+
+def _log_jacobian(turn: FloatArray) -> FloatArray:
+    """Jlog3 (3, 3) at a rotation vector (3,) of more than half a turn."""
+    angle = sqrt(turn @ turn)
+    ratio = 0.5 * np.sin(angle) / (1.0 - np.cos(angle))
+    out: FloatArray = (1.0 / angle**2 - ratio / angle) * np.outer(turn, turn)
+    out += angle * ratio * np.eye(3) + 0.5 * pin.skew(turn)
+    return out
 
 
 class JointTorqueEvaluator(Evaluator):
@@ -390,14 +488,13 @@ class ForceKinematics:
             _EVALUATORS[type(force)](model, force) for force in forces
         ]
 
-    @property
-    def bushings(self) -> list[BushingEvaluator]:
+        self.bushings = [e for e in self._elements if isinstance(e, BushingEvaluator) and e.turns]
         """The bushings that have a moment."""
-        return [e for e in self._elements if isinstance(e, BushingEvaluator) and e.turns]
 
     def over_half_turn(self, data: pin.Data, q: FloatArray) -> tuple[str, ...]:
         """Names of the bushings that turn by more than half a turn along the configurations q
-        (n, nq): there their rotation vector, and with it their moment, jumps to the opposite."""
+        (n, nq) at the ends of steps, of which one lies there: the rotation vector is the opposite
+        before or after it."""
         pin.forwardKinematics(self._model, data, q[0])
         before = {
             bushing: turn
@@ -409,8 +506,8 @@ class ForceKinematics:
             pin.forwardKinematics(self._model, data, row)
             for bushing, last in before.items():
                 turn = bushing.rotation(data)
-                far = min(float(turn @ turn), float(last @ last)) > (0.5 * np.pi) ** 2
-                if far and float(turn @ last) < 0.0:
+                largest = sqrt(max(turn @ turn, last @ last))
+                if largest > np.pi - LOCATED_HALF_TURN and float(turn @ last) < 0.0:
                     found[bushing.name] = None
                 before[bushing] = turn
         return tuple(found)
@@ -426,8 +523,37 @@ class ForceKinematics:
                 total += float(np.ptp(q[:, joint.idx_q]))
         return total
 
-    def generalised(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+    def begin_step(
+        self, data: pin.Data, q: FloatArray, v: FloatArray, t: float
+    ) -> dict[Evaluator, BushingStep]:
+        """The bushings in a step from q, v and t; ``data`` is a workspace."""
+        pin.forwardKinematics(self._model, data, q, v)
+        return {bushing: BushingStep(bushing, data, t) for bushing in self.bushings}
+
+    def past_half_turn(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        t: float,
+        step: Mapping[Evaluator, BushingStep],
+    ) -> float:
+        """Time (s) since the first of the bushings passed half a turn in a ``step`` that ends at q,
+        v and t (:meth:`BushingStep.past_half_turn`)."""
+        pin.forwardKinematics(self._model, data, q, v)
+        return max(bushing.past_half_turn(data, t) for bushing in step.values())
+
+    def generalised(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        t: float,
+        step: Mapping[Evaluator, BushingStep] = MappingProxyType({}),
+    ) -> FloatArray:
         """tau (nv,) in N and N m at q (nq,), v (nv,) and t (s).
+
+        ``step``: the bushings in the step to which the stage belongs.
 
         ``data`` must hold placements, velocities and the world Jacobian at that state: of crba in
         the WORLD convention and nonLinearEffects, or of forwardKinematics and
@@ -442,7 +568,10 @@ class ForceKinematics:
         """
         tau = np.zeros(self._nv)
         for element in self._elements:
-            element.add(tau, data, q, v, t)
+            if isinstance(element, BushingEvaluator):
+                element.add(tau, data, q, v, t, step.get(element))
+            else:
+                element.add(tau, data, q, v, t)
         return tau
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:

@@ -29,7 +29,13 @@ from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
-from srm_mbs.dynamics.forces import resolved_forces
+from srm_mbs.dynamics.forces import (
+    HALF_TURN_ROUNDING,
+    LOCATED_HALF_TURN,
+    BushingStep,
+    Evaluator,
+    resolved_forces,
+)
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
@@ -213,6 +219,7 @@ class Mechanics(Manifold):
         self._friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
+        self._bushings: dict[Evaluator, BushingStep] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Terms and workspaces share memory, which copies of them would not.
@@ -259,6 +266,23 @@ class Mechanics(Manifold):
         """Limit the times of evaluations to [``first``, ``last``] (s): the equations on one side of
         a breakpoint, where its other side would be evaluated otherwise."""
         self._first, self._last = first, last
+        self.end_step()
+
+    def end_step(self) -> None:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        self._bushings = {}
+
+    def begin_step(self, t: float, state: FloatArray) -> None:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        if self._forces is not None and self._forces.bushings:
+            self._bushings = self._forces.begin_step(self.data, *self.split(state), t)
+
+    def past_jump(self, t: float, state: FloatArray) -> float:
+        """See :class:`~srm_mbs.dynamics.system.System`; the moments of bushings jump at half a
+        turn."""
+        if self._forces is None or not self._bushings:
+            return -np.inf
+        return self._forces.past_half_turn(self.data, *self.split(state), t, self._bushings)
 
     @contextmanager
     def everywhere(self) -> Iterator[None]:
@@ -339,6 +363,7 @@ class Mechanics(Manifold):
             "friction_speed": float(self._friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
+            "half_turn": np.array([HALF_TURN_ROUNDING, LOCATED_HALF_TURN]),
         } | self.chart_constants()
 
     def kinetic_energy(self, q: FloatArray, v: FloatArray) -> float:
@@ -388,7 +413,7 @@ class OpenSystem(Mechanics):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._forces.generalised(self.data, q, v, t)
+            force = force + self._forces.generalised(self.data, q, v, t, self._bushings)
         rate = self._terms.rate()
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(self.model, self.data, q, v, force)
@@ -506,7 +531,7 @@ class ClosedSystem(Mechanics):
         pin.crba(model, data, q, pin.Convention.WORLD)
         f = self.applied_force(t, q, v) - pin.nonLinearEffects(model, data, q, v)
         if self._forces is not None:
-            f += self._forces.generalised(data, q, v, t)
+            f += self._forces.generalised(data, q, v, t, self._bushings)
         loops = self.loops
         loops.update(data, q)
         loops.move_to(t)

@@ -207,6 +207,17 @@ class System(Protocol):
     def step_limit(self, state: FloatArray) -> float:
         """Largest step for which the chart stays well inside its domain (s)."""
 
+    def begin_step(self, t: float, state: FloatArray) -> None:
+        """Begin a step from ``state`` at ``t`` (s): forces that jump somewhere go on smoothly up
+        to its end."""
+
+    def end_step(self) -> None:
+        """End the step begun last: forces are those at a state alone."""
+
+    def past_jump(self, t: float, state: FloatArray) -> float:
+        """Time (s) by which a step to ``state`` at ``t`` (s) passed a jump of forces, estimated
+        there: 0 up to rounding, negative before it, infinite without an estimate."""
+
 
 MAX_NEWTON_STEPS = 30
 CLOSURE_TOLERANCE = 1e-13

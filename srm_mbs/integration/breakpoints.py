@@ -243,7 +243,17 @@ class BreakpointHandler:
             As :meth:`resolved`, or if the stage cannot be evaluated.
         """
         self.enter(self._index + 1, t, state)
-        fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
+        return self.past_jump(t, state, memory)
+
+    def past_jump(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
+        """``memory`` with the first stage after a jump of forces at ``t`` (s).
+
+        Raises
+        ------
+        EvaluationError
+            As :meth:`resolved`, or if the stage cannot be evaluated.
+        """
+        fresh = self._resumed(t, state, memory)
         if self._nearness.matters(fresh, self._norm, self.end - t, self._system.multiplier_size):
             return self._beside_singular(t, state, fresh)
         return fresh
@@ -257,8 +267,11 @@ class BreakpointHandler:
         EvaluationError
             If it cannot be evaluated, or the motion from there is not determined.
         """
-        fresh = self._method.resume(self._evaluator, t, state, memory, self._norm)
-        return self._beside_singular(t, state, fresh)
+        return self._beside_singular(t, state, self._resumed(t, state, memory))
+
+    def _resumed(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
+        self._evaluator.begin_step(t, state)
+        return self._method.resume(self._evaluator, t, state, memory, self._norm)
 
     def _beside_singular(
         self, t: float, state: FloatArray, fresh: IntegratorState

@@ -474,10 +474,12 @@ class DenseOutput:
                 threshold, history = self._steps.zones[step]
                 zone = Zone(threshold, history.predict)
             full = np.vstack([rates, np.zeros((len(c), rates.shape[1]))])
+            self._system.begin_step(t, start)
             for i, ci in enumerate(c):
                 delta = (h * A[i]) @ full
                 terms = self._system.evaluate(t + ci * h, self._system.retract(start, delta), zone)
                 full[len(rates) + i] = self._system.chart_rate(delta, terms.rate())
+            self._system.end_step()
             self._extra[step] = full[len(rates) :]
         return np.vstack([rates, self._extra[step]])
 

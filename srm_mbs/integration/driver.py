@@ -14,7 +14,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import ControllerError, EvaluationError, EventError, safe_repr
 from srm_mbs.integration.breakpoints import BreakpointHandler
-from srm_mbs.integration.control.step_size import StepDecision, StepSizeControl
+from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
 from srm_mbs.integration.critical_passages import CriticalPassages
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop, step_dense
@@ -33,6 +33,8 @@ LARGE_CORRECTION = 1e-3
 examined; a smaller one closes them to its square."""
 RESIDUAL_EXAMINED = 1e-9
 """Constraint residual before a correction, in row units, from which the closures are examined."""
+MAX_JUMP_STEPS = 20
+"""Lengths with which a step that passes a jump of forces is tried."""
 LARGEST_RESIDUAL = 1e-2
 """Constraint residual after the correction, in row units, from which a run is meaningless."""
 NAMED_SIGMA = 0.05
@@ -253,6 +255,7 @@ def integrate(
     t, x = t0, state
     unevaluated: RunFailure | None = None
     redone = False
+    jump = JumpSearch(system)
     if breakpoints is not None:
         control.set_target_time(breakpoints.end)
 
@@ -296,7 +299,8 @@ def integrate(
                     record.breaks.append(len(record.times))
                 memory = breakpoints.next(t, x, memory)
                 control.set_target_time(breakpoints.end)
-            proposal = control.propose(t, min(max_step, system.step_limit(x)), memory)
+            limit = min(max_step, system.step_limit(x), jump.limit)
+            proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:
                 memory = breakpoints.singular_arrival(t, x, memory)
                 continue
@@ -311,6 +315,7 @@ def integrate(
                 record.mark_failed(failure, t, h, memory.sigma, control.adaptive, words)
                 break
             result: StepResult | None
+            system.begin_step(t, x)
             try:
                 result = method.step(system, t, h, x, memory, norm)
             except EvaluationError as error:
@@ -321,6 +326,8 @@ def integrate(
             ):
                 if record.stop is not None:
                     break
+                continue
+            if result is not None and jump.misses(proposal, result, control.adaptive):
                 continue
             decision = control.decide(proposal, result)
             placement = "redone" if redone else "a priori" if proposal.placed else ""
@@ -343,6 +350,9 @@ def integrate(
                 passages.accepted(result)
             if accept(result, proposal.t_new):
                 break
+            if jump.found() and breakpoints is not None and t < breakpoints.end:
+                record.breaks.append(len(record.times))
+                memory = breakpoints.past_jump(t, x, memory)
             if sink is not None and len(record.steps) >= sink.block:
                 sink.take(record.data(method.scheme, system.tangent_size))
                 record.rest = t, x
@@ -399,6 +409,44 @@ def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
         raise ControllerError(
             f"the progress callback raised {safe_repr(error)} at t = {t:.6g} s"
         ) from error
+
+
+class JumpSearch:
+    """Looks for the end of a step that passes a jump of forces: on the jump.
+
+    The step is made again with other lengths, by Newton's method for the time of the jump; the
+    forces are smooth over the step (:meth:`~srm_mbs.dynamics.system.System.begin_step`).
+
+    Attributes
+    ----------
+    limit
+        Longest next step (s).
+    """
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._on_jump = False
+        self.limit, self._tries = np.inf, 0
+
+    def misses(self, proposal: Proposal, result: StepResult, adaptive: bool) -> bool:
+        """Whether the step is to be made again, with another length."""
+        h = proposal.h
+        late = self._system.past_jump(proposal.t_new, result.state)
+        self._on_jump = late == 0.0
+        if adaptive and not result.error_ratio <= 1.0:
+            return False
+        short = h == self.limit and -h < late < 0.0
+        if self._tries == MAX_JUMP_STEPS or not (late > 0.0 or short):
+            return False
+        self.limit = h - late if late < h else 0.5 * h
+        self._tries += 1
+        return True
+
+    def found(self) -> bool:
+        """Whether the step made last, which is accepted, ends on a jump; the search is over."""
+        on_jump, self._on_jump = self._on_jump, False
+        self.limit, self._tries = np.inf, 0
+        return on_jump
 
 
 class Closures:

@@ -58,6 +58,7 @@ SAME_TIME_ROUNDING = 16.0 * float(np.finfo(float).eps)
 """The same, over the time itself: the search finds each of two equal zeros to 8 eps."""
 MAX_HALVINGS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
+_HALVES: FloatArray = 0.5 ** np.arange(1, MAX_HALVINGS + 1)
 MAX_BISECTIONS = 40
 """Halvings of the time in which a value leaves zero."""
 MAX_ROOT_STEPS = 200
@@ -362,13 +363,12 @@ class EventWatch:
         """A node of the first step between the start and the first of ``nodes`` where the value
         still has the sign with which it departs, if it returns to zero that soon; else None."""
         event, (t, _), (after, value) = self._events[i], *nodes[:2]
-        length = after - t
-        for _ in range(MAX_HALVINGS):
-            length *= 0.5
-            now = _value_at(event, dense, t + length)
+        times = t + (after - t) * _HALVES
+        for at, x in zip(times.tolist(), dense(times)):
+            now = event(at, x)
             if now * value < 0.0:
                 self._signs[i] = float(np.sign(now))
-                return t + length, now
+                return at, now
         return None
 
     def _zeros(
@@ -487,7 +487,12 @@ def _zero_between(
     for _ in range(MAX_ROOT_STEPS):
         new = _interpolated_zero(points)
         step = abs(new - at)
-        interpolated = a < new < b and step < 0.5 * steps[-2]
+        if step <= precision and not a < new < b:
+            # Rounding places it on an end of the bracket, which is the zero up to rounding.
+            new = min(max(new, a), b)
+            interpolated = True
+        else:
+            interpolated = a < new < b and step < 0.5 * steps[-2]
         if not interpolated:
             new = 0.5 * (a + b)
             step = abs(new - at)
@@ -500,12 +505,12 @@ def _zero_between(
             # Of the times beside it the nearest.
             near = _interpolated_zero([points[-1], (new, value)])
             beside = [near, math.nextafter(new, a), math.nextafter(new, b)]
+            beside = [x for x in beside if x != new and a <= x <= b]
             best = abs(value)
-            for x in beside:
-                if x != new and a <= x <= b:
-                    found = abs(_value_at(event, dense, x))
-                    if found < best:
-                        best, new = found, x
+            for x, state in zip(beside, dense(np.array(beside))):
+                found = abs(event(x, state))
+                if found < best:
+                    best, new = found, x
             return new
         if (value > 0.0) == rising:
             b = new

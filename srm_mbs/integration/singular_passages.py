@@ -740,10 +740,10 @@ def find_bifurcations(
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
+    if not (steps.held.any() or steps.sigmas.min() < REVERSAL_SIGMA):
+        return ()
     held, last = steps.held > 0.0, steps.count - 1
     close = steps.sigmas.min(axis=1) < REVERSAL_SIGMA
-    if not (held.any() or close.any()):
-        return ()
     v = steps.states[:, len(analysis.q0) :] / analysis.coordinate_unit
     speeds = np.linalg.norm(v, axis=1)
     reverses = (v[:-1] * v[1:]).sum(axis=1) <= 0.0

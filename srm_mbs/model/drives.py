@@ -160,9 +160,11 @@ def in_order_of_rows(drives: Sequence[Drive]) -> tuple[Drive, ...]:
 def positions(model: pin.Model, drives: Sequence[Drive], q: Any) -> dict[str, float]:
     """The driven coordinate of each drive (rad, m) at q (nq,); angles of continuous joints in
     (-pi, pi]."""
+    out: dict[str, float] = {}
+    if not drives:
+        return out
     data = workspace(model)
     pin.forwardKinematics(model, data, np.asarray(q, dtype=float))
-    out = {}
     for drive in drives:
         if drive.a is None or drive.b is None:
             joint = model.joints[model.getJointId(drive.joint)]

@@ -346,15 +346,18 @@ def assemble_problem(
     times = np.concatenate([given, mechanism.breakpoints(t0, t_end)])
     intervals = smooth_intervals(times, samples, t0, t_end)
     check_avoidable(options.singular_times, intervals.ends, t_end - t0)
-    on_kernel = uses_kernel(options.backend, method, options.placement, options.singular_times)
+    if before is None:
+        on_kernel = uses_kernel(options.backend, method, options.placement, options.singular_times)
+    else:
+        on_kernel = before.settings.backend == "kernel"
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
     norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
     kernel_system = None
     last_step = 0.0
     if before is not None and held is None and before.mechanism.structure is mechanism.structure:
-        length, last_step = np.ptp(before.span), before.steps.last_length
-        longest = LONGEST_REPEATED * float(length)
+        start, end = before.span
+        last_step, longest = before.steps.last_length, LONGEST_REPEATED * (end - start)
         last_step = min(last_step, longest) if longest > SHORTEST_REPEATED * last_step else 0.0
         system = before.system
         system.restart()
@@ -702,8 +705,7 @@ def _half_turns(names: tuple[str, ...]) -> str:
         return ""
     return (
         " Bushings turned by more than half a turn, where their moments jump to the opposite "
-        f"({', '.join(names)}): from there the error is not controlled. Use torsion springs, whose "
-        "angles count turns."
+        f"({', '.join(names)}). Torsion springs have none of these jumps: their angles count turns."
     )
 
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -29,6 +30,8 @@ from srm_mbs.integration.events import (
     same_time,
     stop_message,
 )
+from srm_mbs.integration.kernel.system import Evaluator
+from srm_mbs.integration.kernel.system import workspace as workspace_of
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import finite_array
@@ -266,14 +269,15 @@ class _RunEvent:
 
     def in_segment(self) -> EventFunction:
         """The event as it is in the next segment."""
-        contact = self.contact
+        event, contact = self.event, self.contact
         rests = contact is not None and contact.departs == 0
         leaves = self.acted or (contact is not None and not rests)
-        return replace(
-            self.event,
-            occurrences=self.left,
-            action=None,
-            acts=self.event.action is not None,
+        return EventFunction(
+            event.name,
+            event.function,
+            self.left,
+            event.direction,
+            acts=event.action is not None,
             departs=leaves and not rests and self.floor == 0.0,
             rests=self.rounding if rests else None,
             floor=self.floor,
@@ -480,7 +484,7 @@ def _act_at_once(
     span: float,
     occurred: list[Occurrence],
     slack: Callable[[_RunEvent], float] = lambda event: 0.0,
-    system: OpenSystem | ClosedSystem | None = None,
+    system: Any = None,
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
     """Mechanism and state after the actions of ``contacts`` that touch at ``t`` and leave to their
     forbidden side, one after the other until none does (:mod:`srm_mbs.integration.contacts`).
@@ -587,11 +591,26 @@ def _after_actions(
 
     contacts = [event for event in events if event.may_touch]
     if contacts:
-        known = part.system if mechanism.structure is part.mechanism.structure else None
-        return _act_at_once(
-            contacts, mechanism, t, q, v, controller, span, at_once, moved_by, known
-        )
+        with _equations(part) as known:
+            if mechanism.structure is not part.mechanism.structure:
+                known = None
+            return _act_at_once(
+                contacts, mechanism, t, q, v, controller, span, at_once, moved_by, known
+            )
     return mechanism, q, v
+
+
+@contextmanager
+def _equations(part: SimulationResult) -> Iterator[Any]:
+    """The equations of motion of ``part``, whose closures its kernel evaluates, if it can."""
+    system = part.system
+    if not system.has_constraints or part.settings.backend != "kernel":
+        yield system
+    elif part.kernel_system is not None:
+        yield Evaluator(system, part.kernel_system)
+    else:
+        with workspace_of(system) as kernel_system:
+            yield Evaluator(system, kernel_system)
 
 
 def _acted(

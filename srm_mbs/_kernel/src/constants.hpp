@@ -69,6 +69,7 @@ namespace srm {
     field(double, large_correction)        /* units */                                             \
     field(double, open_residual)           /* of rows, before the correction */                    \
     field(double, lost_residual)           /* of rows, after the correction */                     \
+    field(int, max_jump_steps)             /* tries to end a step on a jump of forces */           \
     field(double, search_below)            /* sigma below which singularities are searched for */  \
     field(double, search_factor)           /* fall of sigma from one search to the next */         \
     field(double, rounding_share)          /* of the tolerance, in the first stage of a piece */   \

@@ -119,6 +119,7 @@ const std::vector<double>& DenseOutput::extra_rates(System& system, long step, d
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     std::vector<double> rate(n_);
+    system.begin_step(steps_.times[step], steps_.states + step * nx_);
     out.assign(static_cast<std::size_t>(extension_.extra_stages()) * n_, 0.0);
     for (int i = 0; i < extension_.extra_stages(); ++i) {
         const double* a = &extension_.extra_A[i * extension_.n_rates];
@@ -135,6 +136,7 @@ const std::vector<double>& DenseOutput::extra_rates(System& system, long step, d
         system.rate(rate.data());
         system.chart_rate(delta_.data(), rate.data(), &out[i * n_]);
     }
+    system.end_step();
     kept = std::move(out);
     return kept;
 }

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include <pinocchio/spatial.hpp>
 
@@ -16,6 +17,9 @@ using Eigen::Vector3d;
 using pinocchio::Motion;
 using pinocchio::SE3;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
+
+constexpr double pi = 3.14159265358979323846;
+constexpr double inf = std::numeric_limits<double>::infinity();
 
 SE3 placement(const Anchor& anchor, const pinocchio::Data& data) {
     const SE3 inside = pinocchio_model::placement(anchor.placement.data());
@@ -89,13 +93,28 @@ void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double
     add_wrench(e, data, force, moment, at.translation(), tau);
 }
 
-void bushing(const ForceElement& e, const pinocchio::Data& data, double* tau) {
+// The rotation vector of the same rotation about the opposite axis.
+Vector3d other_way(const Vector3d& turn) {
+    const double angle = turn.norm();
+    return angle == 0.0 ? turn : Vector3d(turn * (1.0 - 2.0 * pi / angle));
+}
+
+// Rotation vector of a's axes relative to b's, up to half a turn.
+Vector3d rotation_vector(const ForceElement& e, const pinocchio::Data& data) {
+    return pinocchio::log3(placement(e.b, data).actInv(placement(e.a, data)).rotation());
+}
+
+void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* step, double* tau) {
     const SE3 Ta = placement(e.a, data), Tb = placement(e.b, data);
     const SE3 relative = Tb.actInv(Ta);
-    const Vector3d turn = pinocchio::log3(relative.rotation());
+    Vector3d turn = pinocchio::log3(relative.rotation());
+    if (step) step->nearest(turn.data());
     // dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
     Eigen::Matrix3d L;
-    pinocchio::Jlog3(relative.rotation(), L);
+    if (turn.squaredNorm() <= pi * pi)
+        pinocchio::Jlog3(relative.rotation(), L);
+    else
+        pinocchio::Jlog3(turn.norm(), turn, L);
     const Eigen::Map<const Vector3d> k_shift(&e.numbers[0]), k_turn(&e.numbers[3]);
     Vector3d force = k_shift.cwiseProduct(relative.translation());
     Vector3d moment = k_turn.cwiseProduct(turn);
@@ -124,9 +143,63 @@ void ForceElement::check() const {
     if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
 }
 
+bool turns(const ForceElement& e) {
+    if (e.kind != ForceKind::bushing) return false;
+    const auto acts = [&](int first) {
+        return std::any_of(&e.numbers[first], &e.numbers[first] + 3,
+                           [](double x) { return x != 0.0; });
+    };
+    return acts(3) || acts(9);
+}
+
+BushingStep::BushingStep(const ForceElement& element, const std::vector<double>& limits,
+                         const pinocchio_model::Workspace& work, double t)
+    : element_(&element), rounding_(limits[0]), located_(limits[1]) {
+    Vector3d turn = rotation_vector(element, work.data);
+    // At half a turn, the one that gets smaller; a step that ends there measured the same, but for
+    // rounding.
+    if (past_half_turn(work, t, turn.data(), 2.0) == 0.0) turn = other_way(turn);
+    Eigen::Map<Vector3d>(start_.data()) = turn;
+}
+
+void BushingStep::nearest(double* turn) {
+    Eigen::Map<Vector3d> here(turn);
+    const Eigen::Map<const Vector3d> start(start_.data());
+    const Vector3d other = other_way(here);
+    if (!((other - start).squaredNorm() < (here - start).squaredNorm())) return;
+    passed_ |= other.norm() > pi + located_;
+    here = other;
+}
+
+double BushingStep::past_half_turn(const pinocchio_model::Workspace& work, double t) {
+    const bool passed = passed_;
+    Vector3d turn = rotation_vector(*element_, work.data);
+    nearest(turn.data());
+    const double late = past_half_turn(work, t, turn.data(), 1.0);
+    return passed && late == -inf ? inf : late;
+}
+
+// By the rate of the angle; 0 within so many `roundings`.
+double BushingStep::past_half_turn(const pinocchio_model::Workspace& work, double t,
+                                   const double* vector, double roundings) const {
+    const Eigen::Map<const Vector3d> turn(vector);
+    const double angle = turn.norm();
+    if (angle < 0.5 * pi) return -inf;
+    const Vector3d spin =
+        velocity(element_->a, work.data).angular() - velocity(element_->b, work.data).angular();
+    const double beyond = angle - pi;
+    const double speed =
+        turn.dot(placement(element_->b, work.data).rotation().transpose() * spin) / angle;
+    if (!(speed > 0.0)) return std::copysign(inf, beyond - rounding_);
+    const double spacing = std::nextafter(std::abs(t), inf) - std::abs(t);
+    const double slack = roundings * (rounding_ + speed * 4.0 * spacing);
+    return std::abs(beyond) <= slack ? 0.0 : beyond / speed;
+}
+
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
-                const double* v, double* tau) {
+                const double* v, std::vector<BushingStep>& step, double* tau) {
+    auto next = step.begin();
     for (const ForceElement& e : elements) {
         switch (e.kind) {
             case ForceKind::spring_damper:
@@ -143,7 +216,7 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 wrench(e, t, work.data, tau);
                 break;
             case ForceKind::bushing:
-                bushing(e, work.data, tau);
+                bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr, tau);
                 break;
             case ForceKind::limit_spring:
                 limit_spring(e, q[e.in_q], v[e.in_v], tau[e.in_v]);

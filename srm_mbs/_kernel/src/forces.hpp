@@ -50,10 +50,35 @@ struct ForceElement {
     void check() const;
 };
 
+// Whether an element is a bushing that has a moment.
+bool turns(const ForceElement& element);
+
+// The rotation vector of a bushing over a step: BushingStep in dynamics/forces.py.
+class BushingStep {
+public:
+    // The workspace holds placements and velocities at the start, t; `limits` as in SystemData.
+    BushingStep(const ForceElement& element, const std::vector<double>& limits,
+                const pinocchio_model::Workspace& work, double t);
+
+    // Replaces a rotation vector by that of the opposite axis, if that is closer to the start.
+    void nearest(double* turn);
+    double past_half_turn(const pinocchio_model::Workspace& work, double t);
+
+private:
+    double past_half_turn(const pinocchio_model::Workspace& work, double t, const double* turn,
+                          double roundings) const;
+
+    const ForceElement* element_;
+    double rounding_, located_;
+    std::array<double, 3> start_;
+    bool passed_ = false;
+};
+
 // Adds the generalised forces at t, q, v to tau (nv,).  The workspace holds the placements, the
-// velocities and the world Jacobian there.  Throws EvaluationError.
+// velocities and the world Jacobian there.  `step`: the bushings that have a moment in the step of
+// the stage, in their order, or none.  Throws EvaluationError.
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
-                const double* v, double* tau);
+                const double* v, std::vector<BushingStep>& step, double* tau);
 
 }  // namespace srm

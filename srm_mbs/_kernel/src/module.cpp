@@ -194,6 +194,10 @@ void bind_system(nb::module_& m) {
         .def("repeat_tree", &PySystem::repeat_tree)
         .def("between",
              [](PySystem& s, double first, double last) { s.system->between(first, last); })
+        .def("begin_step",
+             [](PySystem& s, double t, const Array& state) {
+                 s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
+             })
         .def("hold", &PySystem::hold)
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
              nb::arg("damping").none(), nb::arg("friction").none())

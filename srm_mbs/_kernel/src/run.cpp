@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <utility>
 
 #include "critical.hpp"
 #include "errors.hpp"
@@ -80,6 +81,11 @@ void Run::enter_interval() {
 bool Run::enter() {
     ++interval_;
     enter_interval();
+    return restart_after_break();
+}
+
+// Records a break of the rates at t, and evaluates the first stage after it; whether it is accurate.
+bool Run::restart_after_break() {
     records.breaks.push_back(static_cast<double>(records.count()));
     records.break_rates.insert(records.break_rates.end(), end_rate.begin(), end_rate.end());
     return restart_interval();
@@ -103,9 +109,14 @@ double Run::direct_from() const {
     return std::min(largest, std::sqrt(tolerances));
 }
 
-// Evaluates the first stage of an interval; whether it is accurate.
+// Evaluates the first stage of an interval; whether it can be, and is accurate.
 bool Run::restart_interval() {
-    system.evaluate(t_, state.data(), System::ZoneView{});
+    system.begin_step(t_, state.data());
+    try {
+        system.evaluate(t_, state.data(), System::ZoneView{});
+    } catch (const EvaluationError&) {
+        return false;
+    }
     system.rate(memory.rate.data());
     memory.sigma = system.sigma();
     system.state_scale(state.data(), memory.state_scale.data());
@@ -170,7 +181,8 @@ void Run::restore(const RunSnapshot& snapshot) {
 }
 
 Stop Run::attempt(StepDecision& decision) {
-    const double limit = std::min(max_step_, system.step_limit(state.data()));
+    const double limit =
+        std::min({max_step_, system.step_limit(state.data()), jump_limit_});
     const Proposal proposal = control->propose(t_, limit, memory);
     if (proposal.arriving) return Stop::arrival;
     const double h = h_ = proposal.h;
@@ -185,6 +197,7 @@ Stop Run::attempt(StepDecision& decision) {
         t_ - watched_time_ < constants().standstill * (t_end() - t0_))
         return Stop::standstill;
     const StepResult* result = nullptr;
+    system.begin_step(t_, state.data());
     try {
         const double theta =
             eps_factor_ > 0.0 ? -std::expm1(-h / (eps_factor_ * std::pow(h, eps_power_))) : 1.0;
@@ -193,6 +206,7 @@ Stop Run::attempt(StepDecision& decision) {
         evaluation_failed = true;
     }
     if (result && examines_ && passes_residual(*result)) return Stop::passage;
+    if (result && misses_jump(proposal, *result)) return Stop::chunk;
     decision = control->decide(proposal, result);
     const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
     redone_ = decision == StepDecision::replaced;
@@ -213,7 +227,24 @@ Stop Run::attempt(StepDecision& decision) {
     step.accept(memory);
     t_ = proposal.t_new;
     if (made_++ % steps == 0) watched_time_ = t_;
+    const bool jumped = on_jump_;
+    jump_limit_ = inf;
+    jump_tries_ = 0;
+    on_jump_ = false;
+    inaccurate_ = jumped && t_ < interval_end() && !restart_after_break();
     return t_ < t_end() ? Stop::chunk : Stop::finished;
+}
+
+// Whether the step is to be made again, with another length, because of a jump of forces.
+bool Run::misses_jump(const Proposal& proposal, const StepResult& r) {
+    const double h = proposal.h, late = system.past_jump(proposal.t_new, r.state.data());
+    on_jump_ = late == 0.0;
+    if (control->adaptive && !(r.error_ratio <= 1.0)) return false;
+    const bool is_short = h == jump_limit_ && -h < late && late < 0.0;
+    if (jump_tries_ == constants().max_jump_steps || !(late > 0.0 || is_short)) return false;
+    jump_limit_ = late < h ? h - late : 0.5 * h;
+    ++jump_tries_;
+    return true;
 }
 
 // Whether the step passes a critical configuration that has a residual, and was not looked at.
@@ -272,13 +303,7 @@ Stop Run::go_on(double end, double first, double last, bool forces_jump,
     evaluation_failed = false;
     enter_interval();
     if (grid > 0.0) control->start_grid(t_, grid);
-    if (forces_jump) {
-        try {
-            if (!restart_interval()) return Stop::breakpoint;
-        } catch (const EvaluationError&) {
-            return Stop::breakpoint;
-        }
-    }
+    if (forces_jump && !restart_interval()) return Stop::breakpoint;
     return advance(0, seconds);
 }
 
@@ -289,14 +314,8 @@ Stop Run::advance(long steps, double seconds) {
     StepDecision decision;
     for (long attempted = 1;; ++attempted) {
         sleep_if_ending();
-        if (at_breakpoint()) {
-            if (intervals_.given[interval_]) return Stop::breakpoint;
-            try {
-                if (!enter()) return Stop::breakpoint;
-            } catch (const EvaluationError&) {
-                return Stop::breakpoint;
-            }
-        }
+        if (at_breakpoint() && (intervals_.given[interval_] || !enter())) return Stop::breakpoint;
+        if (std::exchange(inaccurate_, false)) return Stop::breakpoint;
         const Stop stop = attempt(decision);
         if (stop != Stop::chunk || records.count() >= last) return stop;
         if (attempted % clock_every == 0 &&

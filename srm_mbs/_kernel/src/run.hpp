@@ -107,8 +107,8 @@ public:
     void restore(const RunSnapshot& snapshot);
     // Proposes, makes and decides on one step; `decision` is only set if there was one.
     Stop attempt(StepDecision& decision);
-    // Goes on to the next interval; whether its first stage is accurate as it was evaluated.  Next
-    // to a singular configuration it may not be.
+    // Goes on to the next interval; whether its first stage could be evaluated, and is accurate.
+    // Next to a singular configuration it may not be.
     bool enter();
     // Goes on to `end` as a run of its own, evaluated within [first, last]; the records of the
     // steps before are dropped.  `forces_jump`: forces may have jumped.  With `grid` > 0, fixed
@@ -150,8 +150,10 @@ private:
     bool leaves_closures_open(const StepResult& result);
     bool passes_residual(const StepResult& result);
     bool examine(double zero);
+    bool misses_jump(const Proposal& proposal, const StepResult& result);
     void enter_interval();
     void drop_records();
+    bool restart_after_break();
     bool restart_interval();
     double direct_from() const;
 
@@ -168,6 +170,11 @@ private:
     bool redone_ = false;
     long made_ = 0;  // steps, whether their records are still here or not
     double watched_time_ = 0.0;
+    // The search for the end of a step on a jump of forces: JumpSearch in driver.py.
+    double jump_limit_ = std::numeric_limits<double>::infinity();
+    int jump_tries_ = 0;
+    bool on_jump_ = false;
+    bool inaccurate_ = false;  // the first stage after a jump: Python has to look at it
     bool examines_;
     std::vector<double> abscissae_;
     double passage_ = 0.0;

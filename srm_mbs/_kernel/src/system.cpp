@@ -123,6 +123,7 @@ const pinocchio::Model& checked_model(const pinocchio::Model& model) {
 void check_indices(const SystemData& data, const pinocchio::Model& model) {
     const long nq = model.nq, nv = model.nv, rows = data.rows, joints = model.njoints;
     expect_size("SystemData.position_of", data.position_of.size(), static_cast<std::size_t>(nv));
+    expect_size("SystemData.half_turn", data.half_turn.size(), 2);
     expect_within("SystemData.position_of", data.position_of, -1, nq - 1);
     expect_within("SystemData.structural_rank", data.structural_rank, 0, std::min(rows, nv));
     if (!(data.sigma_ref > 0.0) || !std::isfinite(data.sigma_ref))
@@ -434,7 +435,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
             pinocchio::computeJointJacobians(w.model, w.data);
-            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data());
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
@@ -445,7 +446,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
     if (!data_.forces.empty())
-        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data());
     update_closures(state, true);
     update_drives(t, true);
     Projection& p = *projection_;
@@ -654,6 +655,30 @@ double System::step_limit(const double* state) const {
         speed = std::max(speed, joint.rotation(state + nq));
     return speed > 0.0 ? data_.rotation_per_step / speed
                        : std::numeric_limits<double>::infinity();
+}
+
+void System::move_bodies(const double* state) {
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+}
+
+void System::begin_step(double t, const double* state) {
+    bushings_.clear();
+    if (std::none_of(data_.forces.begin(), data_.forces.end(), turns)) return;
+    move_bodies(state);
+    for (const ForceElement& e : data_.forces)
+        if (turns(e)) bushings_.emplace_back(e, data_.half_turn, *work_, t);
+}
+
+double System::past_jump(double t, const double* state) {
+    double out = -std::numeric_limits<double>::infinity();
+    if (bushings_.empty()) return out;
+    move_bodies(state);
+    for (BushingStep& bushing : bushings_)
+        out = std::max(out, bushing.past_half_turn(*work_, t));
+    return out;
 }
 
 double System::closure_residual_at(double t, const double* state) {

@@ -111,6 +111,8 @@ using Controller = std::function<void(double, const double*, const double*, doub
     field(double, friction_speed)                                                                \
     field(std::vector<ForceElement>, forces)                                                     \
     field(double, coincident)                   /* relative distance of points that count as one */ \
+    /* Distance of a bushing from half a turn (rad) that is rounding, and that is located. */    \
+    field(std::vector<double>, half_turn)                                                        \
     field(std::vector<GroupJoint>, groups)                                                       \
     field(std::vector<double>, series)          /* of dexp^-1 */                                 \
     field(std::vector<int>, wrapped_angles)     /* velocity indices of (cos, sin) joints */      \
@@ -143,7 +145,13 @@ public:
     void between(double first, double last) {
         first_ = first;
         last_ = last;
+        end_step();
     }
+    // Forces that jump somewhere go on smoothly in a step from a state at t up to its end.
+    void begin_step(double t, const double* state);
+    void end_step() { bushings_.clear(); }
+    // Time by which a step to a state at t passed a jump: past_jump in dynamics/system.py.
+    double past_jump(double t, const double* state);
     // From t on a constant force (nv,) acts in addition to all others.  With `keep` the forces held
     // before still act at earlier times.
     void hold(double t, const double* force, bool keep);
@@ -202,6 +210,7 @@ public:
 
 private:
     Pattern pattern() const;
+    void move_bodies(const double* state);
     void update_closures(const double* q, bool with_bias);
     void update_positions(const ClosureRows& closure, bool with_bias);
     void update_alignments(const ClosureRows& closure, bool with_bias);
@@ -218,6 +227,7 @@ private:
     std::unique_ptr<pinocchio_model::Workspace> work_;
     std::unique_ptr<Projection> projection_;
     bool closed_, flat_, predicted_ = false;
+    std::vector<BushingStep> bushings_;  // in the step that is made
     std::vector<double> g_, bias_, pushed_, f_, v_, rate_, prediction_, white_, acted_;
 };
 

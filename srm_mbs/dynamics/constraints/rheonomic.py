@@ -10,12 +10,14 @@ The rows of the loops come first, then those of driven points, then those of dri
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._kernel.workspace import LARGE, workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination, LoopKinematics
 from srm_mbs.model.closures import LoopClosure
@@ -134,6 +136,12 @@ def _all_rows(mechanism: MechanismData) -> DrivenKinematics:
     return DrivenKinematics(mechanism.model, mechanism.loops, mechanism.drives)
 
 
+@per_model
+def _idle_rows(mechanism: MechanismData) -> deque[tuple[DrivenKinematics, pin.Data]]:
+    """All rows with a workspace, which :func:`constraint_errors` left."""
+    return deque(maxlen=1)
+
+
 def all_rows(mechanism: MechanismData) -> DrivenKinematics:
     """All rows of a mechanism, unscaled, with the motions of its drives and memory of their own."""
     return _all_rows(mechanism).copy_workspace().follow(mechanism.drive_curves)
@@ -149,4 +157,12 @@ def constraint_errors(
     t : (n,), q : (n, nq), v : (n, nv)
         Times (s) and states.
     """
-    return all_rows(mechanism).errors(mechanism.model, t, q, v)
+    model, idle = mechanism.model, _idle_rows(mechanism)
+    try:
+        rows, data = idle.pop()  # two threads never get the same
+    except IndexError:
+        rows, data = _all_rows(mechanism).copy_workspace(), workspace(model)
+    found = rows.follow(mechanism.drive_curves).errors(model, data, t, q, v)
+    if model.nv <= LARGE:
+        idle.append((rows, data))
+    return found

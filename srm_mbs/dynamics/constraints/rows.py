@@ -475,10 +475,10 @@ class LoopKinematics:
         """Do nothing: the rows of loops do not depend on the time t (s)."""
 
     def errors(
-        self, model: pin.Model, t: FloatArray, q: FloatArray, v: FloatArray
+        self, model: pin.Model, data: pin.Data, t: FloatArray, q: FloatArray, v: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """g - s and G v - s' (n, rows) at n times t (n,) and states q (n, nq), v (n, nv)."""
-        data = workspace(model)
+        """g - s and G v - s' (n, rows) at n times t (n,) and states q (n, nq), v (n, nv); ``data``
+        is a workspace."""
         g, c = np.empty((2, len(q), len(self.g)))
         for i in range(len(q)):
             self.evaluate(model, data, q[i])
@@ -491,7 +491,8 @@ def closure_errors(
     model: pin.Model, loops: Sequence[LoopClosure], q: FloatArray, v: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv)."""
-    return LoopKinematics(model, loops).errors(model, np.zeros(len(q)), q, v)
+    rows = LoopKinematics(model, loops)
+    return rows.errors(model, workspace(model), np.zeros(len(q)), q, v)
 
 
 def row_wrenches(loop: LoopClosure, model: pin.Model, data: pin.Data) -> FloatArray:

@@ -107,6 +107,7 @@ def constants() -> Any:
         large_correction=driver.LARGE_CORRECTION,
         open_residual=driver.RESIDUAL_EXAMINED,
         lost_residual=driver.LARGEST_RESIDUAL,
+        max_jump_steps=driver.MAX_JUMP_STEPS,
         search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
         search_factor=breakpoints.REPEATED_SEARCH_SIGMA,
         rounding_share=breakpoints.FIRST_STAGE_ERROR,

@@ -200,7 +200,7 @@ class CompiledRun:
             with suppress(ArithmeticError):  # the reference raises the error that says why
                 accurate = self._run.enter()
         else:
-            passing.enter(self._run.interval, t, state)
+            passing.follow(self._run.interval)
         if not accurate:
             self.remember(passing.resolved(t, state, before))
 

@@ -120,6 +120,11 @@ class Evaluator:
         self._system.between(first, last)
         self._kernel_system.between(first, last)
 
+    def begin_step(self, t: float, state: FloatArray) -> None:
+        """Begin a step of both from ``state`` at ``t`` (s)."""
+        self._system.begin_step(t, state)
+        self._kernel_system.begin_step(t, state)
+
     def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
         """Makes the nodes of the motion next to a singular configuration."""
         return CompiledNodes(self._kernel_system, norm)

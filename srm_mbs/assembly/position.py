@@ -91,7 +91,7 @@ class ClosureProblem(ClosureGeometry):
         return self._mismatch(self.closure(q)[0])
 
     def linearised(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """:meth:`mismatch`, and its derivative for motions of the joints, in units (entries, nv)."""
+        """:meth:`mismatch`, and its derivative for motions of the joints in units (entries, nv)."""
         g, G = self.closure(q)
         return self._mismatch(g), self._jacobian(G)
 

@@ -180,8 +180,8 @@ def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Cond
 def _conditions(
     mechanism: Mechanism, problem: ClosureProblem, q: FloatArray, drives: DriveRows
 ) -> tuple[_Conditions, SingularConfiguration | None]:
-    """The conditions at q, where ``mechanism`` is, and the singular configuration if q is so close to one that the rates
-    determine the branch instead of q."""
+    """The conditions at q, the start of ``mechanism``, and the singular configuration if q is so
+    close to one that the rates determine the branch instead of q."""
     normalised = problem.normalised(q)
     left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
 

@@ -532,6 +532,25 @@ def test_the_joint_with_the_most_freedom_is_cut() -> None:
     assert [joint.name for joint in spanning_tree(near, "world").cut] == ["a"]
 
 
+def test_a_joint_between_bodies_that_are_held_together_is_left_out() -> None:
+    text = sdf(
+        link("base"),
+        link("arm", ONE),
+        link("plate", TWO),
+        link("badge", THREE),
+        joint("hinge", "revolute", "base", "arm"),
+        joint("one", "fixed", "arm", "plate", axis=""),
+        joint("two", "fixed", "plate", "badge", axis=""),
+        joint("three", "fixed", "badge", "arm", axis=""),
+        joint("four", "revolute", "badge", "arm", "|<dynamics><damping>1</damping></dynamics>"),
+    )
+    made = translated(text)
+    assert not {"loop", "force"} & made.entries.keys()
+    (note,) = (note for note in made.notes if "left out" in note)
+    assert "'four'" in note
+    assert sum(f"'{name}'" in note for name in ("one", "two", "three")) == 1
+
+
 def test_a_joint_that_no_closure_can_replace_is_kept() -> None:
     rubbing = [Joint("b", "revolute", "crank", "coupler", friction=0.1), *SQUARE[:2], SQUARE[3]]
     assert [joint.name for joint in spanning_tree(rubbing, "world").cut] == ["c"]

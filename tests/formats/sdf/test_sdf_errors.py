@@ -37,6 +37,7 @@ FAULTS = {
     "two poses": ("<inertial>", "<pose/><inertial>"),
     "mass": ("<mass>1.0</mass>", "<mass>heavy</mass>"),
     "negative": ("<mass>1.0</mass>", "<mass>-1</mass>"),
+    "negative moment": ("<ixx>0.01", "<ixx>-0.01"),
     "auto": ("<inertial>", '<inertial auto="true">'),
     "auto of a plane": ("<inertial>", '<collision name="c"><geometry><plane/></geometry>'
                         '</collision><inertial auto="1">'),

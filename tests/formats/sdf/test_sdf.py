@@ -498,6 +498,31 @@ def test_a_merged_model_is_part_of_the_model_around_it(tmp_path: Path) -> None:
         loaded(tmp_path, twice)
 
 
+def test_a_pose_may_be_that_of_a_frame_of_the_model(tmp_path: Path) -> None:
+    """``placement_frame`` of a model and of an include, and an include posed by another frame."""
+    inside = (
+        link("base", ONE),
+        link("tool", TWO),
+        joint("hinge", "revolute", "base", "tool"),
+        f"<frame name='grip' attached_to='tool'><pose>{THREE}</pose></frame>",
+    )
+    (tmp_path / "arm.sdf").write_text(sdf(*inside, name="arm"))
+    named = "<placement_frame>grip</placement_frame>"
+    here = f"<pose relative_to='stand'>{ONE}</pose>"
+    text = sdf(
+        link("stand", THREE),
+        f"<include><uri>arm.sdf</uri><name>a</name>{here}</include>",
+        f"<include><uri>arm.sdf</uri><name>b</name>{here}{named}</include>",
+        f"<model name='c' placement_frame='grip'>{here}{''.join(inside)}</model>",
+        *(joint(f"weld_{k}", "fixed", "stand", f"{k}::base", axis="") for k in "abc"),
+    )
+    mechanism = loaded(tmp_path, text)
+    for name in "abc":
+        found = placed(mechanism.model, f"{name}::tool", mechanism.q0) * of(THREE)
+        model = pin.SE3.Identity() if name != "a" else of(TWO) * of(THREE)
+        same(found, of(THREE) * of(ONE) * model)
+
+
 def test_a_world_merges_models(tmp_path: Path) -> None:
     (tmp_path / "arm.sdf").write_text(
         sdf(link("upper", ONE), joint("hinge", "revolute", "world", "upper"), name="arm")

@@ -76,7 +76,10 @@ FAULTS = {
     "far": (LAST, "<include><uri>https://a.b/c</uri></include></model>"),
     "merge": (LAST, '<include merge="maybe"><uri>a</uri></include></model>'),
     "canonical": ('name="robot"', 'name="robot" canonical_link="x"'),
-    "placement": ('name="robot"', 'name="robot" placement_frame="arm"'),
+    "placement": ('name="robot"', 'name="robot" placement_frame="x"'),
+    "ring of placement": ('name="robot">', 'name="robot" placement_frame="f"><frame name="f"><pose '
+                          'relative_to="g"/></frame><frame name="g"><pose relative_to="f"/>'
+                          '</frame>'),
 }  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from srm_mbs.assembly.position import (
 from srm_mbs.assembly.velocity import assemble_velocity
 from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
+from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError, get_logger, naming
@@ -241,9 +242,13 @@ def assemble(
         joint = mechanism.joint(name)
         own = slice(joint.idx_q, joint.idx_q + joint.nq)
         closed[own] = start[own]
-    consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates)
+    # Walks from open loops find few closed configurations: the analysis is made here.
+    analysed = mechanism.with_state(closed, mechanism.v0)
+    consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates, analysed)
     drives = DriveRows(mechanism, problem, closed)
     free = null_basis(np.concatenate([problem.normalised(closed), drives.rows]), SINGULAR)
+    if structure_of.kept(mechanism) is None:
+        structure_of.keep(mechanism, analysed.structure.at(mechanism))
     residuals, rate_residuals = mechanism.with_state(closed, consistent).initial_errors
     log.debug(
         "%s: assembled with %s held, closed to %.1e, %d directions free",
@@ -258,5 +263,5 @@ def assemble(
         residuals,
         rate_residuals,
         problem.unit[:, None] * free,
-        free.shape[1] > mechanism.degrees_of_freedom,
+        free.shape[1] > analysed.degrees_of_freedom,
     )

@@ -73,10 +73,29 @@ class ClosureProblem(ClosureGeometry):
             first += loop.rows.count
         return out
 
+    @cached_property
+    def _matching(self) -> dict[str, tuple[tuple[int, pin.SE3], tuple[int, pin.SE3], FloatArray]]:
+        """By name of the loops that match axes: joint and placement in it of both anchors, and the
+        sense (nv,) in which the coordinates move a against b."""
+        out = {}
+        for loop in self.mechanism.loops:
+            if len(loop.rows.matched):
+                a, b = loop.resolve(self.model)
+                moves = support(self.model, a[0]) - support(self.model, b[0])
+                out[loop.name] = (a, b, moves)
+        return out
+
     def mismatch(self, q: FloatArray) -> FloatArray:
         """Residual whose only zeros are the intended closed configurations: distances (in units)
         and differences of axes."""
-        g, _ = self.closure(q)
+        return self._mismatch(self.closure(q)[0])
+
+    def linearised(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """:meth:`mismatch`, and its derivative for motions of the joints in units (entries, nv)."""
+        g, G = self.closure(q)
+        return self._mismatch(g), self._jacobian(G)
+
+    def _mismatch(self, g: FloatArray) -> FloatArray:
         parts = []
         for loop, rows in zip(self.mechanism.loops, self._unambiguous):
             parts.append(g[rows])
@@ -84,15 +103,12 @@ class ClosureProblem(ClosureGeometry):
                 parts.append((self._axes_in_b(loop) - loop.rows.matched).ravel())
         return np.concatenate(parts)
 
-    def mismatch_jacobian(self, q: FloatArray) -> FloatArray:
-        """Derivative of :meth:`mismatch` for motions of the joints, in units (entries, nv)."""
-        _, G = self.closure(q)
+    def _jacobian(self, G: FloatArray) -> FloatArray:
         parts = []
         for loop, rows in zip(self.mechanism.loops, self._unambiguous):
             parts.append(G[rows])
             if len(loop.rows.matched):
-                (joint_a, _), (joint_b, in_b) = loop.resolve(self.model)
-                moves = support(self.model, joint_a) - support(self.model, joint_b)
+                _, (joint_b, in_b), moves = self._matching[loop.name]
                 into_b = (self.data.oMi[joint_b] * in_b).rotation.T
                 turn = into_b @ (world_jacobian(self.data)[3:] * moves * self.unit)
                 parts += [-pin.skew(axis) @ turn for axis in self._axes_in_b(loop)]
@@ -118,7 +134,7 @@ class ClosureProblem(ClosureGeometry):
 
     def _axes_in_b(self, loop: LoopClosure) -> FloatArray:
         """The matched axes of a in the frame of b (c, 3), where the rows were evaluated last."""
-        a, b = (self.data.oMi[joint] * inside for joint, inside in loop.resolve(self.model))
+        a, b = (self.data.oMi[joint] * inside for joint, inside in self._matching[loop.name][:2])
         out: FloatArray = loop.rows.matched @ (b.rotation.T @ a.rotation).T
         return out
 
@@ -184,19 +200,27 @@ def _search(
     """
     from scipy.optimize import least_squares
 
+    latest: tuple[FloatArray, FloatArray, FloatArray] | None = None
+
+    def linearised(delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mismatch and its derivative at the end of the motion; few steps are tried in vain."""
+        nonlocal latest
+        if latest is None or not np.array_equal(latest[0], delta):
+            latest = delta.copy(), *problem.linearised(problem.move(q, delta, free))
+        return latest[1:]
+
     def residual(delta: FloatArray) -> FloatArray:
-        out: FloatArray = np.append(problem.mismatch(problem.move(q, delta, free)), zeros)
+        out: FloatArray = np.append(linearised(delta)[0], zeros)
         return out
 
     def jacobian(delta: FloatArray) -> FloatArray:
         full = np.zeros(problem.model.nv)
         full[free] = delta * problem.unit[free]
         chart = pin.dIntegrate(problem.model, q, full, pin.ARG1)
-        here = problem.move(q, delta, free)
-        at_end = problem.mismatch_jacobian(here) / problem.unit
-        out: FloatArray = ((at_end @ chart) * problem.unit)[:, free]
+        gap, at_end = linearised(delta)
+        out: FloatArray = ((at_end / problem.unit @ chart) * problem.unit)[:, free]
         if near:
-            damping = max(float(np.linalg.norm(problem.mismatch(here))), CONSTRAINT_TOLERANCE)
+            damping = max(float(np.linalg.norm(gap)), CONSTRAINT_TOLERANCE)
             out = np.vstack([out, damping * np.eye(len(free))])
         return out
 

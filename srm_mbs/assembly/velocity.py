@@ -51,6 +51,7 @@ def assemble_velocity(
     q: FloatArray,
     v: FloatArray,
     held: tuple[str, ...],
+    analysed: Mechanism,
 ) -> FloatArray:
     """The rates (nv,) nearest to v that a motion of ``mechanism`` through q has.
 
@@ -62,6 +63,8 @@ def assemble_velocity(
         A configuration with closed loops, and the requested rates.
     held
         Joints whose rates stay as in ``v``.
+    analysed
+        The mechanism, with q as its initial configuration: its structure is asked for.
 
     Raises
     ------
@@ -73,7 +76,7 @@ def assemble_velocity(
     G = np.concatenate([G, drives.rows])
     prescribed = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
     normalised = np.concatenate([problem.normalised(q), drives.rows])
-    conditions, close = _conditions(mechanism, problem, q, drives)
+    conditions, close = _conditions(analysed, problem, q, drives)
     fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
 
     def onto_rows(
@@ -177,8 +180,8 @@ def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Cond
 def _conditions(
     mechanism: Mechanism, problem: ClosureProblem, q: FloatArray, drives: DriveRows
 ) -> tuple[_Conditions, SingularConfiguration | None]:
-    """The conditions at q, and the singular configuration if q is so close to one that the rates
-    determine the branch instead of q."""
+    """The conditions at q, the start of ``mechanism``, and the singular configuration if q is so
+    close to one that the rates determine the branch instead of q."""
     normalised = problem.normalised(q)
     left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
 

@@ -310,11 +310,11 @@ def assembled(reading: Reading) -> Mechanism:
     description, source = reading.description, reading.source
     description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
-    # Assembly analyses this copy, of the guess; the mechanism is analysed at its assembled state.
+    # Assembly analyses this copy where its loops are closed, at rest.
     guess = copy(mechanism)
     try:
         state = assemble(guess, q, v)
-        if np.array_equal(state.q, guess.q0) and np.array_equal(state.v, guess.v0):
+        if np.array_equal(state.v, guess.v0):
             mechanism = guess
         mechanism = mechanism.with_state(state.q, state.v)
         _ = mechanism.structure

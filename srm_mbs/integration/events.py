@@ -58,7 +58,7 @@ SAME_TIME_ROUNDING = 16.0 * float(np.finfo(float).eps)
 """The same, over the time itself: the search finds each of two equal zeros to 8 eps."""
 MAX_HALVINGS = 30
 """Halvings of the first part of a step within which a value that departs from zero may return."""
-_HALVES: FloatArray = 0.5 ** np.arange(1, MAX_HALVINGS + 1)
+_HALVES: FloatArray = np.exp2(-np.arange(1.0, MAX_HALVINGS + 1.0))
 MAX_BISECTIONS = 40
 """Halvings of the time in which a value leaves zero."""
 MAX_ROOT_STEPS = 200

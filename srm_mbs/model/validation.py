@@ -119,7 +119,8 @@ def check_tree(model: pin.Model) -> None:
         raise InputError(
             "nothing in this mechanism can move",
             element="model",
-            remedy="Give it at least one joint that is neither fixed nor locked",
+            remedy="Give it at least one joint that is neither fixed nor locked, or load its file "
+            'with base="floating"',
         )
     for what, numbers in (("gravity", model.gravity.vector), ("damping", model.damping)):
         if not np.isfinite(numbers).all():

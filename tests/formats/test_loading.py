@@ -323,14 +323,39 @@ def test_the_rounding_of_a_point_mass_is_no_negative_inertia(tmp_path: Path) -> 
     assert srm.load(write(tmp_path, text.replace(badge, point))).model.nv == 6
 
 
+def test_a_negative_moment_counts_only_in_the_whole_body(tmp_path: Path) -> None:
+    """The badge is glued to the wheel; the raft is a body of its own."""
+    text = zoo_urdf()
+    badge = INERTIAL.format(**LINKS["badge"])
+    odd = INERTIAL.format(c="0 0 0.1", r="0 0.4 0", m=0.2, i=(-0.002, 0.01, 0.01, 0, 0, 0))
+    with pytest.warns(srm.SrmWarning, match="moment of inertia is negative"):
+        mechanism = srm.load(write(tmp_path, text.replace(badge, odd)))
+    (note,) = mechanism.notes
+    assert "link 'badge': a principal moment of inertia is negative (-0.002 kg m^2)" in note
+    wheel = mechanism.model.inertias[mechanism.model.getJointId("axle")]
+    plain = srm.load(write(tmp_path, text)).model
+    change = wheel.inertia - plain.inertias[plain.getJointId("axle")].inertia
+    assert np.linalg.eigvalsh(change) == pytest.approx([-0.012, 0.0, 0.0], abs=1e-12)
+    assert np.linalg.eigvalsh(wheel.inertia)[0] > 0.0
+    worse = odd.replace("-0.002", "-5")
+    for old, new in ((badge, worse), (INERTIAL.format(**LINKS["raft"]), odd)):
+        with pytest.raises(srm.InputError, match="principal moment of inertia is negative"):
+            srm.load(write(tmp_path, text.replace(old, new)))
+
+
 def test_what_is_ignored_is_noted(tmp_path: Path) -> None:
     text = zoo_urdf().replace(
-        "</robot>", '<transmission/><transmission/><gazebo/><material name="m"/></robot>'
+        "</robot>",
+        '<transmission/><transmission/><gazebo><plugin name="a"/><plugin name="b"/></gazebo>'
+        '<material name="m"/></robot>',
     )
+    text = text.replace('<link name="base"/>', '<link name="base"><collision/></link>')
     text = text.replace('<dynamics damping="0.7"/>', '<dynamics damping="0.7" K="3"/>')
     notes = srm.load(write(tmp_path, text)).notes
     assert sum("2 <transmission>" in note for note in notes) == 1
     assert sum("1 <gazebo>" in note for note in notes) == 1
+    assert sum("2 <plugin>" in note for note in notes) == 1
+    assert sum("1 <collision>" in note for note in notes) == 1
     assert sum("<dynamics K>" in note for note in notes) == 1
     assert not any("material" in note for note in notes)
     assert srm.load(write(tmp_path, zoo_urdf())).notes == ()

@@ -26,6 +26,7 @@ def newton(
     evaluations: int,
     *,
     tolerance: float = 0.0,
+    rounding: float = 0.0,
     monotone: bool = True,
 ) -> tuple[Point, float]:
     """Iterate from ``point`` until |g| is at most ``tolerance``.
@@ -39,6 +40,9 @@ def newton(
         next point, or None if they cannot be solved).
     evaluations
         Largest number of evaluations of g.
+    rounding
+        End, too, where |g| is at most this and the last step has not even halved it: what is left
+        is rounding, or a contradiction of the equations.
     monotone
         End, too, as soon as |g| no longer decreases: it is down to rounding, or diverges.
 
@@ -52,8 +56,9 @@ def newton(
         size, step = linearise(point)
         if monotone and not size < error:
             break
+        stuck = 0.5 * error < size <= rounding
         best, error = point, size
-        if size <= tolerance or evaluation + 1 == evaluations:
+        if stuck or size <= tolerance or evaluation + 1 == evaluations:
             break
         moved = step()
         if moved is None:

@@ -54,6 +54,8 @@ CLOSING_RANK = 1e-9
 """Pivots below this part of the largest do not close loops."""
 CLOSURE_ROUNDING = 1e-14
 """Closure error, in row units, at which Newton's iteration ends."""
+STUCK = 1e-9
+"""Closure error, in row units, below which an iteration that gains nothing ends."""
 CLOSED = 1e-11
 """Closure error, in row units, below which a configuration is closed."""
 RESTARTS = 10
@@ -156,7 +158,14 @@ class ManifoldSampler:
 
             return float(np.abs(g).max()), step
 
-        return newton(q, linearise, iterations + 1, tolerance=CLOSURE_ROUNDING, monotone=False)
+        return newton(
+            q,
+            linearise,
+            iterations + 1,
+            tolerance=CLOSURE_ROUNDING,
+            rounding=STUCK,
+            monotone=False,
+        )
 
     def set_scale(self, rng: np.random.Generator) -> None:
         """Row scales from open random configurations, isotropic per closure and kind of row."""

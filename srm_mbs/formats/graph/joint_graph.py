@@ -71,7 +71,9 @@ def inertia_at(
     """Inertia in the body's frame, from the moments about the centre of mass, which is at
     ``placement``, in its axes (:func:`inertia_tensor`)."""
     R = placement.rotation
-    return pin.Inertia(mass, placement.translation, R @ inertia_tensor(moments) @ R.T)
+    out = pin.Inertia(mass, placement.translation, np.zeros((3, 3)))
+    out.inertia = R @ inertia_tensor(moments) @ R.T  # unchecked here: the check of the tree does
+    return out
 
 
 @dataclass(frozen=True, eq=False)

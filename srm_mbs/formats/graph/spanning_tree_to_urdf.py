@@ -245,6 +245,14 @@ def closure(
     return out | {"a": anchor(child[0], at), "b": anchor(*parent)}
 
 
+def satisfied_note(names: Iterable[str]) -> str:
+    """The note about joints between bodies that do not move against each other."""
+    return (
+        f"the joints {', '.join(map(repr, names))} join bodies that other joints already hold "
+        "together there: they are left out"
+    )
+
+
 def bushing(
     name: str,
     kind: str,
@@ -341,10 +349,14 @@ class GraphTranslator:
         with naming(file=self.file):
             tree = spanning_tree(self.joints, root, cut)
         entries: dict[str, Any] = {"base": base} if base != "fixed" else {}
+        tree, satisfied = self._without_satisfied(tree)
         if tree.cut:
             entries["loop"] = [self._closure(joint) for joint in tree.cut]
         forces = [
-            force for joint in self.joints for force in self._springs(joint, joint in tree.cut)
+            force
+            for joint in self.joints
+            if joint not in satisfied
+            for force in self._springs(joint, joint in tree.cut)
         ]
         if forces:
             entries["force"] = forces
@@ -382,6 +394,23 @@ class GraphTranslator:
                 )
             self.joints = (*self.joints, joint)
         return "fixed", WORLD
+
+    def _without_satisfied(self, tree: SpanningTree) -> tuple[SpanningTree, list[Joint]]:
+        """The tree without those cut joints that join bodies which fixed joints of the tree hold
+        together, and these joints: where the bodies are placed, they are satisfied."""
+        holder: dict[str, str] = {}
+        for joint in tree.joints:
+            held = holder.get(joint.parent, joint.parent)
+            holder[joint.child] = held if joint.type == "fixed" else joint.child
+        satisfied = [
+            joint
+            for joint in tree.cut
+            if holder.get(joint.parent, joint.parent) == holder.get(joint.child, joint.child)
+        ]
+        if satisfied:
+            self.notes.append(satisfied_note(joint.name for joint in satisfied))
+        kept = tuple(joint for joint in tree.cut if joint not in satisfied)
+        return replace(tree, cut=kept), satisfied
 
     def _fault(self, joint: Joint, problem: str, remedy: str) -> InputError:
         return InputError(problem, file=self.file, element=f"joint {joint.name!r}", remedy=remedy)

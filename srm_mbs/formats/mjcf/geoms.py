@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
-from srm_mbs.formats.meshes import enclosed, read_mesh, surface
+from srm_mbs.formats.meshes import enclosed, read_mesh, solid, surface
 from srm_mbs.formats.mjcf.attributes import GEOMS, Attributes, MjcfValues, z_along
 from srm_mbs.model.reach import Reach
 
@@ -137,7 +136,7 @@ def inertia_of(geom: Geom, meshes: Mapping[str, Mesh], reach: Reach) -> pin.Iner
     if geom.kind == "mesh":
         own = _of_mesh(geom.given, meshes.get(geom.given.text("mesh")), reach)
     elif geom.kind in SIZES:
-        volume, moments = _solid(geom.kind, geom.sizes)
+        volume, moments = solid(geom.kind, geom.sizes)
         own = pin.Inertia(volume, np.zeros(3), volume * np.diag(moments))
     else:
         raise geom.given.fault(
@@ -181,31 +180,6 @@ def _of_mesh(given: Attributes, mesh: Mesh | None, reach: Reach) -> pin.Inertia:
     if not size > 0.0:
         raise given.fault(f"the triangles of {mesh.file!r} enclose no volume", GIVE_INERTIAL)
     return pin.Inertia(size, centre, about)
-
-
-def _solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:
-    """Volume (m^3), and moments per mass (3,) m^2 about the centre."""
-    a, b, c = sizes
-    match kind:
-        case "sphere":
-            return 4.0 / 3.0 * math.pi * a**3, np.full(3, 0.4 * a**2)
-        case "ellipsoid":
-            squares = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
-            return 4.0 / 3.0 * math.pi * a * b * c, squares / 5.0
-        case "box":
-            squares = np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2])
-            return 8.0 * a * b * c, squares / 3.0
-        case "cylinder":
-            across = (3.0 * a**2 + 4.0 * b**2) / 12.0
-            return 2.0 * math.pi * a**2 * b, np.array([across, across, 0.5 * a**2])
-        case _:  # a capsule: a cylinder of half length b between two half balls
-            middle, ends = 2.0 * math.pi * a**2 * b, 4.0 / 3.0 * math.pi * a**3
-            volume = middle + ends
-            # A half ball's centre is 3 a/8 from its flat side.
-            apart = 0.4 * a**2 + b**2 + 0.75 * a * b
-            across = middle * (3.0 * a**2 + 4.0 * b**2) / 12.0 + ends * apart
-            axial = middle * 0.5 * a**2 + ends * 0.4 * a**2
-            return volume, np.array([across, across, axial]) / volume
 
 
 def visuals_of(geom: Geom, meshes: Mapping[str, Mesh], colours: Mapping[str, str]) -> list[Element]:

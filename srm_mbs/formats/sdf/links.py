@@ -149,8 +149,7 @@ class Frames:
                 raise self._unknown(name, self._frames[chain[-1]].where if chain else where)
             frame = self._frames[name]
             if name in chain:
-                problem = f"its pose is relative to itself: {' -> '.join((*chain, name))}"
-                raise self.values.fault(frame.where, problem, "Break the ring of relative_to")
+                raise self._ring([*chain, name])
             chain.append(name)
             name = frame.relative_to
         at = self._found[name]
@@ -158,6 +157,30 @@ class Frames:
             at = at * self._frames[each].placement
             self._found[each] = at
         return at
+
+    def within(self, model: str, name: str, where: str) -> pin.SE3:
+        """Placement of a frame in that of the model around it, which is not yet placed.
+
+        Raises
+        ------
+        InputError
+            If there is no such frame in the model, or it is placed relative to itself.
+        """
+        at, seen = pin.SE3.Identity(), [name]
+        while name != model:
+            if name not in self._frames:
+                raise self._unknown(name, where)
+            frame = self._frames[name]
+            at, name = frame.placement * at, frame.relative_to
+            if name in seen:
+                raise self._ring([*seen, name])
+            seen.append(name)
+        return at
+
+    def _ring(self, chain: list[str]) -> InputError:
+        problem = f"its pose is relative to itself: {' -> '.join(chain)}"
+        where = self._frames[chain[-1]].where
+        return self.values.fault(where, problem, "Break the ring of relative_to")
 
     def body(self, name: str, where: str) -> str:
         """Name of the link that a frame is part of, or ``world``.

@@ -76,20 +76,20 @@ class SdfReader:
         node: Element,
         scope: Scope,
         outer: Scope | None = None,
-        placed: pin.SE3 | None = None,
+        placed: tuple[pin.SE3, str] | None = None,
     ) -> str:
         """Read a model whose names begin with ``scope.prefix``; returns its canonical link.
 
         ``outer`` is the context of an enclosing model or world; ``placed`` the pose of an
-        ``<include>``.
+        ``<include>`` and the frame that it names.
         """
         where = f"model {scope.prefix.removesuffix(SEPARATOR) or node.get('name', '')!r}"
         values = self.values
-        values.attributes(node, where, ("name", "canonical_link"))
+        values.attributes(node, where, ("name", "canonical_link", "placement_frame"))
         values.children(node, where, MODEL_READ, MODEL_IGNORED, MANY)
         placement, relative_to = pose(values, node, where, scope)
         if placed is not None:
-            placement, relative_to = placed, ""
+            placement, relative_to = placed
         reference = WORLD
         if outer is not None:
             around = relative_to not in ("", WORLD)
@@ -106,6 +106,9 @@ class SdfReader:
                 problem = f"there is no link {chosen!r} (canonical_link)"
                 raise values.fault(where, problem, "Name one of its links")
         own = scope.full(MODEL)
+        posed = node.get("placement_frame")
+        if posed:  # the pose is that of this frame
+            placement = placement * self.frames.within(own, scope.full(posed), where).inverse()
         self.frames.add(own, reference, placement, where, body=canonical)
         if outer is not None and scope.prefix != outer.prefix:
             # Outside, the name of a model means its own frame.
@@ -183,7 +186,8 @@ class SdfReader:
         where = f"<include> {shortened(uri)!r}"
         values = self.values
         values.attributes(node, where, ("merge",))
-        values.children(node, where, ("uri", "name", "pose", "static"), ("plugin",))
+        known = ("uri", "name", "pose", "static", "placement_frame")
+        values.children(node, where, known, ("plugin",))
         values.check_include(scope.depth, where)
         path = self._included(uri, scope.file, where)
         included = Document(read_text(path), str(path))
@@ -197,13 +201,9 @@ class SdfReader:
             raise values.fault(where, f"{str(path)!r} holds no <model>", "Include a model")
         node.set("name", (node.findtext("name") or "").strip() or model.get("name", ""))
         name = self.name(node, scope)
-        placed = None
-        if node.find("pose") is not None:
-            placed, relative_to = pose(values, node, where, scope)
-            if relative_to:
-                raise values.fault(
-                    where, "its pose is relative to another frame", "Give it in the model's frame"
-                )
+        placed = None if node.find("pose") is None else pose(values, node, where, scope)
+        if node.find("placement_frame") is not None:
+            model.set("placement_frame", (node.findtext("placement_frame") or "").strip())
         static = node.find("static")
         if static is not None and model.find("static") is None:
             model.append(static)

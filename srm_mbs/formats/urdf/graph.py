@@ -90,17 +90,28 @@ class Graph:
             )
         return found[::-1]
 
+    def held(self, link: str) -> tuple[str, pin.SE3]:
+        """The link that moves ``link`` through fixed joints only, and the placement in it."""
+        placement = pin.SE3.Identity()
+        for at in self.ancestors(link):
+            joint = self.above.get(at)
+            if joint is None or joint.get("type") != "fixed":
+                return at, placement
+            placement = origin_placement(joint) * placement
+        return link, pin.SE3.Identity()  # a ring, which the check of the tree names
+
     def pose(self, link: str) -> pin.SE3:
         """Placement of ``link`` in the root link's frame at q = 0."""
         out = pin.SE3.Identity()
         for at in self.ancestors(link)[:-1]:
-            out = joint_placement(self.above[at]) * out
+            out = origin_placement(self.above[at]) * out
         return out
 
 
-def joint_placement(joint: Element) -> pin.SE3:
-    """Placement of the joint in its parent link; zero where the file has no three numbers."""
-    origin = joint.find("origin")
+def origin_placement(node: Element) -> pin.SE3:
+    """Placement that ``<origin>`` of a joint or an <inertial> gives; zero where the file has no
+    three numbers."""
+    origin = node.find("origin")
     values = []
     for key in ("xyz", "rpy"):
         given = None if origin is None else parse_numbers(origin.get(key, ""))

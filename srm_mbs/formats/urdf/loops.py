@@ -26,6 +26,7 @@ import pinocchio as pin
 
 from srm_mbs.errors import known_names
 from srm_mbs.formats.document import Document
+from srm_mbs.formats.graph.spanning_tree_to_urdf import placement, satisfied_note
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf.drake import rewrite
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
@@ -33,6 +34,8 @@ from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
 from srm_mbs.formats.urdf.validation import ElementChecker
 
 CLOSING = re.compile(r"(closing_.+)_1\Z")
+SATISFIED = 1e-6
+"""Distance (m, rad) of two frames on one body, which is rounding of the file."""
 
 
 def _named_by(own: Mapping[str, Any]) -> set[str]:
@@ -100,6 +103,15 @@ def translate(document: Document, options: Options) -> Translation:
     loops, remarks = closing_frames(graph.links, options.own)
     elements.loops.extend(loops)
     notes += remarks
+    satisfied = [loop for loop in elements.loops if _is_satisfied(loop, graph)]
+    if satisfied:
+        elements.loops = [loop for loop in elements.loops if loop not in satisfied]
+        elements.forces = [
+            force
+            for force in elements.forces
+            if force["type"] != "bushing" or not _is_satisfied(force, graph)
+        ]
+        notes.append(satisfied_note(loop["name"] or loop["type"] for loop in satisfied))
     entries: dict[str, Any] = {}
     if elements.loops:
         entries["loop"] = _named(elements.loops, options.own.get("loop", ()))
@@ -109,6 +121,19 @@ def translate(document: Document, options: Options) -> Translation:
         elements.named(root, "joint")
         notes += elements.ignored_notes()
     return Translation(root, "" if found else document.text, entries, tuple(notes))
+
+
+def _is_satisfied(loop: Mapping[str, Any], graph: Graph) -> bool:
+    """Whether fixed joints hold the two frames of a closure, or of its bushing, together."""
+    if loop["type"] == "universal" or not {"a", "b"} <= loop.keys():
+        return False
+    frames = []
+    for end in (loop["a"], loop["b"]):
+        holder, inside = graph.held(end["link"])
+        zero = (0.0, 0.0, 0.0)
+        frames.append((holder, inside * placement(end.get("xyz", zero), end.get("rpy", zero))))
+    (one, here), (other, there) = frames
+    return one == other and bool(here.actInv(there).isIdentity(SATISFIED))
 
 
 def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:

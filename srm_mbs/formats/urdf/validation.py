@@ -15,9 +15,11 @@ from collections.abc import Sequence
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import pinocchio as pin
 
 from srm_mbs.errors import SrmWarning
-from srm_mbs.formats.graph.joint_graph import ROOT_JOINT, inertia_tensor
+from srm_mbs.formats.graph.joint_graph import ROOT_JOINT, inertia_at, inertia_tensor
+from srm_mbs.formats.urdf.graph import Graph, origin_placement
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
 from srm_mbs.formats.xml import NAMESPACED, XmlFile, local_name, words
 from srm_mbs.model.anchors import WORLD
@@ -208,6 +210,11 @@ POINT_MASS_GYRATION_SQUARED = 1e-18
 class UrdfChecker(ElementChecker):
     """Walks a URDF once; raises :class:`InputError` at the first fault."""
 
+    def __init__(self, file: str) -> None:
+        super().__init__(file)
+        self._inertias: dict[str, pin.Inertia] = {}
+        self._negative: dict[str, float] = {}
+
     def check(self, root: Element, base: str, locked: Sequence[str]) -> None:
         """Check the whole file; ``root`` keeps what Pinocchio is to read."""
         self.root(root)
@@ -226,6 +233,7 @@ class UrdfChecker(ElementChecker):
         for name, link in links.items():
             self.link(name, link)
         self.tree(links, joints, base)
+        self.negative_moments(root, links)
         for name, joint in joints.items():
             self.joint(name, joint, base, name in locked)
         self.notes += self.ignored_notes()
@@ -278,22 +286,39 @@ class UrdfChecker(ElementChecker):
         if value < 0.0:
             raise self.fault(where, f"the mass {value:g} kg is negative", "Give a mass >= 0")
         moments = [self.number(inertia, key, where) for key in ATTRIBUTES["inertia"]]
+        self._inertias[name] = inertia_at(origin_placement(inertial), value, moments)
         principal = np.linalg.eigvalsh(inertia_tensor(moments))
         rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
         if principal[0] < -rounding:
-            raise self.fault(
-                where,
-                f"a principal moment of inertia is negative ({principal[0]:.3g} kg m^2)",
-                "Check the entries of <inertia>",
-            )
-        if principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
-            note = (
+            self._negative[name] = principal[0]
+        elif principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
+            self.warn(
                 f"link {name!r}: the principal moments of inertia {principal[0]:.3g}, "
                 f"{principal[1]:.3g}, {principal[2]:.3g} violate the triangle inequality: "
                 "no real body has them"
             )
-            self.notes.append(note)
-            warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
+
+    def warn(self, note: str) -> None:
+        """Note what is doubtful, and warn of it."""
+        self.notes.append(note)
+        warnings.warn(f"{self.file}: {note}", SrmWarning, stacklevel=2)
+
+    def negative_moments(self, root: Element, links: dict[str, Element]) -> None:
+        """Refuse negative principal moments, unless those of the whole body that fixed joints make
+        of the link and others are positive."""
+        if not self._negative:
+            return
+        graph = Graph(root)
+        held = {name: graph.held(name) for name in links}
+        for name, least in self._negative.items():
+            body = [link for link in links if held[link][0] == held[name][0]]
+            total = pin.Inertia.Zero()
+            for link in body:
+                total += held[link][1].act(self._inertias.get(link, pin.Inertia.Zero()))
+            what = f"a principal moment of inertia is negative ({least:.3g} kg m^2)"
+            if not np.linalg.eigvalsh(total.inertia)[0] > 0.0:
+                raise self.fault(f"link {name!r}", what, "Check the entries of <inertia>")
+            self.warn(f"link {name!r}: {what}; with the links fixed to it, all are positive")
 
     def joint(self, name: str, joint: Element, base: str, locked: bool) -> None:
         where = f"joint {name!r}"

@@ -498,6 +498,31 @@ def test_a_merged_model_is_part_of_the_model_around_it(tmp_path: Path) -> None:
         loaded(tmp_path, twice)
 
 
+def test_a_pose_may_be_that_of_a_frame_of_the_model(tmp_path: Path) -> None:
+    """``placement_frame`` of a model and of an include, and an include posed by another frame."""
+    inside = (
+        link("base", ONE),
+        link("tool", TWO),
+        joint("hinge", "revolute", "base", "tool"),
+        f"<frame name='grip' attached_to='tool'><pose>{THREE}</pose></frame>",
+    )
+    (tmp_path / "arm.sdf").write_text(sdf(*inside, name="arm"))
+    named = "<placement_frame>grip</placement_frame>"
+    here = f"<pose relative_to='stand'>{ONE}</pose>"
+    text = sdf(
+        link("stand", THREE),
+        f"<include><uri>arm.sdf</uri><name>a</name>{here}</include>",
+        f"<include><uri>arm.sdf</uri><name>b</name>{here}{named}</include>",
+        f"<model name='c' placement_frame='grip'>{here}{''.join(inside)}</model>",
+        *(joint(f"weld_{k}", "fixed", "stand", f"{k}::base", axis="") for k in "abc"),
+    )
+    mechanism = loaded(tmp_path, text)
+    for name in "abc":
+        found = placed(mechanism.model, f"{name}::tool", mechanism.q0) * of(THREE)
+        model = pin.SE3.Identity() if name != "a" else of(TWO) * of(THREE)
+        same(found, of(THREE) * of(ONE) * model)
+
+
 def test_a_world_merges_models(tmp_path: Path) -> None:
     (tmp_path / "arm.sdf").write_text(
         sdf(link("upper", ONE), joint("hinge", "revolute", "world", "upper"), name="arm")
@@ -530,6 +555,25 @@ def test_a_loop_of_equal_joints_is_cut_far_from_the_root() -> None:
 def test_the_joint_with_the_most_freedom_is_cut() -> None:
     near = [Joint("a", "spherical", "world", "crank"), *SQUARE[1:]]
     assert [joint.name for joint in spanning_tree(near, "world").cut] == ["a"]
+
+
+def test_a_joint_between_bodies_that_are_held_together_is_left_out() -> None:
+    text = sdf(
+        link("base"),
+        link("arm", ONE),
+        link("plate", TWO),
+        link("badge", THREE),
+        joint("hinge", "revolute", "base", "arm"),
+        joint("one", "fixed", "arm", "plate", axis=""),
+        joint("two", "fixed", "plate", "badge", axis=""),
+        joint("three", "fixed", "badge", "arm", axis=""),
+        joint("four", "revolute", "badge", "arm", "|<dynamics><damping>1</damping></dynamics>"),
+    )
+    made = translated(text)
+    assert not {"loop", "force"} & made.entries.keys()
+    (note,) = (note for note in made.notes if "left out" in note)
+    assert "'four'" in note
+    assert sum(f"'{name}'" in note for name in ("one", "two", "three")) == 1
 
 
 def test_a_joint_that_no_closure_can_replace_is_kept() -> None:

@@ -37,6 +37,7 @@ FAULTS = {
     "two poses": ("<inertial>", "<pose/><inertial>"),
     "mass": ("<mass>1.0</mass>", "<mass>heavy</mass>"),
     "negative": ("<mass>1.0</mass>", "<mass>-1</mass>"),
+    "negative moment": ("<ixx>0.01", "<ixx>-0.01"),
     "auto": ("<inertial>", '<inertial auto="true">'),
     "auto of a plane": ("<inertial>", '<collision name="c"><geometry><plane/></geometry>'
                         '</collision><inertial auto="1">'),
@@ -75,7 +76,10 @@ FAULTS = {
     "far": (LAST, "<include><uri>https://a.b/c</uri></include></model>"),
     "merge": (LAST, '<include merge="maybe"><uri>a</uri></include></model>'),
     "canonical": ('name="robot"', 'name="robot" canonical_link="x"'),
-    "placement": ('name="robot"', 'name="robot" placement_frame="arm"'),
+    "placement": ('name="robot"', 'name="robot" placement_frame="x"'),
+    "ring of placement": ('name="robot">', 'name="robot" placement_frame="f"><frame name="f"><pose '
+                          'relative_to="g"/></frame><frame name="g"><pose relative_to="f"/>'
+                          '</frame>'),
 }  # fmt: skip
 
 

@@ -212,6 +212,36 @@ def test_the_second_joint_of_a_child_becomes_a_closure(
     check_rows(mechanism, lambda q: gaps(closed, relative(q, ON_SHIN, NOWHERE)))
 
 
+GLUED = (
+    '<link name="plate"/><joint name="glue" type="fixed"><parent link="rim"/><child link="plate"/>'
+    '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/></joint>'
+)
+AGAIN = (
+    '<joint name="again" type="{kind}"><parent link="rim"/><child link="plate"/>'
+    '<origin xyz="0.1 {y} 0.3" rpy="0.4 0.5 0.6"/><axis xyz="1 0 0"/>{more}</joint>'
+)
+
+
+@pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic", "spherical"])
+def test_a_joint_that_fixed_joints_satisfy_already_is_left_out(kind: str, tmp_path: Path) -> None:
+    """To the rounding of the file."""
+    for y in ("0.2", "0.2000003"):
+        more = '<dynamics damping="0.1"/>' if kind in ("revolute", "prismatic") else ""
+        again = AGAIN.format(kind=kind, y=y, more=more)
+        mechanism = srm.load(write(tmp_path, tree(GLUED + again)))
+        assert not mechanism.loops
+        assert not mechanism.forces
+        assert any("'again' join bodies that other joints already" in n for n in mechanism.notes)
+    loop = (
+        '<loop name="again" type="fixed"><predecessor link="plate"/><successor link="rim">'
+        '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/></successor></loop>'
+    )
+    assert not srm.load(write(tmp_path, tree(GLUED + loop))).loops
+    for wrong in (AGAIN.format(kind=kind, y="0.21", more=""), loop.replace("0.2 0.3", "0.2 0.4")):
+        with pytest.raises(srm.InputError, match="'again'"):
+            srm.load(write(tmp_path, tree(GLUED + wrong)))
+
+
 def test_a_second_joint_that_restrains_nothing_is_left_out(tmp_path: Path) -> None:
     assert not open_mechanism(write(tmp_path, tree(second("floating")))).loops
 

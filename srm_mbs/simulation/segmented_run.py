@@ -168,7 +168,7 @@ def impact(
             element="restitution",
             remedy="Give 0 (nothing springs back) to 1 (all of it)",
         )
-    here = mechanism.with_state(q, v)
+    here = mechanism.continued(q, v)
     remedy = f"Give {here.model.nv} numbers"
     n = numbers(normal, "normal", remedy)
     if n.shape != here.v0.shape:

@@ -394,3 +394,24 @@ REFUSED: dict[str, Any] = {
 def test_bad_events_are_refused_before_any_stepping(slider_crank: srm.Mechanism) -> None:
     run = partial(srm.simulate, slider_crank, 1.0)
     check_refusals("events", {case: partial(run, events=bad) for case, bad in REFUSED.items()})
+
+
+@pytest.mark.parametrize("place", [1000.0, 1000.1, 1000.2, 1000.3])
+def test_a_zero_is_known_to_rounding_without_bisection_after_it_is_found(place: float) -> None:
+    """A body in free flight: its position is linear in time but for rounding."""
+    model = pin.Model()
+    model.gravity.linear = np.zeros(3)
+    index = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    body = pin.Inertia(1.0, np.zeros(3), np.eye(3))
+    model.appendBodyToJoint(index, body, pin.SE3.Identity())
+    seen: list[float] = []
+
+    def reached(t: float, q: Any, v: Any) -> float:
+        seen.append(t)
+        return float(q[0]) - place
+
+    run = srm.simulate(srm.Mechanism(model, v0=[1.0]), 2000.0, events=reached, max_step=7.1)
+    assert run.t_events is not None
+    assert run.t_events[0] == pytest.approx([place], abs=1e-12 * place)
+    # One at the start, and where a step of dop853 has equal parts: its degree is 7.
+    assert len(seen) - 1 - 7 * run.stats.steps <= 8

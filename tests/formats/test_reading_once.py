@@ -1,4 +1,4 @@
-"""Every file is read and parsed once per load, and the mechanism is constructed once."""
+"""Every file is read and parsed once per load; the mechanism is made and analysed once."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import networkx  # noqa: F401 - its import reads files, which do not count
+import numpy as np
 import pytest
 import yaml
 from defusedxml import ElementTree as SafeTree
 
 import srm_mbs as srm
+from srm_mbs.dynamics.constraints import structure
 from srm_mbs.formats import csv_table
 from srm_mbs.formats import files as reading
 from tests.support import sdf_files
@@ -104,3 +106,26 @@ def test_a_conversion_parses_its_file_once(tmp_path: Path, counted: Counter[Any]
     (tmp_path / "robot.sdf").write_text(sdf_files.four_bar())
     srm.convert(tmp_path / "robot.sdf", tmp_path / "out.toml")
     assert counted == {"robot.sdf": 1, "XML": 1, "mechanism": 1}
+
+
+@pytest.mark.parametrize(("more", "times"), [("", 1), ("v = { a = 1.0 }\n", 2)])
+def test_loops_are_analysed_where_they_are_closed(
+    more: str, times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once, from an open guess too; given rates are where the walks of the analysis begin."""
+    analysed = []
+    analyse = structure.analyse
+
+    def recorded(mechanism: Any) -> Any:
+        analysed.append(mechanism)
+        return analyse(mechanism)
+
+    monkeypatch.setattr(structure, "analyse", recorded)
+    (tmp_path / "robot.sdf").write_text(sdf_files.four_bar())
+    guess = "[initial]\nguess = { a = 0.5, b = 1.0 }\n"
+    (tmp_path / "robot.toml").write_text(f'format = 1\nsdf = "robot.sdf"\n{guess}{more}')
+    mechanism = srm.load(tmp_path / "robot.toml")
+    assert mechanism.structure.rank == 2
+    assert len(analysed) == times
+    for each in analysed:
+        assert np.abs(each.initial_errors[0]).max() < 1e-11

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from typing import Any
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import pinocchio as pin
@@ -43,6 +44,7 @@ DYNAMICS = {
 LIMITS = {"lower": "lower", "upper": "upper", "effort": "effort", "speed": "velocity"}
 """What a joint has, and the element of ``<limit>`` that gives it."""
 LIMIT_IGNORED = ("stiffness", "dissipation")
+DRAKE_MIMIC = re.compile(r"\{[^}]*drake[^}]*\}mimic")
 ANGLE_COSINE_TOLERANCE = 1e-9
 """Of the cosine of the angle between two axes that are parallel or perpendicular."""
 GEAR_AXIS_TOLERANCE = 1e-6
@@ -95,6 +97,9 @@ class JointReader:
         where = f"joint {name!r}"
         values = self.values
         rotor = self._motor(node, where)
+        foreign = [child for child in node if DRAKE_MIMIC.fullmatch(child.tag)]
+        for mimic in foreign:
+            node.remove(mimic)
         values.attributes(node, where, ("name", "type"))
         values.children(node, where, JOINT_READ, JOINT_IGNORED)
         kind = node.get("type", "")
@@ -147,6 +152,7 @@ class JointReader:
                     moving = replace(moving, armature=rotor)
                 self.joints.append(_along(moving, axes[0]))
         self._mimics += [(name, scope, axis.mimic) for axis in axes if axis.mimic is not None]
+        self._mimics += [(name, scope, mimic) for mimic in foreign]
 
     def _motor(self, node: Element, where: str) -> float:
         """Take out what Drake says of a motor: the inertia (kg m^2, kg) that the joint sees, which
@@ -325,8 +331,14 @@ class JointReader:
 
     def _mimic(self, name: str, scope: Scope, node: Element) -> dict[str, Any]:
         values, where = self.values, f"joint {name!r}, <mimic>"
-        values.attributes(node, where, ("joint", "axis"))
-        values.children(node, where, ("multiplier", "offset", "reference"), ())
+        if DRAKE_MIMIC.fullmatch(node.tag):  # with attributes in place of elements
+            values.attributes(node, where, ("joint", "multiplier", "offset"))
+            for key in ("multiplier", "offset"):
+                if key in node.attrib:
+                    SubElement(node, key).text = node.attrib[key]
+        else:
+            values.attributes(node, where, ("joint", "axis"))
+            values.children(node, where, ("multiplier", "offset", "reference"), ())
         leader = scope.prefix + node.get("joint", "")
         if node.get("axis", "axis") != "axis":
             raise values.fault(where, "the second axis of a joint cannot lead", "Use axis")

@@ -4,6 +4,7 @@ They are described in ``multibody/parsing/parsing_doxygen.h`` of Drake.
 
 * ``<drake:joint>`` of the types ``ball``, ``planar`` (x, y and the angle about z), ``universal``
   (about x of the parent, then about y of the child) and ``screw``;
+* ``world`` as the parent of a joint without a link of this name: the ground;
 * ``<drake:rotor_inertia>`` and ``<drake:gear_ratio>`` of an actuator: armature of its joint.
 """
 
@@ -12,9 +13,10 @@ from __future__ import annotations
 import re
 from xml.etree.ElementTree import Element, SubElement
 
-from srm_mbs.formats.urdf.graph import ONE_DEGREE
+from srm_mbs.formats.urdf.graph import ONE_DEGREE, link_of
 from srm_mbs.formats.urdf.validation import ElementChecker
 from srm_mbs.formats.xml import local_name
+from srm_mbs.model.anchors import WORLD
 
 DRAKE_JOINT = re.compile(r"\{[^}]*drake[^}]*\}joint")
 TYPES = {"ball": "spherical", "planar": "planar", "screw": "screw", "universal": "universal"}
@@ -36,13 +38,25 @@ def rewrite(root: Element, reader: ElementChecker) -> bool:
     joints = [node for node in root if DRAKE_JOINT.fullmatch(node.tag)]
     for node in joints:
         _joint(node, reader)
+    grounded = _add_ground(root)
     motors = [name for node in root.findall("transmission") if (name := _motor(root, node, reader))]
     if motors:
         reader.notes.append(
             "the inertia of motors, drake:rotor_inertia times the square of drake:gear_ratio, "
             f"acts as armature of the joints {', '.join(map(repr, motors))}"
         )
-    return bool(joints or motors)
+    return bool(joints or motors or grounded)
+
+
+def _add_ground(root: Element) -> bool:
+    """Add the link ``world`` if a joint starts from it and the file has none, as Drake does."""
+    links = {link.get("name") for link in root.findall("link")}
+    missing = WORLD not in links and any(
+        link_of(joint, "parent") == WORLD for joint in root.findall("joint")
+    )
+    if missing:
+        SubElement(root, "link", name=WORLD)
+    return missing
 
 
 def _joint(node: Element, reader: ElementChecker) -> None:

@@ -105,6 +105,29 @@ def test_a_joint_of_drake_is_that_of_this_package(
     np.testing.assert_array_equal(mass_matrix(mechanism.model, q), mass_matrix(plain.model, q))
 
 
+def test_the_ground_needs_no_link(tmp_path: Path) -> None:
+    held = '<joint name="bolt" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    mechanism, plain = loaded(tmp_path, tree(held)), loaded(tmp_path, tree())
+    np.testing.assert_array_equal(
+        mass_matrix(mechanism.model, mechanism.q0), mass_matrix(plain.model, plain.q0)
+    )
+
+
+def test_a_mimic_of_drake_in_sdf_is_a_coupling(tmp_path: Path) -> None:
+    mimic = '<drake:mimic joint="hinge" multiplier="-2.5" offset="0.3"/>'
+    text = sdf_files.sdf(
+        sdf_files.link("arm", "0 0 1 0 0 0"),
+        sdf_files.link("hand", "0 0 2 0 0 0"),
+        sdf_files.joint("hinge", "revolute", "world", "arm"),
+        sdf_files.joint("wrist", "revolute", "arm", "hand", mimic),
+    ).replace("<sdf ", f"<sdf {DRAKE} ")
+    (loop,) = loaded(tmp_path, text, "robot.sdf").loops
+    assert (loop.name, loop.joints) == ("wrist::mimic", ("wrist", "hinge"))
+    assert (loop.ratio, loop.offset) == (-2.5, 0.3)
+    with pytest.raises(srm.InputError, match=r"<multiplier>.*'x'"):
+        loaded(tmp_path, text.replace('"-2.5"', '"x"'), "robot.sdf")
+
+
 def test_frames_filters_and_limits_of_acceleration_are_noted(tmp_path: Path) -> None:
     extra = (
         '<frame name="grasp" link="rim" xyz="0 0 1" rpy="0 0 0"/>'

@@ -66,6 +66,8 @@ SWEEPS = 12
 CONVERGED = 0.01
 """Last relative change of places and energies in a sweep at which the collocation is solved, over
 rtol."""
+TURNED = 1.0
+"""Largest relative change of the rates in that sweep, over rtol."""
 PLACE_ROUNDING = 1e-15
 """Rounding (units^2) of a place on the curve, times its distance from the critical configuration."""
 EXTRAPOLATED = 1e-4
@@ -350,10 +352,17 @@ class PassageAlongCurve:
         v = rates * self.critical.geometry.coordinate_unit
         return np.concatenate([q, v]), np.concatenate([v, node.acceleration])
 
-    def _solved(self, node: Node) -> bool:
-        """Whether ``node`` is on the curve, for the tolerance or to rounding."""
+    def _solved(self, node: Node, speed: float) -> bool:
+        """Whether ``node`` is on the curve and was evaluated with the rates of the ``speed``, for
+        the tolerance or to rounding."""
         distance = float(np.hypot(node.beta, self._curve.width))
-        return node.off <= CONVERGED * self.rtol * distance + PLACE_ROUNDING / distance
+        rounding = PLACE_ROUNDING / distance
+        rates = speed * node.tangent
+        turned = float(np.abs(rates - node.rates).max() / np.abs(rates).max())
+        return (
+            node.off <= CONVERGED * self.rtol * distance + rounding
+            and turned <= TURNED * self.rtol + rounding / distance
+        )
 
     def _panel(self, a: float, b: float) -> None:
         """Go on along the panel [a, b] of xi."""
@@ -380,7 +389,7 @@ class PassageAlongCurve:
             times = self._clock + weights @ (slope / speeds)
             change = float(np.abs(energies[:-1] - energy).max() / energies.max())
             energy, t = energies[:-1], times[:-1]
-            if change <= CONVERGED * self.rtol and all(map(self._solved, nodes)):
+            if change <= CONVERGED * self.rtol and all(map(self._solved, nodes, speeds.tolist())):
                 break
             guesses = [(node.place, s * node.tangent) for node, s in zip(nodes, speeds.tolist())]
         begin, energy_at_begin = self._clock, self._energy
@@ -404,9 +413,10 @@ class PassageAlongCurve:
         place, rates = self._predicted(beta, self._speed(last, energy_before))
         for _ in range(SWEEPS):
             node = self._evaluated(place, beta, rates, t, closed=True)
-            if self._solved(node):
+            speed = self._speed(node, energy)
+            if self._solved(node, speed):
                 break
-            place, rates = node.place, self._speed(node, energy) * node.tangent
+            place, rates = node.place, speed * node.tangent
         self._found.append((node, energy, t))
 
 

@@ -93,6 +93,7 @@ namespace srm {
     field(int, passage_sweeps)                                                                     \
     field(int, bisections)                                                                         \
     field(double, passage_converged)       /* last change in a sweep, over rtol */                 \
+    field(double, passage_turned)          /* that of the rates, over rtol */                      \
     field(double, place_rounding)          /* of a place (units^2), times its distance */          \
     field(double, extrapolated)            /* |beta| from which the deviation is known */          \
     field(double, expected_steps)          /* steps within which a zero of sigma is examined */   \

@@ -370,11 +370,19 @@ private:
         closures_.move(away.data(), x, t);
     }
 
-    // Whether a node is on the curve, for the tolerance or to rounding.
-    bool solved(const Node& node) const {
+    // Whether a node is on the curve and was evaluated with the rates of the speed, for the
+    // tolerance or to rounding.
+    bool solved(const Node& node, double speed) const {
         const double distance = std::hypot(node.beta, curve_.width);
-        return node.off <= constants_.passage_converged * rtol_ * distance +
-                               constants_.place_rounding / distance;
+        const double rounding = constants_.place_rounding / distance;
+        if (!(node.off <= constants_.passage_converged * rtol_ * distance + rounding)) return false;
+        double change = 0.0, most = 0.0;
+        for (int j = 0; j < n_; ++j) {
+            const double rate = speed * node.tangent[j];
+            change = std::max(change, std::abs(rate - node.rates[j]));
+            most = std::max(most, std::abs(rate));
+        }
+        return change <= (constants_.passage_turned * rtol_ + rounding / distance) * most;
     }
 
     void panel(double a, double b) {
@@ -399,7 +407,6 @@ private:
                 const double time = driven_ ? guess.time : t[i];
                 nodes[i] = evaluated(guess.x, time, betas[i], guess.rates, false);
                 works[i] = slope[i] * nodes[i].power;
-                done = done && solved(nodes[i]);
             }
             integrate(works, energy_, energies);
             double change = 0.0, most = 0.0;
@@ -411,6 +418,7 @@ private:
                 const double rate_here = speed(nodes[i], energies[i]);
                 if (!(rate_here * slope[i] > 0.0)) throw NoPassage{};
                 durations[i] = slope[i] / rate_here;
+                done = done && solved(nodes[i], rate_here);
                 change = std::max(change, std::abs(energies[i] - energy[i]));
                 energy[i] = energies[i];
                 guesses[i].x = nodes[i].x;
@@ -455,11 +463,12 @@ private:
                 guess.rates);
         for (int sweep = 0; sweep < constants_.passage_sweeps; ++sweep) {
             node = evaluated(guess.x, driven_ ? guess.time : t, beta, guess.rates, true);
-            if (solved(node)) break;
+            const double rate = speed(node, energy);
+            if (solved(node, rate)) break;
             guess.x = node.x;
             guess.time = node.time;
             guess.rates = node.tangent;
-            for (double& value : guess.rates) value *= speed(node, energy);
+            for (double& value : guess.rates) value *= rate;
         }
         found_.push_back({std::move(node), energy, t});
     }

@@ -131,6 +131,7 @@ def constants() -> Any:
         passage_sweeps=critical_passages.SWEEPS,
         bisections=critical_passages.BISECTIONS,
         passage_converged=critical_passages.CONVERGED,
+        passage_turned=critical_passages.TURNED,
         place_rounding=critical_passages.PLACE_ROUNDING,
         extrapolated=critical_passages.EXTRAPOLATED,
         expected_steps=placement.EXPECTED_STEPS,

@@ -41,7 +41,7 @@ SEARCH = 0.3
 configuration is looked for."""
 PASSED = 0.5
 """Distance of the predicted passage from the critical configuration, over that of the start of the
-step, below which the step passes it."""
+step, below which the step passes it.  In a wide layer the curve itself tells."""
 ROUNDED_RESIDUAL = 1e-13
 """Residual (row units) below which the configuration is singular to rounding."""
 DISTURBING = 1e-3
@@ -536,9 +536,7 @@ class CriticalPassages:
             return []
         begin = geometry.at(analysis.split(state)[0], t)
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
-        if not np.linalg.norm(left) < PASSED * np.linalg.norm(covered):
-            return []
-        self._known = True
+        self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))
         if abs(critical.residual) <= ROUNDED_RESIDUAL:
             return []
         residual = critical.residual
@@ -552,7 +550,9 @@ class CriticalPassages:
                 steps = self._steps(passage)
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
                 pass  # steps pass it as well as they can, and the message says so
-        self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
+        self._known = self._known or bool(steps)
+        if self._known:
+            self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
         return steps
 
     def _steps(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:

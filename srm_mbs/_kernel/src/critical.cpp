@@ -269,7 +269,7 @@ std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures,
         return norm(away.data(), nv);
     };
     const double covered = distance(std::vector<double>(begin, begin + nx));
-    if (!(distance(place) < constants.critical_passed * covered)) return {};
+    found.passed = distance(place) < constants.critical_passed * covered;
     const bool singular = !(std::abs(found.residual) > constants.rounded_residual);
     if (!singular && !search.complete()) return {};
     return std::move(found);

@@ -43,10 +43,11 @@ struct CriticalConfiguration {
     std::vector<double> u;        // (rank,), of unit length
     std::vector<double> hessian;  // (n, n), of u . g
     double residual;
+    bool passed;                  // the straight motion leads past it
 };
 
-// The critical configuration that a motion passes at `zero` (s), from the state `begin` at t with
-// the tangent rate `rate`; none if it passes none.
+// The critical configuration next to a motion at `zero` (s), from the state `begin` at t with the
+// tangent rate `rate`; none if there is none.
 std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures, double t,
                                                          const double* begin, const double* rate,
                                                          double zero, const Constants& constants);

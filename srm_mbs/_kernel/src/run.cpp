@@ -235,8 +235,8 @@ bool Run::examine(double zero) {
     UnitClosures closures(system, zero - t_);
     const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), zero,
                                               constants());
-    known_ = critical.has_value();
-    if (!known_) return false;
+    known_ = critical && critical->passed;
+    if (!critical) return false;
     const double residual = std::abs(critical->residual);
     if (!(residual > constants().rounded_residual)) return false;
     const bool avoided = residual > singular_tolerance_;
@@ -248,7 +248,8 @@ bool Run::examine(double zero) {
             // Steps pass it as well as they can, and the message says so.
         }
     }
-    examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});
+    known_ = known_ || !prepared_.empty();
+    if (known_) examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});
     return !prepared_.empty();
 }
 

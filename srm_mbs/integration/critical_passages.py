@@ -17,7 +17,7 @@ itself.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -42,6 +42,9 @@ configuration is looked for."""
 PASSED = 0.5
 """Distance of the predicted passage from the critical configuration, over that of the start of the
 step, below which the step passes it.  In a wide layer the curve itself tells."""
+EXAMINED_AGAIN = 0.7
+"""Fall of sigma after which a motion that passes no critical configuration so far is examined
+again."""
 ROUNDED_RESIDUAL = 1e-13
 """Residual (row units) below which the configuration is singular to rounding."""
 DISTURBING = 1e-3
@@ -269,9 +272,11 @@ class PassageAlongCurve:
         self.rates = np.array([rate for _, rate in motion])
         self.states[0] = self.state
 
-    def _predicted(self, beta: float, speed: float) -> tuple[FloatArray, FloatArray]:
-        """Place and rates (n,) at ``beta``, for the ``speed`` beta': those of the hyperbola, moved
-        by the distance of the last nodes from it."""
+    def _predicted(
+        self, beta: float, energy: float, mass: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Place, rates (n,) and beta' at ``beta``, with the kinetic ``energy`` (J) and the ``mass``
+        matrix (nv, nv): those of the hyperbola, moved by the distance of the last nodes from it."""
         geometry = self.critical.geometry
         away, tangent = self._curve.hyperbola(beta)
         known = [
@@ -288,7 +293,12 @@ class PassageAlongCurve:
         elif known:
             b, at_b = known[0]
             away, tangent = away + (beta / b) ** 2 * at_b, tangent + 2.0 * beta / b**2 * at_b
-        return geometry.move(self.critical.q, away), speed * tangent
+        if self._driven:
+            speed = float(1.0 / (tangent[-1] * geometry.unit[-1]))
+        else:
+            inertia = tangent @ mass @ tangent
+            speed = self._heading * float(np.sqrt(2.0 * energy / inertia))
+        return geometry.move(self.critical.q, away), speed * tangent, speed
 
     def _off_hyperbola(self, node: Node) -> FloatArray:
         away = self.critical.geometry.difference(self.critical.q, node.place)
@@ -369,29 +379,35 @@ class PassageAlongCurve:
         x, w, integrals = gauss_nodes(self._count)
         xi = a + (b - a) * x
         weights, slope = np.vstack([integrals, w]), self._width * np.cosh(xi) * (b - a)
-        last, energy, t = self._found[-1]
-        speed = self._speed(last, energy)
-        ahead = self._width * (np.sinh(xi) - np.sinh(a))
-        energy, t = self._energy + last.power * ahead, self._clock + ahead / speed
-        start, betas = self._width * np.sinh(a), (self._width * np.sinh(xi)).tolist()
-        guesses = [self._predicted(beta, speed) for beta in betas]
+        start, betas = self._width * np.sinh(a), self._width * np.sinh(xi)
+        energy = self._energy + self._found[-1][0].power * (betas - start)
+        if not (energy > 0.0).all():
+            raise ValueError("the energy does not suffice to pass")
+        # Of the evaluation made last.
+        mass = self.critical.geometry.mass()
+        predicted = [self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())]
+        places, rates = [one[0] for one in predicted], [one[1] for one in predicted]
+        t = self._clock + integrals @ (slope / np.array([one[2] for one in predicted]))
+        nodes = [self._evaluated(*one) for one in zip(places, betas.tolist(), rates, t.tolist())]
         for _ in range(SWEEPS):
-            nodes = [
-                self._evaluated(place, beta, rates, time)
-                for (place, rates), beta, time in zip(guesses, betas, t.tolist())
-            ]
             energies = self._energy + weights @ (slope * [node.power for node in nodes])
             if not (energies > 0.0).all():
                 raise ValueError("the energy does not suffice to pass")
-            speeds = np.array([self._speed(*one) for one in zip(nodes, energies.tolist())])
+            speeds = [self._speed(*one) for one in zip(nodes, energies.tolist())]
             if not (speeds * slope > 0.0).all():
                 raise ValueError("the drives lead where the mechanism cannot follow")
             times = self._clock + weights @ (slope / speeds)
-            change = float(np.abs(energies[:-1] - energy).max() / energies.max())
-            energy, t = energies[:-1], times[:-1]
-            if change <= CONVERGED * self.rtol and all(map(self._solved, nodes, speeds.tolist())):
+            left = [i for i, node in enumerate(nodes) if not self._solved(node, speeds[i])]
+            if not left:
                 break
-            guesses = [(node.place, s * node.tangent) for node, s in zip(nodes, speeds.tolist())]
+            for i in left:
+                here = nodes[i]
+                nodes[i] = self._evaluated(
+                    here.place, here.beta, speeds[i] * here.tangent, float(times[i])
+                )
+        else:
+            raise ValueError("the collocation does not converge")
+        energy, t = energies[:-1], times[:-1]
         begin, energy_at_begin = self._clock, self._energy
         self._energy, self._clock = float(energies[-1]), float(times[-1])
         if self._driven:  # known without any integral
@@ -409,14 +425,16 @@ class PassageAlongCurve:
     def _point(self, beta: float, energy: float, t: float) -> None:
         """Go on to ``beta``, where the motion has the kinetic ``energy`` (J) at ``t`` (s); a
         residual that counts as zero is closed again."""
-        last, energy_before, _ = self._found[-1]
-        place, rates = self._predicted(beta, self._speed(last, energy_before))
+        mass = self.critical.geometry.mass()
+        place, rates, _ = self._predicted(beta, energy, mass)
         for _ in range(SWEEPS):
             node = self._evaluated(place, beta, rates, t, closed=True)
             speed = self._speed(node, energy)
             if self._solved(node, speed):
                 break
             place, rates = node.place, speed * node.tangent
+        else:
+            raise ValueError("the end of the curve does not converge")
         self._found.append((node, energy, t))
 
 
@@ -480,8 +498,15 @@ class CriticalPassages:
     ) -> None:
         self._system, self._scheme, self._norm = system, scheme, norm
         self._tolerance = tolerance
-        self._known = False
+        self._known = self._quiet = False
+        self._sigma = self._examine_below = np.inf
         self.examined: list[ExaminedPassage] = []
+
+    @cached_property
+    def _one_freedom(self) -> bool:
+        """Whether the closed configurations are curves, which may be followed."""
+        analysis = self._system.singularities
+        return len(analysis.geometry(analysis.q0).unit) - analysis.rank == 1
 
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
@@ -497,12 +522,15 @@ class CriticalPassages:
 
     def unexamined(self, zero: float | None, t: float) -> float | None:
         """The ``zero`` (s) of sigma that is expected after ``t`` (s), unless it was examined."""
-        return None if self._known or zero is None or not zero > t else zero
+        if self._known or zero is None or not zero > t or not self._sigma < self._examine_below:
+            return None
+        return None if self._quiet and not self._one_freedom else zero
 
     def accepted(self, result: StepResult) -> None:
         """A step was accepted: where sigma rises, the next passage is another one."""
+        self._quiet, self._sigma = result.quiet, float(result.sigmas[-1])
         if result.sigmas[-1] > result.sigmas[0]:
-            self._known = False
+            self._known, self._examine_below = False, np.inf
 
     def steps_past(
         self, t: float, state: FloatArray, rate: FloatArray, zero: float, end: float
@@ -529,6 +557,7 @@ class CriticalPassages:
         move = np.zeros(2 * nv)
         move[:nv] = ahead * (rate[:nv] + 0.5 * ahead * rate[nv:])
         q = analysis.split(system.retract(state, move))[0]
+        self._examine_below = EXAMINED_AGAIN * self._sigma
         geometry = analysis.geometry(analysis.q0, t)
         place = geometry.at(q, zero)
         critical = critical_configuration(geometry, analysis.rank, place, SEARCH)

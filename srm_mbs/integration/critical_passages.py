@@ -55,6 +55,11 @@ LAYER = 1.5
 """|xi| up to which the panel in the middle reaches; a third more instead of a short panel more."""
 SHORTEST_PANEL = 0.1
 """Length of a panel in xi, at least."""
+PANEL_ERROR = 10.0
+"""Largest error of interpolation on a panel (units), over rtol.  Gauss quadrature, which leads from
+panel to panel, is far more accurate."""
+RELATIVE_PANEL_ERROR = 0.01
+"""Largest one over the size of the panel: dense output shows layers that are far below rtol."""
 SHRINKAGE = 0.8
 """Ratio of the lengths that are tried."""
 BISECTIONS = 50
@@ -124,8 +129,8 @@ def panel_edges(
     """
 
     def accurate(a: float, b: float) -> bool:
-        size = width * float(np.sinh(b))
-        return size * interpolation_error(a, b, nodes, width, layer) <= tolerance
+        error = interpolation_error(a, b, nodes, width, layer)
+        return error <= min(RELATIVE_PANEL_ERROR, tolerance / (width * float(np.sinh(b))))
 
     edge, out = reach, [reach]
     while edge > SHORTEST_PANEL and not (edge <= 4.0 / 3.0 * LAYER and accurate(-edge, edge)):
@@ -256,7 +261,8 @@ class PassageAlongCurve:
         self._clock, self._found = self.t, [(here, self._energy, self.t)]
         self._count = node_count(self.rtol)
         reach = float(np.arcsinh(abs(curve.beta) / self._width))
-        edges = panel_edges(reach, self._count, self._width, not self.exact, self.rtol)
+        allowed = PANEL_ERROR * self.rtol
+        edges = panel_edges(reach, self._count, self._width, not self.exact, allowed)
         for a, b in pairwise(self._heading * x for x in edges):
             if self._clock < self.end:
                 self._panel(a, b)
@@ -579,9 +585,11 @@ class CriticalPassages:
                 steps = self._steps(passage)
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
                 pass  # steps pass it as well as they can, and the message says so
-        self._known = self._known or bool(steps)
-        if self._known:
+        if self._known or steps:
             self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
+        if steps:
+            self._known, self._quiet, self._examine_below = False, False, np.inf
+            self._sigma = float(steps[-1][0].sigmas[-1])
         return steps
 
     def _steps(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:

@@ -617,6 +617,7 @@ void bind_run(nb::module_& m) {
     field(Array, break_rates)       /* (breaks, n) */                                 \
     field(std::vector<long>, breaks)                                                  \
     field(std::vector<long>, zones) /* numbers of the steps with a zone */            \
+    field(Array, layers)            /* (k, 2) */                                      \
     field(double, end)              /* of the run (s) */
 
 // The accepted steps of a run, in NumPy arrays that are not copied.
@@ -646,6 +647,8 @@ struct PySteps {
         out.end_rate = end_rate.data();
         out.breaks = breaks;
         out.break_rates = break_rates.data();
+        expect("layers", layers, {k, 2});
+        out.layers = layers.data();
         out.in_zone.assign(k, 0);
         for (long step : zones) {
             if (step < 0 || step >= out.count)

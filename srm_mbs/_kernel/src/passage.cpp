@@ -335,12 +335,12 @@ private:
         return away;
     }
 
-    // Place and rates at beta, for a speed: those of the hyperbola, moved by the distance of the
-    // last nodes from it.
-    void predict(double beta, double speed, Vector& x, double& t, Vector& rates) {
-        Vector away(n_), second, third;
-        rates.resize(n_);
-        curve_.hyperbola(beta, away, rates);
+    // The node at beta before its first evaluation, and beta' there, with the kinetic energy (J):
+    // that of the hyperbola, moved by the distance of the last nodes from it.  The mass matrix is
+    // that of the evaluation made last.
+    Node predicted(double beta, double energy, double& speed) {
+        Vector away(n_), tangent(n_), second, third;
+        curve_.hyperbola(beta, away, tangent);
         std::vector<const Node*> known;
         for (std::size_t k = found_.size() < 2 ? 0 : found_.size() - 2; k < found_.size(); ++k) {
             const Node& node = found_[k].node;
@@ -361,13 +361,36 @@ private:
             }
             for (int j = 0; j < n_; ++j) {
                 away[j] += beta * beta * (second[j] + beta * third[j]);
-                rates[j] += beta * (2.0 * second[j] + 3.0 * beta * third[j]);
+                tangent[j] += beta * (2.0 * second[j] + 3.0 * beta * third[j]);
             }
         }
-        for (double& value : rates) value *= speed;
-        x = critical_.x;
-        t = critical_.t;
-        closures_.move(away.data(), x, t);
+        Node out;
+        out.beta = beta;
+        out.x = critical_.x;
+        out.time = critical_.t;
+        closures_.move(away.data(), out.x, out.time);
+        if (!driven_) out.inertia = inertia(tangent);
+        out.tangent = std::move(tangent);
+        speed = this->speed(out, energy);
+        set_rates(out, speed);
+        return out;
+    }
+
+    double inertia(const Vector& tangent) const {
+        Vector own(nv_), mass(nv_);
+        for (int j = 0; j < nv_; ++j) own[j] = tangent[j] * closures_.unit(j);
+        system_.mass_times(own.data(), mass.data());
+        return dot(own.data(), mass.data(), nv_);
+    }
+
+    static void set_rates(Node& node, double speed) {
+        node.rates = node.tangent;
+        for (double& value : node.rates) value *= speed;
+    }
+
+    // The node from an evaluation of `guess`, at its own time with drives, else at t.
+    Node again(const Node& guess, double t, bool closed) {
+        return evaluated(guess.x, driven_ ? guess.time : t, guess.beta, guess.rates, closed);
     }
 
     // Whether a node is on the curve and was evaluated with the rates of the speed, for the
@@ -387,55 +410,48 @@ private:
 
     void panel(double a, double b) {
         const Vector& x = collocation_.nodes;
-        const Found& last = found_.back();
-        const double rate = speed(last.node, last.energy), start = width_ * std::sinh(a);
-        Vector slope(count_), betas(count_), energy(count_), t(count_);
-        Vector energies(count_ + 1), times(count_ + 1), works(count_), durations(count_);
-        std::vector<Node> guesses(count_), nodes(count_);
+        const double start = width_ * std::sinh(a), power = found_.back().node.power;
+        Vector slope(count_), t(count_ + 1), energies(count_ + 1), times(count_ + 1);
+        Vector works(count_), durations(count_);
+        std::vector<Node> nodes(count_);
         for (int i = 0; i < count_; ++i) {
-            const double xi = a + (b - a) * x[i];
+            const double xi = a + (b - a) * x[i], beta = width_ * std::sinh(xi);
+            const double energy = energy_ + power * (beta - start);
+            if (!(energy > 0.0)) throw NoPassage{};
+            double rate;
+            nodes[i] = predicted(beta, energy, rate);
             slope[i] = width_ * std::cosh(xi) * (b - a);
-            betas[i] = width_ * std::sinh(xi);
-            energy[i] = energy_ + last.node.power * (betas[i] - start);
-            t[i] = clock_ + (betas[i] - start) / rate;
-            predict(betas[i], rate, guesses[i].x, guesses[i].time, guesses[i].rates);
+            durations[i] = slope[i] / rate;
         }
-        for (int sweep = 0; sweep < constants_.passage_sweeps; ++sweep) {
-            bool done = true;
-            for (int i = 0; i < count_; ++i) {
-                const Node& guess = guesses[i];
-                const double time = driven_ ? guess.time : t[i];
-                nodes[i] = evaluated(guess.x, time, betas[i], guess.rates, false);
-                works[i] = slope[i] * nodes[i].power;
-            }
+        integrate(durations, clock_, t);
+        for (int i = 0; i < count_; ++i) nodes[i] = again(nodes[i], t[i], false);
+        for (int sweep = 0;; ++sweep) {
+            if (sweep == constants_.passage_sweeps) throw NoPassage{};
+            for (int i = 0; i < count_; ++i) works[i] = slope[i] * nodes[i].power;
             integrate(works, energy_, energies);
-            double change = 0.0, most = 0.0;
-            for (double value : energies) {
+            for (double value : energies)
                 if (!(value > 0.0)) throw NoPassage{};
-                most = std::max(most, value);
-            }
             for (int i = 0; i < count_; ++i) {
-                const double rate_here = speed(nodes[i], energies[i]);
-                if (!(rate_here * slope[i] > 0.0)) throw NoPassage{};
-                durations[i] = slope[i] / rate_here;
-                done = done && solved(nodes[i], rate_here);
-                change = std::max(change, std::abs(energies[i] - energy[i]));
-                energy[i] = energies[i];
-                guesses[i].x = nodes[i].x;
-                guesses[i].time = nodes[i].time;
-                guesses[i].rates = nodes[i].tangent;
-                for (double& value : guesses[i].rates) value *= rate_here;
+                durations[i] = slope[i] / speed(nodes[i], energies[i]);
+                if (!(durations[i] > 0.0)) throw NoPassage{};
             }
             integrate(durations, clock_, times);
-            std::copy_n(times.begin(), count_, t.begin());
-            if (done && change <= constants_.passage_converged * rtol_ * most) break;
+            bool done = true;
+            for (int i = 0; i < count_; ++i) {
+                const double rate = slope[i] / durations[i];
+                if (solved(nodes[i], rate)) continue;
+                done = false;
+                set_rates(nodes[i], rate);
+                nodes[i] = again(nodes[i], times[i], false);
+            }
+            if (done) break;
         }
         const double begin = clock_, energy_before = energy_;
         energy_ = energies[count_];
         clock_ = times[count_];
         for (int i = 0; i < count_; ++i) {
-            const double time = driven_ ? nodes[i].time : t[i];
-            if (time < end_) found_.push_back({std::move(nodes[i]), energy[i], time});
+            const double time = driven_ ? nodes[i].time : times[i];
+            if (time < end_) found_.push_back({std::move(nodes[i]), energies[i], time});
         }
         if (!(clock_ >= end_)) return;
         // The end of the run or of its smooth interval lies in the panel.
@@ -458,17 +474,14 @@ private:
     // Goes on to beta, where the motion has the kinetic energy (J) at t; a residual that counts as
     // zero is closed again.
     void point(double beta, double energy, double t) {
-        Node guess, node;
-        predict(beta, speed(found_.back().node, found_.back().energy), guess.x, guess.time,
-                guess.rates);
-        for (int sweep = 0; sweep < constants_.passage_sweeps; ++sweep) {
-            node = evaluated(guess.x, driven_ ? guess.time : t, beta, guess.rates, true);
-            const double rate = speed(node, energy);
+        double rate;
+        Node node = predicted(beta, energy, rate);
+        for (int sweep = 0;; ++sweep) {
+            if (sweep == constants_.passage_sweeps) throw NoPassage{};
+            node = again(node, t, true);
+            rate = speed(node, energy);
             if (solved(node, rate)) break;
-            guess.x = node.x;
-            guess.time = node.time;
-            guess.rates = node.tangent;
-            for (double& value : guess.rates) value *= rate;
+            set_rates(node, rate);
         }
         found_.push_back({std::move(node), energy, t});
     }
@@ -491,7 +504,9 @@ private:
 
     Vector panel_edges(double reach, bool layer) const {
         const auto accurate = [&](double a, double b) {
-            return width_ * std::sinh(b) * interpolation_error(a, b, layer) <= rtol_;
+            const double error = interpolation_error(a, b, layer);
+            return error <= std::min(constants_.relative_panel_error,
+                                     constants_.panel_error * rtol_ / (width_ * std::sinh(b)));
         };
         const double within = 4.0 / 3.0 * constants_.layer, shortest = constants_.shortest_panel;
         double edge = reach;

@@ -69,7 +69,8 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
       examines_(options.examines),
       abscissae_(step.scheme.c),
       singular_tolerance_(options.singular_tolerance),
-      collocation_(options.collocation) {
+      collocation_(options.collocation),
+      one_freedom_(system.nv + (system.driven() ? 1 : 0) - system.structural_rank() == 1) {
     abscissae_.push_back(1.0);
     enter_interval();
 }
@@ -180,7 +181,8 @@ Stop Run::attempt(StepDecision& decision) {
     const double h = h_ = proposal.h;
     if (examines_) {
         const double zero = control->next_zero();
-        if (!known_ && zero > t_ && examine(zero)) return make_prepared();
+        const bool due = !known_ && zero > t_ && memory.sigma < examine_below_;
+        if (due && (one_freedom_ || !quiet_) && examine(zero)) return make_prepared();
     }
     const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
@@ -209,8 +211,12 @@ Stop Run::attempt(StepDecision& decision) {
         return stuck ? Stop::evaluation : Stop::chunk;
     }
     evaluation_failed = false;
+    quiet_ = result->quiet;
     // Where sigma rises, the next passage is another one.
-    if (result->sigmas.back() > result->sigmas.front()) known_ = false;
+    if (result->sigmas.back() > result->sigmas.front()) {
+        known_ = false;
+        examine_below_ = inf;
+    }
     if (leaves_closures_open(*result)) return Stop::closures;
     if (result->in_zone)
         records.zones.push_back({records.count(), result->zone_threshold, *memory.history});
@@ -232,6 +238,7 @@ std::optional<double> Run::crossing(const StepResult& r) const {
 // are not to make it; whether there are any.
 bool Run::examine(double zero) {
     const double rtol = step.norm.rtol;
+    examine_below_ = constants().examined_again * memory.sigma;
     UnitClosures closures(system, zero - t_);
     const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), zero,
                                               constants());
@@ -294,7 +301,8 @@ Stop Run::make_prepared() {
     h_ = step.result.h;
     record(step.result, t, critical);
     if (prepared_.empty()) {
-        known_ = false;
+        known_ = quiet_ = false;
+        examine_below_ = inf;
         control->moved(t_);
     }
     return t_ < t_end() ? Stop::chunk : Stop::finished;

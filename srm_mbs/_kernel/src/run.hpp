@@ -1,6 +1,7 @@
 // The driver: propose a step, make it, decide on it, record it; in chunks.  See driver.py.
 #pragma once
 
+#include <limits>
 #include <memory>
 #include <optional>
 #include <string>
@@ -179,7 +180,11 @@ private:
     std::vector<double> abscissae_;
     double singular_tolerance_;
     Collocation collocation_;
-    bool known_ = false;  // the passage ahead has been examined
+    const bool one_freedom_;  // the closed configurations are curves, which may be followed
+    bool known_ = false;      // the passage ahead has been examined
+    bool quiet_ = false;      // the last step was
+    // sigma below which the motion is examined again, where no passage was found so far.
+    double examine_below_ = std::numeric_limits<double>::infinity();
     // Steps along a curve that are still to be made, the next one last, and their ends.
     std::vector<std::pair<StepResult, double>> prepared_;
 };

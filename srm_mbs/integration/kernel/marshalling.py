@@ -120,12 +120,15 @@ def constants() -> Any:
         critical_reach=critical_passages.SEARCH,
         critical_passed=critical_passages.PASSED,
         rounded_residual=critical_passages.ROUNDED_RESIDUAL,
+        examined_again=critical_passages.EXAMINED_AGAIN,
         disturbing=critical_passages.DISTURBING,
         dependent_row=critical_passages.DEPENDENT,
         definite=critical.DEFINITE,
         largest_deviation=critical.LARGEST_DEVIATION,
         layer=critical_passages.LAYER,
         shortest_panel=critical_passages.SHORTEST_PANEL,
+        panel_error=critical_passages.PANEL_ERROR,
+        relative_panel_error=critical_passages.RELATIVE_PANEL_ERROR,
         panel_shrinkage=critical_passages.SHRINKAGE,
         curvature=critical_passages.CURVATURE,
         passage_sweeps=critical_passages.SWEEPS,
@@ -325,6 +328,7 @@ def steps_struct(steps: StepData) -> Any:
         break_rates=steps.break_rates.reshape(len(steps.breaks), len(steps.end_rate)),
         breaks=steps.breaks.tolist(),
         zones=steps.between_nodes,
+        layers=steps.layers,
         end=steps.end,
     )
 

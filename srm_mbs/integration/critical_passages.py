@@ -17,7 +17,7 @@ itself.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -41,24 +41,46 @@ SEARCH = 0.3
 configuration is looked for."""
 PASSED = 0.5
 """Distance of the predicted passage from the critical configuration, over that of the start of the
-step, below which the step passes it."""
+step, below which the step passes it.  In a wide layer the curve itself tells."""
+EXAMINED_AGAIN = 0.7
+"""Fall of sigma after which a motion that passes no critical configuration so far is examined
+again."""
 ROUNDED_RESIDUAL = 1e-13
 """Residual (row units) below which the configuration is singular to rounding."""
 DISTURBING = 1e-3
 """Residual that counts as zero, over rtol, up to which steps pass as if it were."""
 LARGEST = 64
 """Coordinates of a mechanism whose passages are examined, at most: the search is dense algebra."""
-LAYER = 2.0
-"""|xi| up to which the motion changes on the scale of the layer, which dense output resolves."""
-OUTER_PANEL = 1.0
-"""Largest length of a panel of collocation nodes in xi, outside the layer."""
-SHORTEST_PANEL = 0.2
-"""Shortest length of a panel in the layer."""
+LAYER = 1.5
+"""|xi| up to which the panel in the middle reaches; a third more instead of a short panel more."""
+SHORTEST_PANEL = 0.1
+"""Length of a panel in xi, at least."""
+PANEL_ERROR = 10.0
+"""Largest error of interpolation on a panel (units), over rtol.  Gauss quadrature, which leads from
+panel to panel, is far more accurate."""
+RELATIVE_PANEL_ERROR = 0.01
+"""Largest one over the size of the panel: dense output shows layers that are far below rtol."""
+SHRINKAGE = 0.8
+"""Ratio of the lengths that are tried."""
+BISECTIONS = 50
+DEPENDENT = 1e-10
+"""Part of a row without those of others below which it depends on them."""
+LAYER_SINGULARITY = 0.25j * np.pi
+"""Where, in the complex plane of xi, the inertia along a typical hyperbola vanishes."""
+CURVATURE = 2.0
+"""Distance (units) at which closures leave their tangents, about: the singularity of the curve in
+the complex plane of beta."""
 SWEEPS = 12
-CONVERGED = 1e-14
-"""Relative change of energies and times in a sweep at which the collocation is solved."""
-ROUNDED = 1e-11
-"""That from which rounding may end it."""
+CONVERGED = 0.01
+"""Last relative change of places and energies in a sweep at which the collocation is solved, over
+rtol."""
+TURNED = 1.0
+"""Largest relative change of the rates in that sweep, over rtol."""
+PLACE_ROUNDING = 1e-15
+"""Rounding (units^2) of a place on the curve, times its distance from the critical configuration."""
+EXTRAPOLATED = 1e-4
+"""|beta| (units) from which the distance of the curve from its hyperbola is known beyond
+rounding."""
 
 
 @lru_cache(maxsize=16)
@@ -73,43 +95,115 @@ def gauss_nodes(count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     return x, w, 0.5 * legendre.legval(y, integral.T).T @ basis
 
 
-def panel_edges(reach: float, inner: float) -> FloatArray:
-    """Edges of the panels on [-reach, reach] in xi: of the length ``inner`` in the layer, where
-    |xi| < LAYER, of OUTER_PANEL elsewhere.
+def node_count(rtol: float) -> int:
+    """Collocation nodes of a panel, an even number."""
+    return 2 * int(np.ceil(0.5 - 0.3 * np.log10(rtol)))
+
+
+def interpolation_error(a: float, b: float, nodes: int, width: float, layer: bool) -> float:
+    """Relative error of polynomials through ``nodes`` Gauss nodes on the panel [a, b] of xi.
+
+    It falls with the ellipse around the panel through the next singularity: that of the layer, if
+    there is a ``layer``, and that of the curve, at beta = +-i CURVATURE.
+    """
+    middle, half = 0.5 * (a + b), 0.5 * (b - a)
+    of_curve = complex(np.arcsinh(1j * CURVATURE / width))
+    places = [of_curve.real + 0.5j * np.pi, -of_curve.real + 0.5j * np.pi]
+    if layer:
+        places.append(LAYER_SINGULARITY)
+    error = 0.0
+    for place in places:
+        z = (place - middle) / half
+        root = np.sqrt(z * z - 1.0)
+        error = max(error, float(max(abs(z + root), abs(z - root))) ** -nodes)
+    return error
+
+
+def panel_edges(
+    reach: float, nodes: int, width: float, layer: bool, tolerance: float
+) -> list[float]:
+    """Edges of the panels on [-reach, reach] in xi, symmetric, on which polynomials through
+    ``nodes`` Gauss nodes are accurate to ``tolerance`` (units).
 
     Their number is odd, and the number of nodes even: none lies at 0, which may be singular.
     """
-    layer = min(reach, LAYER)
-    half = max(1, int(np.ceil(layer / inner - 0.5)))
-    within = np.linspace(-layer, layer, 2 * half + 2)
-    outer = np.linspace(layer, reach, 1 + int(np.ceil((reach - layer) / OUTER_PANEL)))[1:]
-    return np.concatenate([-outer[::-1], within, outer])
+
+    def accurate(a: float, b: float) -> bool:
+        error = interpolation_error(a, b, nodes, width, layer)
+        return error <= min(RELATIVE_PANEL_ERROR, tolerance / (width * float(np.sinh(b))))
+
+    edge, out = reach, [reach]
+    while edge > SHORTEST_PANEL and not (edge <= 4.0 / 3.0 * LAYER and accurate(-edge, edge)):
+        length = edge - LAYER if edge > 4.0 / 3.0 * LAYER else 0.5 * edge
+        while length > SHORTEST_PANEL and not accurate(edge - length, edge):
+            length *= SHRINKAGE
+        edge -= length
+        out.append(edge)
+    return [-x for x in out] + out[::-1]
+
+
+def interpolated(x: FloatArray, values: FloatArray, at: float) -> float:
+    """The polynomial through ``values`` (k,) at x (k,), at a point between."""
+    off = at - x
+    if not off.all():
+        return float(values[int(np.argmin(np.abs(off)))])
+    weights = np.array([1.0 / np.prod(np.delete(a - x, i)) for i, a in enumerate(x)]) / off
+    return float(weights @ values / weights.sum())
+
+
+def bisected(x: FloatArray, values: FloatArray, value: float) -> float:
+    """Where the polynomial through increasing ``values`` (k,) at x (k,) has the ``value``."""
+    low, high = float(x[0]), float(x[-1])
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if interpolated(x, values, middle) < value:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
-    """A configuration of the curve.
+class Node:
+    """A point of the motion along a curve, as its last evaluation left it.
 
     Attributes
     ----------
-    place, beta
-        The configuration, and where on the curve it is.
-    tangent, bend : (n,)
-        Its first and second derivative by beta, in units.
-    inertia
-        m.
+    place
+        The configuration, as the geometry takes it.
+    beta
+        Where it is on the curve.
+    tangent : (n,)
+        Its derivative by beta, in units.
+    rates : (n,)
+        That by time.
+    off
+        Newton step (units) that led there.
+    inertia, power
+        m, and the work of the forces per beta.
+    acceleration : (nv,)
+        Of the motion.
+    sigma
+        That of the closures.
     """
 
     place: FloatArray
     beta: float
     tangent: FloatArray
-    bend: FloatArray
+    rates: FloatArray
+    off: float
     inertia: float
+    power: float
+    acceleration: FloatArray
+    sigma: float
 
 
 @dataclass(eq=False)
 class PassageAlongCurve:
     """The motion past a critical configuration, along the curve of closed configurations.
+
+    Each sweep over a panel evaluates the equations of motion once at each of its nodes, and moves
+    places, energies and times there.
 
     Parameters
     ----------
@@ -119,15 +213,17 @@ class PassageAlongCurve:
         The critical configuration next to the motion.
     t, state
         Start (s), and the state (nq + nv,) there, moving towards the critical configuration.
+    end
+        Time (s) at which the passage ends at the latest.
     exact
         Whether the residual counts as zero, so that the motion goes straight on.
-    panel, nodes
-        Length in xi of a panel in the layer, and collocation nodes of a panel, an even number.
+    rtol
+        Relative tolerance of the run.
 
     Attributes
     ----------
-    times : (k,) s, states : (k, nq + nv), rates : (k, 2 nv)
-        The motion at the nodes: states and tangent rates.
+    times : (k,) s, states : (k, nq + nv), rates : (k, 2 nv), sigmas : (k,)
+        The motion at the nodes: states, tangent rates and sigma.
 
     Raises
     ------
@@ -140,131 +236,212 @@ class PassageAlongCurve:
     critical: CriticalConfiguration
     t: float
     state: FloatArray
+    end: float
     exact: bool
-    panel: float
-    nodes: int
+    rtol: float
     times: FloatArray = field(init=False)
     states: FloatArray = field(init=False)
     rates: FloatArray = field(init=False)
+    sigmas: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         geometry = self.critical.geometry
         q, v = self.system.split(self.state)
         self._nv = len(v)
         self._driven = len(geometry.unit) > self._nv
-        self._curve = CurveThroughSaddle(self.critical, geometry.at(q, self.t), self.exact)
-        start = self._curve.beta
-        u = geometry.rates(v)
-        here = self._point(start)
-        if not float(u @ here.tangent) * start < 0.0:
+        place = geometry.at(q, self.t)
+        curve = self._curve = CurveThroughSaddle(self.critical, place, self.exact)
+        rates = geometry.rates(v)
+        here = self._evaluated(place, curve.beta, rates, self.t, closed=True)
+        if not float(rates @ here.tangent) * curve.beta < 0.0:
             raise ValueError("the motion leads away from the critical configuration")
-        self._heading = -float(np.sign(start))
-        self._width = self._curve.width or abs(start)
-        geometry.closure(here.place)
-        M, own = geometry.mass(), u[: self._nv]
-        self._energy, self._t = 0.5 * float(own @ M @ own), self.t
-        reach = float(np.arcsinh(abs(start) / self._width))
-        edges = self._edges = self._heading * panel_edges(reach, self.panel)
-        found = [(here, self._energy, self.t)]
-        for a, b in pairwise(edges.tolist()):
-            found += self._panel(a, b)
-        # A residual that counts as zero is closed again where it leaves.
-        point, energy, t = found[-1]
-        found[-1] = self._point(point.beta, closed=True), energy, t
-        self.times = np.array([t for *_, t in found])
-        self._energies = np.array([energy for _, energy, _ in found])
-        motion = [self._motion(*one) for one in found]
+        self._heading = -float(np.sign(curve.beta))
+        self._width = curve.width or abs(curve.beta)
+        self._energy = 0.5 * here.inertia * float(curve.along @ rates) ** 2
+        self._clock, self._found = self.t, [(here, self._energy, self.t)]
+        self._count = node_count(self.rtol)
+        reach = float(np.arcsinh(abs(curve.beta) / self._width))
+        allowed = PANEL_ERROR * self.rtol
+        edges = panel_edges(reach, self._count, self._width, not self.exact, allowed)
+        for a, b in pairwise(self._heading * x for x in edges):
+            if self._clock < self.end:
+                self._panel(a, b)
+        if self._clock < self.end:
+            self._point(-curve.beta, self._energy, self._clock)
+            if self._driven:
+                node, energy, _ = self._found.pop()
+                self._found.append((node, energy, float(node.place[-1])))
+        self.times = np.array([t for *_, t in self._found])
+        self.sigmas = np.array([node.sigma for node, *_ in self._found])
+        motion = [self._motion(*one) for one in self._found]
         self.states = np.array([state for state, _ in motion])
         self.rates = np.array([rate for _, rate in motion])
         self.states[0] = self.state
 
-    def _point(self, beta: float, closed: bool = False) -> _Point:
-        geometry, nv = self.critical.geometry, self._nv
-        place, tangent, bend = self._curve.at(beta, closed)
-        geometry.closure(place)
-        own = tangent[:nv]
-        return _Point(place, beta, tangent, bend, float(own @ geometry.mass() @ own))
+    def _predicted(
+        self, beta: float, energy: float, mass: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Place, rates (n,) and beta' at ``beta``, with the kinetic ``energy`` (J) and the ``mass``
+        matrix (nv, nv): those of the hyperbola, moved by the distance of the last nodes from it."""
+        geometry = self.critical.geometry
+        away, tangent = self._curve.hyperbola(beta)
+        known = [
+            (node.beta, self._off_hyperbola(node))
+            for node, *_ in self._found[-2:]
+            if node.beta * beta > EXTRAPOLATED * abs(beta)
+        ]
+        if len(known) == 2:
+            (a, at_a), (b, at_b) = known
+            third = (at_b / b**2 - at_a / a**2) / (b - a)
+            second = at_b / b**2 - third * b
+            away = away + beta**2 * (second + beta * third)
+            tangent = tangent + beta * (2.0 * second + 3.0 * beta * third)
+        elif known:
+            b, at_b = known[0]
+            away, tangent = away + (beta / b) ** 2 * at_b, tangent + 2.0 * beta / b**2 * at_b
+        if self._driven:
+            speed = float(1.0 / (tangent[-1] * geometry.unit[-1]))
+        else:
+            inertia = tangent @ mass @ tangent
+            speed = self._heading * float(np.sqrt(2.0 * energy / inertia))
+        return geometry.move(self.critical.q, away), speed * tangent, speed
 
-    def _speed(self, point: _Point, energy: float) -> float:
+    def _off_hyperbola(self, node: Node) -> FloatArray:
+        away = self.critical.geometry.difference(self.critical.q, node.place)
+        return away - self._curve.hyperbola(node.beta)[0]
+
+    def _evaluated(
+        self, place: FloatArray, beta: float, rates: FloatArray, t: float, closed: bool = False
+    ) -> Node:
+        """The node next to ``place``, from one evaluation there with the ``rates`` (n,), in
+        units."""
+        system, geometry, nv = self.system, self.critical.geometry, self._nv
+        unit = geometry.coordinate_unit
+        q, v = place[:-1] if self._driven else place, rates[:nv] * unit
+        if self._driven:
+            t = float(place[-1])
+        sigma = system.evaluate(t, np.concatenate([q, v])).sigma
+        force = system.working_force(t, q, v) * unit
+        inertial = system.inertial_force(q, v) * unit
+        step, tangent, matrix = self._curve.linearised(place, beta, closed)
+        tangent = tangent / self._growth(place, tangent)
+        M, own = geometry.mass(), tangent[:nv]
+        turned = self._curve.bend(place, rates, matrix)
+        inertia = float(own @ M @ own)
+        if self._driven:
+            along = -turned[-1] / tangent[-1]
+        else:
+            along = float(own @ (force + inertial - M @ turned[:nv])) / inertia
+        return Node(
+            place=geometry.move(place, step),
+            beta=beta,
+            tangent=tangent,
+            rates=rates,
+            off=float(np.abs(step).max()),
+            inertia=inertia,
+            power=0.0 if self._driven else float(own @ force),
+            acceleration=(own * along + turned[:nv]) * unit,
+            sigma=sigma,
+        )
+
+    def _growth(self, place: FloatArray, tangent: FloatArray) -> float:
+        """Derivative of beta along ``tangent`` (n,), of which the part along is 1."""
+        system, geometry, nv = self.system, self.critical.geometry, self._nv
+        if geometry.commutes:
+            return 1.0
+        unit, none = geometry.coordinate_unit, np.zeros(nv)
+        away = geometry.difference(self.critical.q, place)
+        delta, rate = (np.concatenate([x[:nv] * unit, none]) for x in (away, tangent))
+        charted = system.chart_rate(delta, rate)[:nv] / unit
+        return float(self._curve.along @ np.concatenate([charted, tangent[nv:]]))
+
+    def _speed(self, node: Node, energy: float) -> float:
         """beta' of a motion with the kinetic ``energy`` (J), or with drives that of their time."""
         if self._driven:
-            return float(1.0 / (point.tangent[-1] * self.critical.geometry.unit[-1]))
-        return float(self._heading * np.sqrt(2.0 * energy / point.inertia))
+            return float(1.0 / (node.tangent[-1] * self.critical.geometry.unit[-1]))
+        return float(self._heading * np.sqrt(2.0 * energy / node.inertia))
 
-    def _state_at(self, point: _Point, energy: float) -> tuple[FloatArray, FloatArray]:
-        """q (nq,) and v (nv,) at a point."""
-        q = point.place[:-1] if self._driven else point.place
-        unit = self.critical.geometry.coordinate_unit
-        return q, self._speed(point, energy) * point.tangent[: self._nv] * unit
+    def _motion(self, node: Node, energy: float, t: float) -> tuple[FloatArray, FloatArray]:
+        """State and tangent rate at a node."""
+        q = node.place[:-1] if self._driven else node.place
+        rates = self._speed(node, energy) * node.tangent[: self._nv]
+        v = rates * self.critical.geometry.coordinate_unit
+        return np.concatenate([q, v]), np.concatenate([v, node.acceleration])
 
-    def _motion(self, point: _Point, energy: float, t: float) -> tuple[FloatArray, FloatArray]:
-        """State and tangent rate at a point."""
-        geometry, nv = self.critical.geometry, self._nv
-        unit, speed = geometry.coordinate_unit, self._speed(point, energy)
-        q, v = self._state_at(point, energy)
-        tangent, turned = point.tangent[:nv], point.bend[:nv] * speed**2
-        if self._driven:
-            along = -point.bend[-1] * speed**2 / point.tangent[-1]
-        else:
-            force = self.system.working_force(t, q, v) + self.system.inertial_force(q, v)
-            geometry.closure(point.place)
-            along = float(tangent @ (force * unit - geometry.mass() @ turned)) / point.inertia
-        acceleration = (tangent * along + turned) * unit
-        return np.concatenate([q, v]), np.concatenate([v, acceleration])
+    def _solved(self, node: Node, speed: float) -> bool:
+        """Whether ``node`` is on the curve and was evaluated with the rates of the ``speed``, for
+        the tolerance or to rounding."""
+        distance = float(np.hypot(node.beta, self._curve.width))
+        rounding = PLACE_ROUNDING / distance
+        rates = speed * node.tangent
+        turned = float(np.abs(rates - node.rates).max() / np.abs(rates).max())
+        return (
+            node.off <= CONVERGED * self.rtol * distance + rounding
+            and turned <= TURNED * self.rtol + rounding / distance
+        )
 
-    def _power(self, point: _Point, t: float, energy: float) -> float:
-        """q' . f at a point: the work per beta; with drives, which prescribe the motion, 0."""
-        if self._driven:
-            return 0.0
-        force = self.system.working_force(t, *self._state_at(point, energy))
-        return float((point.tangent * self.critical.geometry.coordinate_unit) @ force)
-
-    def _panel(self, a: float, b: float) -> list[tuple[_Point, float, float]]:
-        """Points, energies and times at the nodes of the panel [a, b] of xi, and at its end."""
-        x, w, integrals = gauss_nodes(self.nodes)
-        xi = a + (b - a) * np.append(x, 1.0)
-        weights = np.vstack([integrals, w])
-        points = [self._point(float(beta)) for beta in self._width * np.sinh(xi)]
-        inner, slope = points[:-1], self._width * np.cosh(xi[:-1]) * (b - a)
-        energy, t = np.full(len(x), self._energy), np.full(len(x), self._t)
-        last = np.inf
+    def _panel(self, a: float, b: float) -> None:
+        """Go on along the panel [a, b] of xi."""
+        x, w, integrals = gauss_nodes(self._count)
+        xi = a + (b - a) * x
+        weights, slope = np.vstack([integrals, w]), self._width * np.cosh(xi) * (b - a)
+        start, betas = self._width * np.sinh(a), self._width * np.sinh(xi)
+        energy = self._energy + self._found[-1][0].power * (betas - start)
+        if not (energy > 0.0).all():
+            raise ValueError("the energy does not suffice to pass")
+        # Of the evaluation made last.
+        mass = self.critical.geometry.mass()
+        predicted = [self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())]
+        places, rates = [one[0] for one in predicted], [one[1] for one in predicted]
+        t = self._clock + integrals @ (slope / np.array([one[2] for one in predicted]))
+        nodes = [self._evaluated(*one) for one in zip(places, betas.tolist(), rates, t.tolist())]
         for _ in range(SWEEPS):
-            work = slope * [self._power(*one) for one in zip(inner, t.tolist(), energy.tolist())]
-            energies = self._energy + weights @ work
+            energies = self._energy + weights @ (slope * [node.power for node in nodes])
             if not (energies > 0.0).all():
                 raise ValueError("the energy does not suffice to pass")
-            speeds = np.array([self._speed(*one) for one in zip(inner, energies.tolist())])
+            speeds = [self._speed(*one) for one in zip(nodes, energies.tolist())]
             if not (speeds * slope > 0.0).all():
                 raise ValueError("the drives lead where the mechanism cannot follow")
-            times = self._t + weights @ (slope / speeds)
-            change = float(
-                np.abs(energies[:-1] - energy).max() / energies.max()
-                + np.abs(times[:-1] - t).max() / (times[-1] - self._t)
-            )
-            energy, t = energies[:-1], times[:-1]
-            if change < CONVERGED or (change < ROUNDED and not change < last):
+            times = self._clock + weights @ (slope / speeds)
+            left = [i for i, node in enumerate(nodes) if not self._solved(node, speeds[i])]
+            if not left:
                 break
-            last = change
-        self._energy, self._t = float(energies[-1]), float(times[-1])
-        return list(zip(points, energies.tolist(), times.tolist()))
+            for i in left:
+                here = nodes[i]
+                nodes[i] = self._evaluated(
+                    here.place, here.beta, speeds[i] * here.tangent, float(times[i])
+                )
+        else:
+            raise ValueError("the collocation does not converge")
+        energy, t = energies[:-1], times[:-1]
+        begin, energy_at_begin = self._clock, self._energy
+        self._energy, self._clock = float(energies[-1]), float(times[-1])
+        if self._driven:  # known without any integral
+            t = np.array([node.place[-1] for node in nodes])
+        new = list(zip(nodes, energy.tolist(), t.tolist()))
+        self._found += [one for one in new if one[-1] < self.end]
+        if self._clock >= self.end:
+            # The end of the run or of its smooth interval lies in the panel.
+            own = np.concatenate([[0.0], x, [1.0]])
+            clock = np.concatenate([[begin], times])
+            at = bisected(own, clock, self.end)
+            between = interpolated(own, np.concatenate([[energy_at_begin], energies]), at)
+            self._point(self._width * float(np.sinh(a + (b - a) * at)), between, self.end)
 
-    def at_time(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """State (nq + nv,) and tangent rate (2 nv,) at the time t (s) of the passage."""
-        from scipy.interpolate import BarycentricInterpolator
-        from scipy.optimize import brentq
-
-        count = self.nodes + 1
-        k = int(np.searchsorted(self.times, t, side="right")) - 1
-        panel = min(k, len(self.times) - 2) // count
-        own = slice(panel * count, (panel + 1) * count + 1)
-        x = np.concatenate([[0.0], gauss_nodes(self.nodes)[0], [1.0]])
-        begin = self.times[own.start]
-        clock = BarycentricInterpolator(x, self.times[own] - begin)
-        place = brentq(lambda s: float(clock(s)) - (t - begin), 0.0, 1.0, xtol=1e-15)
-        a, b = self._edges[panel : panel + 2]
-        energy = float(BarycentricInterpolator(x, self._energies[own])(place))
-        point = self._point(self._width * float(np.sinh(a + (b - a) * place)))
-        return self._motion(point, energy, t)
+    def _point(self, beta: float, energy: float, t: float) -> None:
+        """Go on to ``beta``, where the motion has the kinetic ``energy`` (J) at ``t`` (s); a
+        residual that counts as zero is closed again."""
+        mass = self.critical.geometry.mass()
+        place, rates, _ = self._predicted(beta, energy, mass)
+        for _ in range(SWEEPS):
+            node = self._evaluated(place, beta, rates, t, closed=True)
+            speed = self._speed(node, energy)
+            if self._solved(node, speed):
+                break
+            place, rates = node.place, speed * node.tangent
+        else:
+            raise ValueError("the end of the curve does not converge")
+        self._found.append((node, energy, t))
 
 
 @dataclass(frozen=True)
@@ -327,8 +504,15 @@ class CriticalPassages:
     ) -> None:
         self._system, self._scheme, self._norm = system, scheme, norm
         self._tolerance = tolerance
-        self._known = False
+        self._known = self._quiet = False
+        self._sigma = self._examine_below = np.inf
         self.examined: list[ExaminedPassage] = []
+
+    @cached_property
+    def _one_freedom(self) -> bool:
+        """Whether the closed configurations are curves, which may be followed."""
+        analysis = self._system.singularities
+        return len(analysis.geometry(analysis.q0).unit) - analysis.rank == 1
 
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
@@ -344,12 +528,15 @@ class CriticalPassages:
 
     def unexamined(self, zero: float | None, t: float) -> float | None:
         """The ``zero`` (s) of sigma that is expected after ``t`` (s), unless it was examined."""
-        return None if self._known or zero is None or not zero > t else zero
+        if self._known or zero is None or not zero > t or not self._sigma < self._examine_below:
+            return None
+        return None if self._quiet and not self._one_freedom else zero
 
     def accepted(self, result: StepResult) -> None:
         """A step was accepted: where sigma rises, the next passage is another one."""
+        self._quiet, self._sigma = result.quiet, float(result.sigmas[-1])
         if result.sigmas[-1] > result.sigmas[0]:
-            self._known = False
+            self._known, self._examine_below = False, np.inf
 
     def steps_past(
         self, t: float, state: FloatArray, rate: FloatArray, zero: float, end: float
@@ -376,6 +563,7 @@ class CriticalPassages:
         move = np.zeros(2 * nv)
         move[:nv] = ahead * (rate[:nv] + 0.5 * ahead * rate[nv:])
         q = analysis.split(system.retract(state, move))[0]
+        self._examine_below = EXAMINED_AGAIN * self._sigma
         geometry = analysis.geometry(analysis.q0, t)
         place = geometry.at(q, zero)
         critical = critical_configuration(geometry, analysis.rank, place, SEARCH)
@@ -383,37 +571,32 @@ class CriticalPassages:
             return []
         begin = geometry.at(analysis.split(state)[0], t)
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
-        if not np.linalg.norm(left) < PASSED * np.linalg.norm(covered):
-            return []
-        self._known = True
+        self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))
         if abs(critical.residual) <= ROUNDED_RESIDUAL:
             return []
         residual = critical.residual
         avoided = abs(residual) > self._tolerance
         steps: list[tuple[StepResult, float]] = []
         if avoided or abs(residual) > DISTURBING * self._norm.rtol:
-            panel = max(SHORTEST_PANEL, (1e4 * self._norm.rtol) ** 0.1)
-            nodes = 2 * int(np.ceil(0.5 - 0.3 * np.log10(self._norm.rtol)))
             try:
-                passage = PassageAlongCurve(system, critical, t, state, not avoided, panel, nodes)
-                steps = self._steps(passage, end)
+                passage = PassageAlongCurve(
+                    system, critical, t, state, end, not avoided, self._norm.rtol
+                )
+                steps = self._steps(passage)
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
                 pass  # steps pass it as well as they can, and the message says so
-        self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
+        if self._known or steps:
+            self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
+        if steps:
+            self._known, self._quiet, self._examine_below = False, False, np.inf
+            self._sigma = float(steps[-1][0].sigmas[-1])
         return steps
 
-    def _steps(self, passage: PassageAlongCurve, end: float) -> list[tuple[StepResult, float]]:
-        """The ``passage`` as steps from node to node, up to ``end`` (s)."""
-        inside = passage.times < end
-        times, states, rates = passage.times[inside], passage.states[inside], passage.rates[inside]
-        if not inside.all():
-            state, rate = passage.at_time(end)
-            times = np.append(times, end)
-            states, rates = np.vstack([states, state]), np.vstack([rates, rate])
-        system = self._system
-        sigmas = [system.evaluate(t, x).sigma for t, x in zip(times.tolist(), states)]
+    def _steps(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:
+        """The ``passage`` as steps from node to node."""
+        times, states, rates = passage.times, passage.states, passage.rates
         return [
-            (self._step(times, states, rates, sigmas, i), float(times[i + 1]))
+            (self._step(times, states, rates, passage.sigmas, i), float(times[i + 1]))
             for i in range(len(times) - 1)
         ]
 
@@ -422,7 +605,7 @@ class CriticalPassages:
         times: FloatArray,
         states: FloatArray,
         rates: FloatArray,
-        sigmas: list[float],
+        sigmas: FloatArray,
         i: int,
     ) -> StepResult:
         system, scheme = self._system, self._scheme

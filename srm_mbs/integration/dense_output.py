@@ -102,7 +102,9 @@ class HermiteStep:
     """The interpolant of one step.
 
     Degree 11 where degree 15 confirms it better than it confirms degree 7: between steps of very
-    different lengths a higher degree is not better.
+    different lengths a higher degree is not better.  Past a critical configuration the motion is
+    that of a hyperbola, smooth in asinh((t - t_c) / tau), with the time tau (s) of its layer around
+    t_c; polynomials in that variable are taken where they are confirmed better.
 
     Parameters
     ----------
@@ -121,10 +123,25 @@ class HermiteStep:
         self._interval = steps.smooth_interval(step)
         self._start = steps.states[step]
         self._h = steps.times[step + 1] - steps.times[step]
-        polynomials = [self._through(count) for count in HERMITE_NODES]
-        values = [polynomial(COMPARED_AT) for polynomial in polynomials]
-        changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
-        self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
+        best = np.inf
+        layer = steps.layers[step]
+        for self._layer in (None, layer) if layer[1] > 0.0 else (None,):
+            polynomials = [self._through(count) for count in HERMITE_NODES]
+            values = [polynomial(self._variable(COMPARED_AT)[0]) for polynomial in polynomials]
+            changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
+            if min(changes) < best:
+                best, chosen = min(changes), self._layer
+                self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
+        self._layer = chosen
+
+    def _variable(self, theta: Any) -> tuple[Any, Any]:
+        """The variable of the polynomial at the fractions ``theta`` of the step, and its derivative
+        by the time in steps."""
+        if self._layer is None:
+            return theta, np.ones_like(theta)
+        centre, width = self._layer
+        beside = (self._steps.times[self._step] - centre + theta * self._h) / width
+        return np.arcsinh(beside), self._h / width / np.hypot(1.0, beside)
 
     def _nodes(self, count: int) -> list[int]:
         """Indices of up to ``count`` ends of steps around the step, none too close together."""
@@ -172,13 +189,14 @@ class HermiteStep:
         for i in self._nodes(count):
             delta = self._system.difference(self._start, steps.states[i], self._moved(i))
             rate = steps.rate_at(i, last)
-            points += 2 * [(steps.times[i] - t0) / self._h]
-            values += [delta, self._h * self._system.chart_rate(delta, rate)]
+            at, growth = self._variable((steps.times[i] - t0) / self._h)
+            points += 2 * [float(at)]
+            values += [delta, self._h / growth * self._system.chart_rate(delta, rate)]
         return KroghInterpolator(np.array(points), np.array(values))  # type: ignore[no-any-return]
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """States (k, nx) at the fractions ``theta`` (k,) of the step."""
-        deltas = self._polynomial(theta)
+        deltas = self._polynomial(self._variable(theta)[0])
         return np.array([self._system.retract(self._start, delta) for delta in deltas])
 
 
@@ -255,6 +273,30 @@ class StepData:
         with a stage in the zone, and those past a critical configuration."""
         critical = np.flatnonzero(self.placements == CRITICAL).tolist()
         return sorted({*self.zones, *critical})
+
+    @cached_property
+    def layers(self) -> FloatArray:
+        """Time and width (s) of the layer that a step belongs to (n, 2); width 0 without one.
+
+        Past a critical configuration sigma^2 is a parabola; it leads through the lowest ends of the
+        steps there.
+        """
+        out = np.zeros((self.count, 2))
+        marked = (self.placements == CRITICAL).astype(int)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], marked, [0]])))
+        for first, last in zip(edges[::2].tolist(), edges[1::2].tolist()):
+            sigmas = np.append(self.sigmas[first:last, 0], self.sigmas[last - 1, -1])
+            k = int(np.argmin(sigmas))
+            if not 0 < k < last - first:
+                continue
+            t, f = self.times[first + k - 1 : first + k + 2], sigmas[k - 1 : k + 2] ** 2
+            slopes = np.diff(f) / np.diff(t)
+            bend = (slopes[1] - slopes[0]) / (t[2] - t[0])
+            centre = 0.5 * (t[0] + t[1] - slopes[0] / bend)
+            square = f[1] / bend - (t[1] - centre) ** 2
+            if square > (NODE_SPACING * (t[2] - t[0])) ** 2:
+                out[first:last] = centre, np.sqrt(square)
+        return out
 
     def smooth_interval(self, step: int) -> tuple[int, int]:
         """First and last end of a step, as indices into ``times``, of the smooth interval around

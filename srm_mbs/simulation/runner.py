@@ -521,7 +521,7 @@ def _compiled_run(
         max_step=options.longest_step,
         placed=options.placement,
         arrivals=handler.arrivals,
-        examines=problem.passages is not None,
+        singular_tolerance=None if problem.passages is None else options.singular_tolerance,
     )
 
 

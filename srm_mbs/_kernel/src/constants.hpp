@@ -83,6 +83,23 @@ namespace srm {
     field(double, critical_reach)          /* of the search (units) */                             \
     field(double, critical_passed)         /* distance that is a passage, over that of the start */ \
     field(double, rounded_residual)        /* that of a singular configuration (row units) */      \
+    field(double, examined_again)          /* fall of sigma after a search without a passage */    \
+    field(double, disturbing)              /* one that counts as zero and disturbs, over rtol */   \
+    field(double, dependent_row)           /* remainder of a row that depends on others */         \
+    field(double, definite)                /* ratio of the curvatures of a saddle, at least */     \
+    field(double, largest_deviation)       /* from the hyperbola, over the distance */             \
+    field(double, layer)                   /* |xi| of the panel in the middle */                   \
+    field(double, shortest_panel)          /* in xi */                                             \
+    field(double, panel_error)             /* of interpolation (units), over rtol */               \
+    field(double, relative_panel_error)    /* of interpolation, over the size of the panel */      \
+    field(double, panel_shrinkage)         /* ratio of lengths that are tried */                   \
+    field(double, curvature)               /* distance of the curve's singularity (units) */       \
+    field(int, passage_sweeps)                                                                     \
+    field(int, bisections)                                                                         \
+    field(double, passage_converged)       /* last Newton step of a place, over rtol */            \
+    field(double, passage_turned)          /* last relative change of rates, over rtol */          \
+    field(double, place_rounding)          /* of a place (units^2), times its distance */          \
+    field(double, extrapolated)            /* |beta| from which the deviation is known */          \
     field(double, expected_steps)          /* steps within which a zero of sigma is examined */   \
     field(double, expected_sigma)          /* sigma below which it is, wherever it lies */
 

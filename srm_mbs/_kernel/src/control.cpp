@@ -246,17 +246,16 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
                         constants_.turning_sigma);
         lost_branch_ = lost_branch_ && !result->quiet;
         zero_ = expected_ = nan;
+        const std::vector<double>& sigmas = result->sigmas;
+        const double start = sigmas[0], end = sigmas.back();
         if (!result->quiet) {
-            const std::vector<double>& sigmas = result->sigmas;
-            const double start = sigmas[0], end = sigmas.back();
             const double ahead = zero_ahead(abscissae_[middle_], start, sigmas[middle_], end,
                                             constants_.zero_horizon);
             zero_ = result->t + h * ahead;
-            if (ahead < 1.0 + constants_.expected_steps)
-                expected_ = zero_;
-            else if (end < start && end < constants_.expected_sigma)
-                expected_ = result->t + h * (start / (start - end));
+            if (ahead < 1.0 + constants_.expected_steps) expected_ = zero_;
         }
+        if (std::isnan(expected_) && end < start && end < constants_.expected_sigma)
+            expected_ = result->t + h * (start / (start - end));
     }
     return decision;
 }

@@ -7,9 +7,6 @@
 
 namespace srm {
 
-namespace {
-
-// Solves A x = b in place, A (n, n) by rows; whether it has no zero pivot.
 bool solve(std::vector<double>& A, std::vector<double>& b) {
     const std::size_t n = b.size();
     for (std::size_t k = 0; k < n; ++k) {
@@ -35,87 +32,122 @@ bool solve(std::vector<double>& A, std::vector<double>& b) {
     return true;
 }
 
+UnitClosures::UnitClosures(System& system_, double time_unit_)
+    : system(system_),
+      nv(system.nv),
+      n(system.nv + (system.driven() ? 1 : 0)),
+      rows(system.rows()),
+      time_unit(time_unit_),
+      g(rows),
+      G(static_cast<std::size_t>(rows) * n),
+      move_(2 * nv),
+      away_(2 * nv),
+      none_(2 * nv) {}
+
+void UnitClosures::evaluate(const std::vector<double>& x, double t) {
+    system.closures_at(t, x.data(), g.data(), G.data(), n);
+    for (int i = 0; i < rows; ++i) {
+        const double scale = system.residual_scale(i);
+        g[i] *= scale;
+        for (int j = 0; j < n; ++j) G[i * n + j] *= scale * unit(j);
+    }
+}
+
+void UnitClosures::move(const double* delta, std::vector<double>& x, double& t) {
+    for (int j = 0; j < nv; ++j) move_[j] = delta[j] * unit(j);
+    system.retract(x.data(), move_.data(), x.data());
+    if (n > nv) t += delta[nv] * time_unit;
+}
+
+void UnitClosures::difference(const std::vector<double>& from, double t_from,
+                              const std::vector<double>& to, double t_to, double* out) {
+    system.difference(from.data(), to.data(), none_.data(), away_.data());
+    for (int j = 0; j < nv; ++j) out[j] = away_[j] / unit(j);
+    if (n > nv) out[nv] = (t_to - t_from) / time_unit;
+}
+
+namespace {
+
 // The search for (q, u, delta) with G^T u = 0, g = delta u, |u| = 1 over independent rows of the
 // closures, in row units.
 class Search {
 public:
-    Search(System& system, const Constants& constants, double time_unit)
-        : system_(system),
+    Search(UnitClosures& closures, const Constants& constants)
+        : closures_(closures),
           constants_(constants),
-          nv_(system.nv),
-          n_(system.nv + (system.driven() ? 1 : 0)),
-          all_(system.rows()),
-          rank_(system.structural_rank()),
-          time_unit_(time_unit),
-          g_all_(all_),
-          G_all_(static_cast<std::size_t>(all_) * n_),
+          n_(closures.n),
+          all_(closures.rows),
+          rank_(closures.system.structural_rank()),
           g_(rank_),
-          G_(static_cast<std::size_t>(rank_) * n_),
-          move_(2 * nv_) {}
+          G_(static_cast<std::size_t>(rank_) * n_) {}
 
-    std::optional<double> run(const std::vector<double>& place, double time) {
+    bool run(const std::vector<double>& place, double time) {
         x_ = place;
         time_ = time;
-        evaluate(x_, time_);
+        closures_.evaluate(x_, time_);
         choose_rows();
         take_rows();
-        if (!start()) return {};
+        if (!start()) return false;
         const int size = n_ + rank_ + 1;
         std::vector<double> value(size), matrix, moved(n_, 0.0);
-        double last_move = std::numeric_limits<double>::infinity(), best = last_move, found = 0.0;
+        double last_move = std::numeric_limits<double>::infinity(), best = last_move;
         for (int i = 0; i < constants_.critical_iterations; ++i) {
             fill_value(value);
             const double error = largest(value.data(), size);
             if (!(error < best) && error < constants_.critical_accepted) break;
             if (error < best) {
                 best = error;
-                found = delta_;
-                best_x_ = x_;
+                found.residual = delta_;
+                found.x = x_;
+                found.t = time_;
+                found.u = u_;
             }
             if (error <= constants_.critical_converged) break;
-            if (last_move > constants_.critical_frozen && !differentiate()) return {};
+            if (last_move > constants_.critical_frozen && !differentiate()) return false;
             fill_matrix(matrix);
             for (double& v : value) v = -v;
-            if (!solve(matrix, value)) return {};
+            if (!solve(matrix, value)) return false;
             last_move = largest(value.data(), n_);
-            if (!(last_move < constants_.critical_reach)) return {};
-            step(value.data(), x_, time_);
+            if (!(last_move < constants_.critical_reach)) return false;
+            closures_.move(value.data(), x_, time_);
             add(1.0, value.data(), moved.data(), n_);
-            if (!(largest(moved.data(), n_) < constants_.critical_reach)) return {};
+            if (!(largest(moved.data(), n_) < constants_.critical_reach)) return false;
             add(1.0, value.data() + n_, u_.data(), rank_);
             const double length = norm(u_.data(), rank_);
             for (double& u : u_) u /= length;
-            evaluate(x_, time_);
+            closures_.evaluate(x_, time_);
             take_rows();
             delta_ = dot(u_.data(), g_.data(), rank_);
         }
-        if (!(best < constants_.critical_accepted)) return {};
-        return found;
+        return best < constants_.critical_accepted;
     }
 
-    const std::vector<double>& place() const { return best_x_; }
+    // Completes `found` by the Hessian there.
+    bool complete() {
+        x_ = found.x;
+        time_ = found.t;
+        u_ = found.u;
+        closures_.evaluate(x_, time_);
+        take_rows();
+        if (!differentiate()) return false;
+        found.hessian = hessian_;
+        found.rows = chosen_;
+        return true;
+    }
+
+    CriticalConfiguration found;
 
 private:
-    void evaluate(const std::vector<double>& x, double time) {
-        system_.closures_at(time, x.data(), g_all_.data(), G_all_.data(), n_);
-        for (int i = 0; i < all_; ++i) {
-            const double scale = system_.residual_scale(i);
-            g_all_[i] *= scale;
-            for (int j = 0; j < nv_; ++j) G_all_[i * n_ + j] *= scale * system_.unit(j);
-            if (n_ > nv_) G_all_[i * n_ + nv_] *= scale * time_unit_;
-        }
-    }
-
     void take_rows() {
         for (int i = 0; i < rank_; ++i) {
-            g_[i] = g_all_[chosen_[i]];
-            std::copy_n(&G_all_[chosen_[i] * n_], n_, &G_[i * n_]);
+            g_[i] = closures_.g[chosen_[i]];
+            std::copy_n(&closures_.G[chosen_[i] * n_], n_, &G_[i * n_]);
         }
     }
 
     // Independent rows, by Gram-Schmidt with the largest remainder next.
     void choose_rows() {
-        std::vector<double> left(G_all_);
+        std::vector<double> left(closures_.G);
         std::vector<bool> taken(all_, false);
         chosen_.clear();
         for (int k = 0; k < rank_; ++k) {
@@ -179,10 +211,10 @@ private:
             e[j] = constants_.critical_difference;
             std::vector<double> x(x_);
             double time = time_;
-            step(e.data(), x, time);
-            evaluate(x, time);
+            closures_.move(e.data(), x, time);
+            closures_.evaluate(x, time);
             for (int i = 0; i < rank_; ++i) {
-                const double* row = &G_all_[chosen_[i] * n_];
+                const double* row = &closures_.G[chosen_[i] * n_];
                 for (int k = 0; k < n_; ++k) hessian_[k * n_ + j] += u_[i] * row[k];
             }
             for (int k = 0; k < n_; ++k)
@@ -210,43 +242,37 @@ private:
         }
     }
 
-    void step(const double* delta, std::vector<double>& x, double& time) {
-        for (int j = 0; j < nv_; ++j) move_[j] = delta[j] * system_.unit(j);
-        std::fill(move_.begin() + nv_, move_.end(), 0.0);
-        system_.retract(x.data(), move_.data(), x.data());
-        if (n_ > nv_) time += delta[nv_] * time_unit_;
-    }
-
-    System& system_;
+    UnitClosures& closures_;
     const Constants& constants_;
-    const int nv_, n_, all_, rank_;
-    const double time_unit_;
-    std::vector<double> g_all_, G_all_, g_, G_, move_, u_, hessian_, x_, best_x_;
+    const int n_, all_, rank_;
+    std::vector<double> g_, G_, u_, hessian_, x_;
     std::vector<int> chosen_;
     double time_ = 0.0, delta_ = 0.0;
 };
 
 }  // namespace
 
-std::optional<double> residual_of_passage(System& system, double t, const double* begin,
-                                          const double* rate, double zero,
-                                          const Constants& constants) {
+std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures, double t,
+                                                         const double* begin, const double* rate,
+                                                         double zero, const Constants& constants) {
+    System& system = closures.system;
     const int nv = system.nv, nx = system.nq + nv;
     const double ahead = zero - t;
-    std::vector<double> move(2 * nv, 0.0), place(nx), away(2 * nv), none(2 * nv, 0.0);
+    std::vector<double> move(2 * nv, 0.0), place(nx), away(closures.n);
     for (int i = 0; i < nv; ++i) move[i] = ahead * (rate[i] + 0.5 * ahead * rate[nv + i]);
     system.retract(begin, move.data(), place.data());
-    Search search(system, constants, ahead);
-    const std::optional<double> delta = search.run(place, zero);
-    if (!delta) return {};
-    const auto distance = [&](const double* x) {
-        system.difference(search.place().data(), x, none.data(), away.data());
-        double sum = 0.0;
-        for (int i = 0; i < nv; ++i) sum += away[i] * away[i] / (system.unit(i) * system.unit(i));
-        return std::sqrt(sum);
+    Search search(closures, constants);
+    if (!search.run(place, zero)) return {};
+    CriticalConfiguration& found = search.found;
+    const auto distance = [&](const std::vector<double>& x) {
+        closures.difference(found.x, found.t, x, found.t, away.data());
+        return norm(away.data(), nv);
     };
-    if (!(distance(place.data()) < constants.critical_passed * distance(begin))) return {};
-    return delta;
+    const double covered = distance(std::vector<double>(begin, begin + nx));
+    found.passed = distance(place) < constants.critical_passed * covered;
+    const bool singular = !(std::abs(found.residual) > constants.rounded_residual);
+    if (!singular && !search.complete()) return {};
+    return std::move(found);
 }
 
 }  // namespace srm

@@ -67,7 +67,8 @@ void DenseOutput::states(System& system, const double* t, long k, double* out) {
         if (places_[step] == Place::regular) {
             extended(system, step, theta, out);
         } else {
-            value(best_polynomial(system, step), theta, delta_.data());
+            const Polynomial& best = best_polynomial(system, step);
+            value(best, variable(step, theta, best.in_layer), delta_.data());
             system.retract(steps_.states + step * nx_, delta_.data(), out);
         }
     }
@@ -207,15 +208,29 @@ void DenseOutput::motion(long step, long node, double* out) const {
     }
 }
 
+// The variable of polynomials at a fraction of the step, and its derivative by the time in steps.
+double DenseOutput::variable(long step, double theta, bool in_layer, double* growth) const {
+    if (growth) *growth = 1.0;
+    if (!in_layer) return theta;
+    const double centre = steps_.layers[2 * step], width = steps_.layers[2 * step + 1];
+    const double h = steps_.times[step + 1] - steps_.times[step];
+    const double beside = (steps_.times[step] - centre + theta * h) / width;
+    if (growth) *growth = h / width / std::hypot(1.0, beside);
+    return std::asinh(beside);
+}
+
 // Divided differences of the states and rates at ends of steps, in the chart of the step.
-DenseOutput::Polynomial DenseOutput::hermite(System& system, long step, int count) {
+DenseOutput::Polynomial DenseOutput::hermite(System& system, long step, int count,
+                                             bool in_layer) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
     Polynomial out;
+    out.in_layer = in_layer;
     std::vector<double> slopes, rate(n_), near(n_ / 2);
     const long last = smooth_interval(step).second;
     for (long i : nodes(system, step, count)) {
-        const double at = (times[i] - times[step]) / h;
+        double growth;
+        const double at = variable(step, (times[i] - times[step]) / h, in_layer, &growth);
         motion(step, i, near.data());
         system.difference(start, steps_.states + i * nx_, near.data(), delta_.data());
         system.chart_rate(delta_.data(), rate_at(i, last), rate.data());
@@ -223,7 +238,7 @@ DenseOutput::Polynomial DenseOutput::hermite(System& system, long step, int coun
             out.points.push_back(at);
             out.coefficients.insert(out.coefficients.end(), delta_.begin(), delta_.end());
         }
-        for (double& value : rate) value *= h;
+        for (double& value : rate) value *= h / growth;
         slopes.insert(slopes.end(), rate.begin(), rate.end());
     }
     const int k = static_cast<int>(out.points.size());
@@ -254,21 +269,32 @@ void DenseOutput::value(const Polynomial& polynomial, double theta, double* out)
 }
 
 // Of the polynomials of degree 7, 11 and 15, the middle one if it differs less from the last than
-// the first from it; else the first.
+// the first from it; else the first.  Past a critical configuration those in the variable of the
+// layer, if they are confirmed better.
 const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long step) {
     Polynomial& out = polynomials_[step];
     if (!out.points.empty()) return out;
-    std::vector<Polynomial> tried;
-    for (int count : constants_.nodes) tried.push_back(hermite(system, step, count));
-    double changes[2] = {0.0, 0.0};
-    std::vector<double> a(n_), b(n_);
-    for (int k = 0; k < 2; ++k)
-        for (double theta : constants_.probes) {
-            value(tried[k], theta, a.data());
-            value(tried[k + 1], theta, b.data());
-            for (int i = 0; i < n_; ++i) changes[k] = std::max(changes[k], std::abs(b[i] - a[i]));
-        }
-    out = tried[changes[1] <= changes[0] ? 1 : 0];
+    const bool layer = steps_.layers && steps_.layers[2 * step + 1] > 0.0;
+    double best = std::numeric_limits<double>::infinity();
+    for (const bool in_layer : {false, true}) {
+        if (in_layer && !layer) break;
+        std::vector<Polynomial> tried;
+        for (int count : constants_.nodes) tried.push_back(hermite(system, step, count, in_layer));
+        double changes[2] = {0.0, 0.0};
+        std::vector<double> a(n_), b(n_);
+        for (int k = 0; k < 2; ++k)
+            for (double theta : constants_.probes) {
+                const double at = variable(step, theta, in_layer);
+                value(tried[k], at, a.data());
+                value(tried[k + 1], at, b.data());
+                for (int i = 0; i < n_; ++i)
+                    changes[k] = std::max(changes[k], std::abs(b[i] - a[i]));
+            }
+        const double change = std::min(changes[0], changes[1]);
+        if (in_layer && !(change < best)) break;
+        best = change;
+        out = tried[changes[1] <= changes[0] ? 1 : 0];
+    }
     return out;
 }
 

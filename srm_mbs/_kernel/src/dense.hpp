@@ -46,6 +46,7 @@ struct StepArrays {
     bool corrected = false;
     const double *times, *states, *rates, *corrections, *sigmas, *end_rate;
     std::vector<char> in_zone;  // (count,)
+    const double* layers = nullptr;  // (count, 2), time and width (s) of the layer; width 0: none
     std::vector<long> breaks;   // numbers of the steps that end on breakpoints, from 1
     const double* break_rates = nullptr;  // (breaks, n), tangent rates before them
 };
@@ -61,6 +62,7 @@ public:
 private:
     struct Polynomial {
         std::vector<double> points, coefficients;  // (k,), (k, n): Newton form
+        bool in_layer = false;  // a polynomial in the variable of the layer
     };
     std::pair<long, long> smooth_interval(long step) const;
     const double* rate_at(long node, long last) const;
@@ -71,7 +73,8 @@ private:
     const Polynomial& best_polynomial(System& system, long step);
     std::vector<long> nodes(const System& system, long step, int count) const;
     void motion(long step, long node, double* out) const;
-    Polynomial hermite(System& system, long step, int count);
+    Polynomial hermite(System& system, long step, int count, bool in_layer);
+    double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;
 
     Extension extension_;

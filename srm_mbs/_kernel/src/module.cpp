@@ -92,6 +92,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<IntegratorState>(m, "IntegratorState");
     bind_struct<ControlState>(m, "ControlState");
     bind_struct<SmoothIntervals>(m, "SmoothIntervals");
+    bind_struct<Collocation>(m, "Collocation");
     bind_struct<RunOptions>(m, "RunOptions");
     bind_struct<RunSnapshot>(m, "RunSnapshot");
     bind_struct<Curve>(m, "Curve");
@@ -443,31 +444,12 @@ struct PyRun {
         run->memory = memory;
     }
 
-    // A step to t that was made in Python; its correction is zero.
-    void append(double t, const Array& end, const Array& rates, const Array& end_rate,
-                const Array& sigmas, const Array& state_scale, int rank) {
-        const std::size_t n = 2 * static_cast<std::size_t>(s.nv);
-        const std::size_t stages = static_cast<std::size_t>(run->step.scheme.stages()) + 1;
-        StepResult r;
-        r.state = checked_state(end);
-        r.rates = sized(rates, stages * n, "rates");
-        r.end_rate = sized(end_rate, n, "end_rate");
-        r.sigmas = sized(sigmas, stages, "sigmas");
-        r.state_scale = sized(state_scale, n, "state_scale");
-        r.correction.assign(n, 0.0);
-        r.rank = rank;
-        run->append(r, t);
-    }
-
-    static std::vector<double> sized(const Array& array, std::size_t size, const char* what) {
-        if (array.size() != size)
-            throw nb::value_error((std::string(what) + " has another size").c_str());
-        return to_vector(array);
-    }
-
-    void move_to(double t, const IntegratorState& memory) {
-        check(memory);
-        run->move_to(t, memory);
+    // Passages next to critical configurations: (time, residual, avoided, resolved).
+    nb::list examined() const {
+        nb::list out;
+        for (const ExaminedPassage& one : run->examined)
+            out.append(nb::make_tuple(one.time, one.residual, one.avoided, one.resolved));
+        return out;
     }
 
     // Accepted, rejected and zone steps since the start.
@@ -532,6 +514,7 @@ void bind_run(nb::module_& m) {
         .def_ro("quiet", &StepResult::quiet)
         .def_ro("held", &StepResult::held)
         .def_ro("in_zone", &StepResult::in_zone)
+        .def_ro("critical", &StepResult::critical)
         .def_ro("zone_threshold", &StepResult::zone_threshold)
         .def_prop_ro("state", [](const StepResult& r) { return owned_array(r.state); })
         .def_prop_ro("rates", [](const StepResult& r) {
@@ -603,16 +586,13 @@ void bind_run(nb::module_& m) {
         .def("restore", &PyRun::restore)
         .def("memory", [](const PyRun& r) { return r.run->memory; })
         .def("remember", &PyRun::remember)
-        .def("append", &PyRun::append, nb::arg("t"), nb::arg("state"), nb::arg("rates"),
-             nb::arg("end_rate"), nb::arg("sigmas"), nb::arg("state_scale"), nb::arg("rank"))
-        .def("move_to", &PyRun::move_to)
-        .def_prop_ro("passage_time", [](const PyRun& r) { return r.run->passage_time(); })
         .def("last", [](PyRun& r) -> StepResult& { return r.run->step.result; },
              nb::rv_policy::reference_internal)
         .def("last_history", &PyRun::last_history)
         .def("step_dense", &PyRun::step_dense, nb::rv_policy::take_ownership,
              nb::keep_alive<0, 1>())
         .def("attempts", &PyRun::attempts)
+        .def("examined", &PyRun::examined)
         .def("suspect_times", &PyRun::suspect_times)
         .def("totals", &PyRun::totals)
         .def("take_records", &PyRun::take_records)
@@ -641,6 +621,7 @@ void bind_run(nb::module_& m) {
     field(Array, break_rates)       /* (breaks, n) */                                 \
     field(std::vector<long>, breaks)                                                  \
     field(std::vector<long>, zones) /* numbers of the steps with a zone */            \
+    field(Array, layers)            /* (k, 2) */                                      \
     field(double, end)              /* of the run (s) */
 
 // The accepted steps of a run, in NumPy arrays that are not copied.
@@ -670,6 +651,8 @@ struct PySteps {
         out.end_rate = end_rate.data();
         out.breaks = breaks;
         out.break_rates = break_rates.data();
+        expect("layers", layers, {k, 2});
+        out.layers = layers.data();
         out.in_zone.assign(k, 0);
         for (long step : zones) {
             if (step < 0 || step >= out.count)

@@ -68,7 +68,10 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
       open_residual_(constants().open_residual),
       search_below_(constants().search_below),
       examines_(options.examines),
-      abscissae_(step.scheme.c) {
+      abscissae_(step.scheme.c),
+      singular_tolerance_(options.singular_tolerance),
+      collocation_(options.collocation),
+      one_freedom_(system.nv + (system.driven() ? 1 : 0) - system.structural_rank() == 1) {
     abscissae_.push_back(1.0);
     enter_interval();
 }
@@ -159,6 +162,7 @@ void Run::resume(double t, const std::vector<double>& from, IntegratorState know
     interval_ = static_cast<std::size_t>(at - ends.begin());
     enter_interval();
     state = from;
+    prepared_.clear();
     memory = std::move(known);
     control->resume(known_control);
 }
@@ -181,6 +185,7 @@ void Run::restore(const RunSnapshot& snapshot) {
 }
 
 Stop Run::attempt(StepDecision& decision) {
+    if (!prepared_.empty()) return make_prepared();
     const double limit =
         std::min({max_step_, system.step_limit(state.data()), jump_limit_});
     const Proposal proposal = control->propose(t_, limit, memory);
@@ -188,7 +193,8 @@ Stop Run::attempt(StepDecision& decision) {
     const double h = h_ = proposal.h;
     if (examines_) {
         const double zero = control->next_zero();
-        if (!known_ && zero > t_ && examine(zero)) return Stop::passage;
+        const bool due = !known_ && zero > t_ && memory.sigma < examine_below_;
+        if (due && (one_freedom_ || !quiet_) && examine(zero)) return make_prepared();
     }
     const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
@@ -205,7 +211,10 @@ Stop Run::attempt(StepDecision& decision) {
     } catch (const EvaluationError&) {
         evaluation_failed = true;
     }
-    if (result && examines_ && passes_residual(*result)) return Stop::passage;
+    if (result && examines_) {
+        const std::optional<double> zero = crossing(*result);
+        if (zero && examine(*zero)) return make_prepared();
+    }
     if (result && misses_jump(proposal, *result)) return Stop::chunk;
     decision = control->decide(proposal, result);
     const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
@@ -216,17 +225,16 @@ Stop Run::attempt(StepDecision& decision) {
         return stuck ? Stop::evaluation : Stop::chunk;
     }
     evaluation_failed = false;
+    quiet_ = result->quiet;
     // Where sigma rises, the next passage is another one.
-    if (result->sigmas.back() > result->sigmas.front()) known_ = false;
+    if (result->sigmas.back() > result->sigmas.front()) {
+        known_ = false;
+        examine_below_ = inf;
+    }
     if (leaves_closures_open(*result)) return Stop::closures;
     if (result->in_zone)
         records.zones.push_back({records.count(), result->zone_threshold, *memory.history});
-    records.append(*result, proposal.t_new, placement);
-    end_rate = result->end_rate;
-    std::copy(result->state.begin(), result->state.end(), state.begin());
-    step.accept(memory);
-    t_ = proposal.t_new;
-    if (made_++ % steps == 0) watched_time_ = t_;
+    record(*result, proposal.t_new, placement);
     const bool jumped = on_jump_;
     jump_limit_ = inf;
     jump_tries_ = 0;
@@ -247,38 +255,98 @@ bool Run::misses_jump(const Proposal& proposal, const StepResult& r) {
     return true;
 }
 
-// Whether the step passes a critical configuration that has a residual, and was not looked at.
-bool Run::passes_residual(const StepResult& r) {
-    if (known_ || r.quiet) return false;
+// When the step passes a singular configuration that has not been examined.
+std::optional<double> Run::crossing(const StepResult& r) const {
+    if (known_ || r.quiet) return {};
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
-    if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return false;
+    if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return {};
     const double zero = zero_within(abscissae_, r.sigmas);
     const bool inside = 0.0 < zero && zero <= 1.0;
-    return examine(r.t + (inside ? zero : abscissae_[low - r.sigmas.begin()]) * r.h);
+    return r.t + (inside ? zero : abscissae_[low - r.sigmas.begin()]) * r.h;
 }
 
-// Whether the critical configuration of the passage expected at `zero` has a residual.
+// Examines the passage expected at `zero`, and prepares the steps along the curve if ordinary steps
+// are not to make it; whether there are any.
 bool Run::examine(double zero) {
-    const auto residual =
-        residual_of_passage(system, t_, state.data(), memory.rate.data(), zero, constants());
-    known_ = residual.has_value();
-    passage_ = zero;
-    return residual && std::abs(*residual) > constants().rounded_residual;
+    const double rtol = step.norm.rtol;
+    examine_below_ = constants().examined_again * memory.sigma;
+    UnitClosures closures(system, zero - t_);
+    const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), zero,
+                                              constants());
+    known_ = critical && critical->passed;
+    if (!critical) return false;
+    const double residual = std::abs(critical->residual);
+    if (!(residual > constants().rounded_residual)) return false;
+    const bool avoided = residual > singular_tolerance_;
+    if (avoided || residual > constants().disturbing * rtol) {
+        try {
+            follow(passage_along_curve(closures, *critical, t_, state, intervals_.ends[interval_],
+                                       !avoided, rtol, collocation_, constants()));
+        } catch (const EvaluationError&) {
+            // Steps pass it as well as they can, and the message says so.
+        }
+    }
+    known_ = known_ || !prepared_.empty();
+    if (known_) examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});
+    return !prepared_.empty();
 }
 
-void Run::append(const StepResult& result, double t) {
+// Prepares the steps from point to point.
+void Run::follow(const std::vector<PassagePoint>& points) {
+    const int nv = system.nv, n = 2 * nv, stages = step.scheme.stages();
+    const double first = step.scheme.b.front();
+    for (std::size_t i = points.size(); i-- > 1;) {
+        const PassagePoint &from = points[i - 1], &to = points[i];
+        StepResult r;
+        r.t = from.t;
+        r.h = to.t - from.t;
+        r.state = to.state;
+        r.end_rate = to.rate;
+        r.correction.assign(n, 0.0);
+        r.state_scale.resize(n);
+        system.state_scale(to.state.data(), r.state_scale.data());
+        // Rates between the ends only say how far the step leads.
+        std::vector<double> moved(from.rate), between(n);
+        for (double& value : moved) value *= r.h;
+        system.difference(from.state.data(), to.state.data(), moved.data(), between.data());
+        for (int j = 0; j < n; ++j)
+            between[j] = (between[j] / r.h - first * from.rate[j]) / (1.0 - first);
+        r.rates = from.rate;
+        for (int k = 1; k < stages; ++k)
+            r.rates.insert(r.rates.end(), between.begin(), between.end());
+        r.rates.insert(r.rates.end(), to.rate.begin(), to.rate.end());
+        for (double c : abscissae_) r.sigmas.push_back(from.sigma + c * (to.sigma - from.sigma));
+        r.multiplier.assign(nv, 0.0);
+        r.rank = system.structural_rank();
+        r.critical = true;
+        prepared_.emplace_back(std::move(r), to.t);
+    }
+}
+
+// Makes the next of the prepared steps.
+Stop Run::make_prepared() {
     constexpr int critical = 3;  // STEP_PLACEMENTS of dense_output.py
-    records.append(result, t, critical);
-    if (made_++ % constants().standstill_steps == 0) watched_time_ = t;
-    end_rate = result.end_rate;
-    state = result.state;
+    step.result = std::move(prepared_.back().first);
+    const double t = prepared_.back().second;
+    prepared_.pop_back();
+    h_ = step.result.h;
+    record(step.result, t, critical);
+    if (prepared_.empty()) {
+        known_ = quiet_ = false;
+        examine_below_ = inf;
+        control->moved(t_);
+    }
+    return t_ < t_end() ? Stop::chunk : Stop::finished;
 }
 
-void Run::move_to(double t, IntegratorState known) {
+// Moves to the end t of an accepted step.
+void Run::record(const StepResult& result, double t, int placement) {
+    records.append(result, t, placement);
+    end_rate = result.end_rate;
+    std::copy(result.state.begin(), result.state.end(), state.begin());
+    step.accept(memory);
     t_ = t;
-    memory = std::move(known);
-    known_ = false;
-    control->moved(t);
+    if (made_++ % constants().standstill_steps == 0) watched_time_ = t_;
 }
 
 void Run::drop_records() {

@@ -1,11 +1,15 @@
 // The driver: propose a step, make it, decide on it, record it; in chunks.  See driver.py.
 #pragma once
 
+#include <limits>
 #include <memory>
+#include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "control.hpp"
+#include "passage.hpp"
 #include "struct_fields.hpp"
 
 namespace srm {
@@ -19,7 +23,6 @@ enum class Stop {
     evaluation = 5,  // a fixed step could not be evaluated
     breakpoint = 6,  // the next interval begins, and Python has to look at it first
     arrival = 7,     // the end lies next to a singular configuration: Python prepares for it
-    passage = 8,     // a step passes a critical configuration with a residual: Python looks at it
 };
 
 #define SRM_SMOOTH_INTERVALS(field)                                                           \
@@ -43,13 +46,21 @@ struct SmoothIntervals {
     field(double, max_step)                                                            \
     field(std::string, placement)  /* "automatic" or "off" */                          \
     field(bool, arrivals)          /* stop before an end next to a singular configuration */ \
-    field(bool, examines)          /* stop before a critical configuration with a residual */ \
+    field(bool, examines)          /* follow the residuals of critical configurations */ \
+    field(double, singular_tolerance) /* residual (row units) up to which one is singular */ \
+    field(Collocation, collocation) /* of passages along curves */                     \
     /* Regularisation eps = eps_factor h^eps_power; eps_factor 0: eps -> 0. */         \
     field(double, eps_factor)                                                          \
     field(double, eps_power)
 
 struct RunOptions {
     SRM_FIELDS(SRM_RUN_OPTIONS)
+};
+
+// A passage next to a critical configuration: ExaminedPassage of critical_passages.py.
+struct ExaminedPassage {
+    double time, residual;
+    bool avoided, resolved;
 };
 
 struct Attempt {
@@ -116,14 +127,7 @@ public:
     Stop go_on(double end, double first, double last, bool forces_jump, double grid,
                double seconds);
 
-    // Records a step to t that was made in Python.
-    void append(const StepResult& result, double t);
-    // Goes on from t, where such steps have led.
-    void move_to(double t, IntegratorState known);
-
     double t() const { return t_; }
-    // When the passage is expected for which the run stopped.
-    double passage_time() const { return passage_; }
     double last_h() const { return h_; }
     double t_end() const { return intervals_.ends.back(); }
     // Whether the next interval has still to be entered.
@@ -142,15 +146,19 @@ public:
     StepRecords records;
     std::vector<double> end_rate;  // (n,), tangent rate at the end of the last step
     std::vector<Attempt> attempts;
+    std::vector<ExaminedPassage> examined;  // with a residual
     // Of the steps whose records were dropped.
     long steps_before = 0, rejected_before = 0, zones_before = 0;
     bool evaluation_failed = false;  // in the last attempt
 
 private:
     bool leaves_closures_open(const StepResult& result);
-    bool passes_residual(const StepResult& result);
+    std::optional<double> crossing(const StepResult& result) const;
     bool examine(double zero);
     bool misses_jump(const Proposal& proposal, const StepResult& result);
+    void follow(const std::vector<PassagePoint>& points);
+    Stop make_prepared();
+    void record(const StepResult& result, double t, int placement);
     void enter_interval();
     void drop_records();
     bool restart_after_break();
@@ -177,8 +185,15 @@ private:
     bool inaccurate_ = false;  // the first stage after a jump: Python has to look at it
     bool examines_;
     std::vector<double> abscissae_;
-    double passage_ = 0.0;
-    bool known_ = false;  // the passage ahead has been examined
+    double singular_tolerance_;
+    Collocation collocation_;
+    const bool one_freedom_;  // the closed configurations are curves, which may be followed
+    bool known_ = false;      // the passage ahead has been examined
+    bool quiet_ = false;      // the last step was
+    // sigma below which the motion is examined again, where no passage was found so far.
+    double examine_below_ = std::numeric_limits<double>::infinity();
+    // Steps along a curve that are still to be made, the next one last, and their ends.
+    std::vector<std::pair<StepResult, double>> prepared_;
 };
 
 }  // namespace srm

@@ -270,6 +270,7 @@ const StepResult& SplitStep::make(double t, double h, const double* state,
         prepare_branch(memory, t + h, sigma_change);
     }
     r.residual = 0.0;
+    r.critical = false;
     evaluate_stages(t, state, memory, sigma_change);
     system_.state_scale(x_.data(), r.state_scale.data());
     const double sigma = r.sigmas[scheme.stages()];

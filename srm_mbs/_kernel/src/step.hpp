@@ -84,6 +84,7 @@ struct StepResult {
     bool quiet = false;    // the whole step is far from singular configurations
     bool held = false;     // a stage kept the normals of the last node
     bool lost_branch = false;  // nodes of the branch were wanted and not found
+    bool critical = false;     // along the curve past a critical configuration
     double zone_threshold = 0.0;
 };
 

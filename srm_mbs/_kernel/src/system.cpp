@@ -691,6 +691,22 @@ double System::closure_residual_at(double t, const double* state) {
     return closure_residual();
 }
 
+void System::mass_times(const double* x, double* out) const {
+    const double* M = work_->data.M.data();  // the upper triangle
+    for (int i = 0; i < nv; ++i) {
+        out[i] = 0.0;
+        for (int j = 0; j < nv; ++j) out[i] += M[std::max(i, j) * nv + std::min(i, j)] * x[j];
+    }
+}
+
+void System::working_forces(double* all, double* working) {
+    auto& w = *work_;
+    std::copy(f_.begin(), f_.end(), all);
+    for (int i = 0; i < nv; ++i) working[i] = f_[i] + w.data.nle[i];
+    pinocchio::computeGeneralizedGravity(w.model, w.data, Argument(w.q));
+    for (int i = 0; i < nv; ++i) working[i] -= w.data.g[i];
+}
+
 void System::closures_at(double t, const double* q, double* g, double* G, int width) {
     auto& w = *work_;
     t = std::min(std::max(t, first_), last_);

@@ -199,6 +199,13 @@ public:
     // derivative by t, where drives are, as its last column.
     void closures_at(double t, const double* q, double* g, double* G, int width);
     int rows() const { return data_.rows; }
+    // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
+    // them but those of inertia (nv,), and Gdot v - s'' (rows,).
+    void mass_times(const double* x, double* out) const;
+    void working_forces(double* all, double* working);
+    const std::vector<double>& bias() const { return bias_; }
+    // Whether moves commute: no ball, planar or free joints.
+    bool commutes() const { return data_.groups.empty(); }
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
     double unit(int j) const { return data_.unit[j]; }

@@ -39,9 +39,9 @@ FROZEN = 1e-3
 RIDGE = 1e-5
 """Added to the Hessian: configurations that are critical together, such as those of a free base,
 stay where they are."""
-CURVE_ITERATIONS = 20
-CURVE_STEP = 1e-15
-"""Newton step (units) at which a point of a curve is found."""
+LARGEST_DEVIATION = 0.5
+"""Distance of a configuration from its hyperbola, over that from the critical configuration, from
+which it is not beside that one."""
 DEFINITE = 1e-3
 """Ratio of the two curvatures of a saddle below which branches are almost tangent."""
 
@@ -193,7 +193,9 @@ class CurveThroughSaddle:
     beta
         That of q.
     width
-        |beta| at which the curve leaves its asymptotes.
+        |beta| at which the curve leaves its asymptotes; 0 if it leads straight through q*.
+    along : (n,)
+        Direction of beta.
 
     Raises
     ------
@@ -217,7 +219,7 @@ class CurveThroughSaddle:
         delta = float(critical.u @ g)
         # delta > 0: the coordinate of the negative curvature keeps its sign.
         kept, along = (axes[:, 0], axes[:, 1]) if delta > 0.0 else (axes[:, 1], axes[:, 0])
-        self._kept, self._along = plane @ kept, plane @ along
+        self._kept, self.along = plane @ kept, plane @ along
         of_kept, of_along = (-low, high) if delta > 0.0 else (high, -low)
         self._exact = exact
         self._delta = delta
@@ -225,38 +227,54 @@ class CurveThroughSaddle:
         self._ratio = of_along / of_kept
         self.width = float(np.sqrt(self._level / self._ratio))
         away = geometry.difference(critical.q, q)
-        self.beta = float(self._along @ away)
+        self.beta = float(self.along @ away)
         beside = float(self._kept @ away)
         self._sign = float(np.sign(beside if not exact else beside * self.beta))
-        on_curve = self.at(self.beta, closed=True)[0]
-        if not np.abs(geometry.difference(on_curve, q)).max() < 1e-6 * abs(self.beta):
+        off = float(np.linalg.norm(away - self.hyperbola(self.beta)[0]))
+        if not off < LARGEST_DEVIATION * float(np.linalg.norm(away)):
             raise ValueError("the configuration is not on a curve beside the critical one")
 
-    def at(self, beta: float, closed: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The configuration (nq,) at ``beta``, and its first and second derivative (n,) by beta, in
-        units.
+    def hyperbola(self, beta: float) -> tuple[FloatArray, FloatArray]:
+        """The point of the hyperbola at ``beta``, as a displacement (n,) from q*, and its
+        derivative."""
+        kept = np.sqrt(self._level + self._ratio * beta * beta)
+        slope = self._ratio * beta / kept
+        if self._exact:
+            kept, slope = kept * np.sign(beta), slope * np.sign(beta)
+        kept, slope = self._sign * kept, self._sign * slope
+        return beta * self.along + kept * self._kept, self.along + slope * self._kept
+
+    def linearised(
+        self, x: FloatArray, beta: float, closed: bool = False
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Newton's equations for the configuration at ``beta``, at x (nq,) next to it.
+
+        Returns
+        -------
+        step : (n,)
+            The step from x, in units.
+        tangent : (n,)
+            Direction of the curve, of which the part ``along`` is 1.
+        matrix : (n, n)
+            Of the equations: the rows of the closures, the critical combination after the others,
+            and ``along``.
 
         ``closed``: with the residual closed, also if it counts as zero.
         """
         critical, geometry = self._critical, self._geometry
-        kept = np.sqrt(self._level + self._ratio * beta * beta)
-        kept *= self._sign * np.sign(beta) if self._exact else self._sign
-        x = geometry.move(critical.q, beta * self._along + kept * self._kept)
         target = self._delta if self._exact and not closed else 0.0
-        last = np.inf
-        for _ in range(CURVE_ITERATIONS):
-            g, G = equations(geometry, critical.rows, x)
-            off = float(self._along @ geometry.difference(critical.q, x)) - beta
-            value = np.concatenate([self._strong @ g, [critical.u @ g - target, off]])
-            matrix = np.vstack([self._strong @ G, critical.u @ G, self._along])
-            step = np.linalg.solve(matrix, value)
-            size = float(np.abs(step).max())
-            if not size < last and size < 1e-6 * abs(beta):
-                break
-            x, last = geometry.move(x, -step), size
-            if size < CURVE_STEP:
-                break
-        tangent = np.linalg.solve(matrix, np.append(np.zeros(len(value) - 1), 1.0))
-        bias = critical.rows @ geometry.bias(x, tangent)
-        turning = np.concatenate([self._strong @ bias, [critical.u @ bias, 0.0]])
-        return x, tangent, -np.linalg.solve(matrix, turning)
+        g, G = equations(geometry, critical.rows, x)
+        off = float(self.along @ geometry.difference(critical.q, x)) - beta
+        value = np.concatenate([self._strong @ g, [critical.u @ g - target, off]])
+        matrix = np.vstack([self._strong @ G, critical.u @ G, self.along])
+        sides = np.column_stack([-value, np.append(np.zeros(len(value) - 1), 1.0)])
+        step, tangent = np.linalg.solve(matrix, sides).T
+        return step, tangent, matrix
+
+    def bend(self, x: FloatArray, rates: FloatArray, matrix: FloatArray) -> FloatArray:
+        """A second derivative (n,) of the motion by time, in units, that keeps the closures closed
+        at the ``rates`` (n,), in units; ``matrix`` as in :meth:`linearised`."""
+        bias = self._critical.rows @ self._geometry.bias(x, rates)
+        turning = np.concatenate([self._strong @ bias, [self._critical.u @ bias, 0.0]])
+        out: FloatArray = -np.linalg.solve(matrix, turning)
+        return out

@@ -42,7 +42,7 @@ PREDICTION_STEPS = 3.0
 """Steps within which zeros of sigma are predicted."""
 EXPECTED_STEPS = 1.5
 """Steps within which a zero of sigma is examined before it is passed."""
-EXPECTED_SIGMA = 0.3
+EXPECTED_SIGMA = 0.6
 """sigma below which it is examined wherever it lies."""
 SIGMA_CHANGE = 0.5
 """Largest change of sigma in one step, by the slope of the last steps."""
@@ -422,6 +422,7 @@ class SingularityPlacement(ControlWrapper):
             self._zero = self._expected = None
             self._turning = False
             self._lost_branch = self._lost_branch and not result.quiet
+            ahead = None
             if not result.quiet:
                 if result.sigmas[-1] < WATCHED_SIGMA:
                     extreme = extreme_sigma(self._abscissae, self._middle[0], result.sigmas)
@@ -429,8 +430,8 @@ class SingularityPlacement(ControlWrapper):
                     self._turning = slow or abs(extreme) < TURNING_SIGMA
                 ahead = zero_ahead(*self._middle, result.sigmas)
                 self._zero = None if ahead is None else result.t + proposal.h * ahead
-                expected = expected_zero(result.sigmas, ahead)
-                self._expected = None if expected is None else result.t + proposal.h * expected
+            expected = expected_zero(result.sigmas, ahead)
+            self._expected = None if expected is None else result.t + proposal.h * expected
         return decision
 
 

@@ -13,7 +13,7 @@ from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler
-from srm_mbs.integration.critical_passages import CriticalPassages
+from srm_mbs.integration.critical_passages import CriticalPassages, ExaminedPassage
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunRecord, StepSink, Tick
 from srm_mbs.integration.events import EventWatch, Stop, step_dense
@@ -72,7 +72,7 @@ def integrate(
     passing
         Handles breakpoints, if there are any.
     passages
-        Makes the passages of critical configurations that steps cannot make.
+        Takes the passages of critical configurations that the kernel examined.
     sink
         Takes the steps; they remain in the record without one.
     """
@@ -97,14 +97,6 @@ def integrate(
                 continue
             if reason is ReturnReason.ARRIVAL and passing is not None:
                 run.arrive(passing)
-                continue
-            if reason is ReturnReason.PASSAGE and passages is not None:
-                stop = _pass_critical(system, run, passages, tick, events)
-                if stop is not None:
-                    record.mark_stopped(stop)
-                    break
-                t_start, start = run.t, run.state
-                reason = ReturnReason.CHUNK_FULL if run.t < run.t_end else ReturnReason.FINISHED
                 continue
             if reason not in (ReturnReason.CHUNK_FULL, ReturnReason.FINISHED):
                 failure = why_stopped(reason, system, run)
@@ -131,36 +123,11 @@ def integrate(
         driver.Attempt(t, h, ratio, DECISIONS[decision]) for t, h, ratio, decision in run.attempts()
     ]
     record.placed, record.replaced = run.placed, run.replaced
+    if passages is not None:
+        passages.examined = [ExaminedPassage(*values) for values in run.examined()]
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
-
-
-def _pass_critical(
-    system: ClosedSystem | OpenSystem,
-    run: CompiledRun,
-    passages: CriticalPassages,
-    tick: Tick | None,
-    events: EventWatch | None,
-) -> Stop | None:
-    """Make the passage before which the kernel returned, if steps cannot: why the run ends on the
-    way, or None."""
-    start, memory, end = run.state, run.memory(), run.interval_end
-    past = passages.steps_past(run.t, start, memory.rate, run.passage_time, end)
-    for step, t_new in past:
-        run.append(step, t_new)
-        run.method.accept(memory, step)
-        if events is not None:
-            dense = step_dense(system, run.method.scheme, start, step, t_new)
-            stop = events.after_step(step.t, start, t_new, step.state, dense)
-            if stop is not None:
-                return stop
-        start = step.state
-        if tick is not None:
-            driver.call_progress(tick, t_new, step.h, start)
-    if past:
-        run.move_to(past[-1][1], memory)
-    return None
 
 
 def why_stopped(

@@ -121,6 +121,23 @@ def constants() -> Any:
         critical_reach=critical_passages.SEARCH,
         critical_passed=critical_passages.PASSED,
         rounded_residual=critical_passages.ROUNDED_RESIDUAL,
+        examined_again=critical_passages.EXAMINED_AGAIN,
+        disturbing=critical_passages.DISTURBING,
+        dependent_row=critical_passages.DEPENDENT,
+        definite=critical.DEFINITE,
+        largest_deviation=critical.LARGEST_DEVIATION,
+        layer=critical_passages.LAYER,
+        shortest_panel=critical_passages.SHORTEST_PANEL,
+        panel_error=critical_passages.PANEL_ERROR,
+        relative_panel_error=critical_passages.RELATIVE_PANEL_ERROR,
+        panel_shrinkage=critical_passages.SHRINKAGE,
+        curvature=critical_passages.CURVATURE,
+        passage_sweeps=critical_passages.SWEEPS,
+        bisections=critical_passages.BISECTIONS,
+        passage_converged=critical_passages.CONVERGED,
+        passage_turned=critical_passages.TURNED,
+        place_rounding=critical_passages.PLACE_ROUNDING,
+        extrapolated=critical_passages.EXTRAPOLATED,
         expected_steps=placement.EXPECTED_STEPS,
         expected_sigma=placement.EXPECTED_SIGMA,
     )
@@ -238,6 +255,13 @@ def intervals_struct(intervals: SmoothIntervals) -> Any:
     )
 
 
+@lru_cache(maxsize=16)
+def collocation_struct(count: int) -> Any:
+    """``Collocation`` of passage.hpp."""
+    nodes, weights, integrals = critical_passages.gauss_nodes(count)
+    return _core.Collocation(nodes=nodes, weights=weights, integrals=integrals)
+
+
 def options_struct(
     *,
     t0: float,
@@ -246,7 +270,8 @@ def options_struct(
     max_step: float,
     placed: str,
     arrivals: bool,
-    examines: bool,
+    singular_tolerance: float | None,
+    rtol: float,
     eps: Regularisation | None,
 ) -> Any:
     """``RunOptions`` of run.hpp."""
@@ -257,7 +282,9 @@ def options_struct(
         max_step=max_step,
         placement=placed,
         arrivals=arrivals,
-        examines=examines,
+        examines=singular_tolerance is not None,
+        singular_tolerance=singular_tolerance or 0.0,
+        collocation=collocation_struct(critical_passages.node_count(rtol)),
         eps_factor=0.0 if eps is None else eps.factor,
         eps_power=0.0 if eps is None else eps.power,
     )
@@ -302,6 +329,7 @@ def steps_struct(steps: StepData) -> Any:
         break_rates=steps.break_rates.reshape(len(steps.breaks), len(steps.end_rate)),
         breaks=steps.breaks.tolist(),
         zones=steps.between_nodes,
+        layers=steps.layers,
         end=steps.end,
     )
 

@@ -44,8 +44,6 @@ class ReturnReason(IntEnum):
     """The next smooth interval begins."""
     ARRIVAL = 7
     """The end lies next to a singular configuration."""
-    PASSAGE = 8
-    """A step would pass a critical configuration that has a residual."""
 
 
 class CompiledRun:
@@ -69,8 +67,9 @@ class CompiledRun:
         ``"automatic"`` or ``"off"``.
     arrivals
         Whether the kernel returns before an end next to a singular configuration.
-    examines
-        Whether the kernel returns before a critical configuration that has a residual.
+    singular_tolerance
+        Residual (row units) up to which a critical configuration counts as singular; None where
+        they are not examined.
 
     Raises
     ------
@@ -93,7 +92,7 @@ class CompiledRun:
         max_step: float,
         placed: str,
         arrivals: bool = False,
-        examines: bool = False,
+        singular_tolerance: float | None = None,
     ) -> None:
         self.kernel_system, self.method, self.norm = kernel_system, method, norm
         self.start, self.t0, self.t_end = state.copy(), t0, float(intervals.ends[-1])
@@ -105,7 +104,8 @@ class CompiledRun:
             max_step=max_step,
             placed=placed,
             arrivals=arrivals,
-            examines=examines,
+            singular_tolerance=singular_tolerance,
+            rtol=norm.rtol,
             eps=method.regularisation,
         )
         self._run = core.Run(  # type: ignore[union-attr]
@@ -157,6 +157,7 @@ class CompiledRun:
             history=history,
             multiplier=None,
             constraint_residual=r.residual,
+            placement="critical" if r.critical else "",
         )
 
     def step_dense(self, system: System, start: FloatArray) -> StepDense:
@@ -166,7 +167,8 @@ class CompiledRun:
         def by_reference() -> StepDense:
             return step_dense(system, scheme, start, self.last(), t)
 
-        if self._run.last().in_zone:
+        last = self._run.last()
+        if last.in_zone or last.critical:
             return by_reference()
         compiled = self._run.step_dense(start, *marshalling.dense_structs(scheme))
 
@@ -208,22 +210,6 @@ class CompiledRun:
         """Prepare for the end next to a singular configuration before which the kernel returned."""
         run = self._run
         self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.interval))
-
-    def append(self, step: StepResult, t_new: float) -> None:
-        """Record a ``step`` that ends at ``t_new`` (s), made by the reference."""
-        self._run.append(
-            t_new,
-            step.state,
-            step.rates,
-            step.end_rate,
-            step.sigmas,
-            step.state_scale,
-            step.rank,
-        )
-
-    def move_to(self, t: float, memory: IntegratorState) -> None:
-        """Go on from ``t`` (s), where such steps have led."""
-        self._run.move_to(t, marshalling.state_struct(memory))
 
     def remember(self, memory: IntegratorState) -> None:
         """Start the next step from ``memory``."""

@@ -1,0 +1,579 @@
+#include "passage.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <complex>
+#include <numeric>
+
+#include "linear.hpp"
+
+namespace srm {
+
+void Collocation::check() const {
+    expect_size("weights", weights.size(), nodes.size());
+    expect_size("integrals", integrals.size(), nodes.size() * nodes.size());
+}
+
+namespace {
+
+using Vector = std::vector<double>;
+
+// The motion has no passage along the curve.
+struct NoPassage {};
+
+// Extends orthonormal rows (count, n) by `more` others.
+void extend(Vector& basis, int n, int more) {
+    for (int k = 0; k < more; ++k) {
+        const int count = static_cast<int>(basis.size()) / n;
+        int next = 0;
+        double most = -1.0;
+        for (int j = 0; j < n; ++j) {
+            double left = 1.0;
+            for (int i = 0; i < count; ++i) left -= basis[i * n + j] * basis[i * n + j];
+            if (left > most) {
+                most = left;
+                next = j;
+            }
+        }
+        Vector e(n, 0.0);
+        e[next] = 1.0;
+        for (int pass = 0; pass < 2; ++pass)
+            for (int i = 0; i < count; ++i)
+                add(-dot(&basis[i * n], e.data(), n), &basis[i * n], e.data(), n);
+        const double length = norm(e.data(), n);
+        for (double& x : e) x /= length;
+        basis.insert(basis.end(), e.begin(), e.end());
+    }
+}
+
+// The curve of closed configurations beside a critical one: CurveThroughSaddle.
+class SaddleCurve {
+public:
+    SaddleCurve(UnitClosures& closures, const CriticalConfiguration& critical, const Vector& x, double t,
+          bool exact, const Constants& constants)
+        : closures_(closures),
+          critical_(critical),
+          n_(closures.n),
+          rank_(static_cast<int>(critical.rows.size())),
+          exact_(exact) {
+        if (n_ - rank_ != 1) throw NoPassage{};
+        strong_ = critical.u;
+        extend(strong_, rank_, rank_ - 1);
+        strong_.erase(strong_.begin(), strong_.begin() + rank_);
+        closures_.evaluate(critical.x, critical.t);
+        combine();
+        // The plane of the displacements that keep the other combinations closed.
+        Vector basis;
+        for (int i = 0; i + 1 < rank_; ++i) {
+            Vector row(&rows_[i * n_], &rows_[i * n_] + n_);
+            const double whole = norm(row.data(), n_);
+            for (int pass = 0; pass < 2; ++pass)
+                for (int k = 0; k < i; ++k)
+                    add(-dot(&basis[k * n_], row.data(), n_), &basis[k * n_], row.data(), n_);
+            const double length = norm(row.data(), n_);
+            if (!(length > constants.dependent_row * whole)) throw NoPassage{};
+            for (double& value : row) value /= length;
+            basis.insert(basis.end(), row.begin(), row.end());
+        }
+        extend(basis, n_, 2);
+        const double* first = &basis[(rank_ - 1) * n_];
+        const double* second = first + n_;
+        const double a = form(first, first), c = form(second, second);
+        const double b = 0.5 * (form(first, second) + form(second, first));
+        const double middle = 0.5 * (a + c), radius = std::hypot(0.5 * (a - c), b);
+        const double low = middle - radius, high = middle + radius;
+        if (!(low < 0.0 && 0.0 < high &&
+              std::min(-low, high) > constants.definite * std::max(-low, high)))
+            throw NoPassage{};
+        const double angle = 0.5 * std::atan2(2.0 * b, a - c);
+        Vector of_low(n_, 0.0), of_high(n_, 0.0);
+        add(std::cos(angle), first, of_high.data(), n_);
+        add(std::sin(angle), second, of_high.data(), n_);
+        add(-std::sin(angle), first, of_low.data(), n_);
+        add(std::cos(angle), second, of_low.data(), n_);
+        // delta > 0: the coordinate of the negative curvature keeps its sign.
+        delta_ = critical.residual;
+        const bool positive = delta_ > 0.0;
+        kept_ = positive ? of_low : of_high;
+        along = positive ? of_high : of_low;
+        const double of_kept = positive ? -low : high, of_along = positive ? high : -low;
+        level_ = exact ? 0.0 : 2.0 * std::abs(delta_) / of_kept;
+        ratio_ = of_along / of_kept;
+        width = std::sqrt(level_ / ratio_);
+        Vector away(n_), on(n_), slope(n_);
+        closures_.difference(critical.x, critical.t, x, t, away.data());
+        beta = dot(along.data(), away.data(), n_);
+        const double beside = dot(kept_.data(), away.data(), n_);
+        sign_ = (exact ? beside * beta : beside) > 0.0 ? 1.0 : -1.0;
+        hyperbola(beta, on, slope);
+        const double distance = norm(away.data(), n_);
+        add(-1.0, on.data(), away.data(), n_);
+        if (!(norm(away.data(), n_) < constants.largest_deviation * distance)) throw NoPassage{};
+    }
+
+    // The point of the hyperbola at `at`, as a displacement from q*, and its derivative.
+    void hyperbola(double at, Vector& away, Vector& slope) const {
+        double kept = std::sqrt(level_ + ratio_ * at * at), rise = ratio_ * at / kept;
+        const double sign = exact_ && at < 0.0 ? -sign_ : sign_;
+        kept *= sign;
+        rise *= sign;
+        for (int j = 0; j < n_; ++j) {
+            away[j] = at * along[j] + kept * kept_[j];
+            slope[j] = along[j] + rise * kept_[j];
+        }
+    }
+
+    // Newton's step onto the configuration at `at`, from a place next to it, and the direction of
+    // the curve, of which the part along beta is 1; solve_bend() then refers to that place.
+    void linearise(const Vector& x, double t, double at, bool closed, Vector& step,
+                   Vector& tangent) {
+        closures_.evaluate(x, t);
+        combine();
+        const double target = exact_ && !closed ? delta_ : 0.0;
+        step.assign(n_, 0.0);
+        closures_.difference(critical_.x, critical_.t, x, t, step.data());
+        const double off = dot(along.data(), step.data(), n_) - at;
+        for (int i = 0; i < rank_; ++i) step[i] = -values_[i];
+        step[rank_ - 1] += target;
+        step[rank_] = -off;
+        tangent.assign(n_, 0.0);
+        tangent[rank_] = 1.0;
+        std::copy(along.begin(), along.end(), &rows_[rank_ * n_]);
+        for (Vector* side : {&step, &tangent}) solve_rows(*side);
+    }
+
+    // Minus the solution for the bias (all rows), Gdot v - s'' in row units.
+    void solve_bend(const Vector& bias, Vector& bend) {
+        bend.assign(n_, 0.0);
+        for (int i = 0; i < rank_; ++i)
+            for (int k = 0; k < rank_; ++k)
+                bend[i] -= weight(i, k) * bias[critical_.rows[k]];
+        solve_rows(bend);
+    }
+
+    double beta = 0.0, width = 0.0;
+    Vector along;
+
+private:
+    double weight(int i, int k) const {
+        return i + 1 < rank_ ? strong_[i * rank_ + k] : critical_.u[k];
+    }
+
+    // The combinations of g and G, the critical one last.
+    void combine() {
+        values_.assign(rank_, 0.0);
+        rows_.assign(static_cast<std::size_t>(n_) * n_, 0.0);
+        for (int i = 0; i < rank_; ++i)
+            for (int k = 0; k < rank_; ++k) {
+                values_[i] += weight(i, k) * closures_.g[critical_.rows[k]];
+                add(weight(i, k), &closures_.G[critical_.rows[k] * n_], &rows_[i * n_], n_);
+            }
+    }
+
+    double form(const double* a, const double* b) const {
+        double sum = 0.0;
+        for (int i = 0; i < n_; ++i) sum += a[i] * dot(&critical_.hessian[i * n_], b, n_);
+        return sum;
+    }
+
+    void solve_rows(Vector& side) {
+        matrix_ = rows_;
+        if (!solve(matrix_, side)) throw NoPassage{};
+    }
+
+    UnitClosures& closures_;
+    const CriticalConfiguration& critical_;
+    const int n_, rank_;
+    const bool exact_;
+    double delta_ = 0.0, level_ = 0.0, ratio_ = 1.0, sign_ = 1.0;
+    Vector strong_, kept_, values_, rows_, matrix_;
+};
+
+struct Node {
+    Vector x;  // (nq + nv,), rates unused
+    double time = 0.0;
+    double beta = 0.0;
+    Vector tangent, rates;  // (n,)
+    double off = 0.0, inertia = 0.0, power = 0.0, sigma = 0.0;
+    Vector acceleration;  // (nv,)
+};
+
+struct Found {
+    Node node;
+    double energy, t;
+};
+
+class Passage {
+public:
+    Passage(UnitClosures& closures, const CriticalConfiguration& critical, double t,
+            const Vector& state, double end, bool exact, double rtol,
+            const Collocation& collocation, const Constants& constants)
+        : closures_(closures),
+          system_(closures.system),
+          critical_(critical),
+          constants_(constants),
+          collocation_(collocation),
+          count_(static_cast<int>(collocation.nodes.size())),
+          nq_(system_.nq),
+          nv_(system_.nv),
+          n_(closures.n),
+          driven_(system_.driven()),
+          rtol_(rtol),
+          end_(end),
+          curve_(closures, critical, state, t, exact, constants) {
+        Vector rates(n_);
+        for (int j = 0; j < nv_; ++j) rates[j] = state[nq_ + j] / closures.unit(j);
+        if (driven_) rates[nv_] = 1.0 / closures.time_unit;
+        const double start = curve_.beta;
+        Node here = evaluated(state, t, start, rates, true);
+        here.x = state;
+        here.time = t;
+        if (!(dot(rates.data(), here.tangent.data(), n_) * start < 0.0)) throw NoPassage{};
+        heading_ = start > 0.0 ? -1.0 : 1.0;
+        width_ = curve_.width > 0.0 ? curve_.width : std::abs(start);
+        const double speed = dot(curve_.along.data(), rates.data(), n_);
+        energy_ = 0.5 * here.inertia * speed * speed;
+        clock_ = t;
+        found_.push_back({std::move(here), energy_, t});
+        const double reach = std::asinh(std::abs(start) / width_);
+        const Vector edges = panel_edges(reach, !exact);
+        for (std::size_t k = 0; k + 1 < edges.size() && clock_ < end_; ++k)
+            panel(heading_ * edges[k], heading_ * edges[k + 1]);
+        if (clock_ < end_) {
+            point(-start, energy_, clock_);
+            if (driven_) found_.back().t = found_.back().node.time;
+        }
+    }
+
+    std::vector<PassagePoint> points() const {
+        std::vector<PassagePoint> out;
+        for (const Found& one : found_) {
+            PassagePoint p{one.t, one.node.sigma, one.node.x, Vector(2 * nv_)};
+            if (!out.empty()) {
+                const double rate = speed(one.node, one.energy);
+                for (int j = 0; j < nv_; ++j)
+                    p.state[nq_ + j] = rate * one.node.tangent[j] * closures_.unit(j);
+            }
+            std::copy_n(&p.state[nq_], nv_, p.rate.begin());
+            std::copy(one.node.acceleration.begin(), one.node.acceleration.end(),
+                      p.rate.begin() + nv_);
+            out.push_back(std::move(p));
+        }
+        return out;
+    }
+
+private:
+    // The node next to a place, from one evaluation there with the rates (n,), in units.
+    Node evaluated(const Vector& x, double t, double beta, const Vector& rates, bool closed) {
+        Node node;
+        Vector step;
+        curve_.linearise(x, t, beta, closed, step, node.tangent);
+        const double grown = growth(x, t, node.tangent);
+        for (double& value : node.tangent) value /= grown;
+        Vector state(x);
+        for (int j = 0; j < nv_; ++j) state[nq_ + j] = rates[j] * closures_.unit(j);
+        system_.evaluate(t, state.data(), System::ZoneView{});
+        node.sigma = system_.sigma();
+        Vector bias(system_.bias());
+        for (std::size_t i = 0; i < bias.size(); ++i)
+            bias[i] *= system_.residual_scale(static_cast<int>(i));
+        Vector turned, own(nv_), mass(nv_), all(nv_), working(nv_), turning(nv_), inertial(nv_);
+        curve_.solve_bend(bias, turned);
+        for (int j = 0; j < nv_; ++j) {
+            own[j] = node.tangent[j] * closures_.unit(j);
+            turning[j] = turned[j] * closures_.unit(j);
+        }
+        system_.mass_times(own.data(), mass.data());
+        system_.mass_times(turning.data(), inertial.data());
+        system_.working_forces(all.data(), working.data());
+        node.inertia = dot(own.data(), mass.data(), nv_);
+        double forward;
+        if (driven_) {
+            forward = -turned[nv_] / node.tangent[nv_];
+        } else {
+            node.power = dot(own.data(), working.data(), nv_);
+            forward = (dot(own.data(), all.data(), nv_) - dot(own.data(), inertial.data(), nv_)) /
+                      node.inertia;
+        }
+        node.acceleration.resize(nv_);
+        for (int j = 0; j < nv_; ++j) node.acceleration[j] = own[j] * forward + turning[j];
+        node.beta = beta;
+        node.rates = rates;
+        node.off = largest(step.data(), n_);
+        node.x = x;
+        node.time = t;
+        closures_.move(step.data(), node.x, node.time);
+        return node;
+    }
+
+    // Derivative of beta along a tangent whose part along it is 1.
+    double growth(const Vector& x, double t, const Vector& tangent) {
+        if (system_.commutes()) return 1.0;
+        Vector away(n_), delta(2 * nv_, 0.0), rate(2 * nv_, 0.0), charted(2 * nv_);
+        closures_.difference(critical_.x, critical_.t, x, t, away.data());
+        for (int j = 0; j < nv_; ++j) {
+            delta[j] = away[j] * closures_.unit(j);
+            rate[j] = tangent[j] * closures_.unit(j);
+        }
+        system_.chart_rate(delta.data(), rate.data(), charted.data());
+        double out = driven_ ? curve_.along[nv_] * tangent[nv_] : 0.0;
+        for (int j = 0; j < nv_; ++j) out += curve_.along[j] * charted[j] / closures_.unit(j);
+        return out;
+    }
+
+    // beta' of a motion with the kinetic energy (J), or with drives that of their time.
+    double speed(const Node& node, double energy) const {
+        if (driven_) return 1.0 / (node.tangent[nv_] * closures_.time_unit);
+        return heading_ * std::sqrt(2.0 * energy / node.inertia);
+    }
+
+    Vector off_hyperbola(const Node& node) {
+        Vector away(n_), on(n_), slope(n_);
+        closures_.difference(critical_.x, critical_.t, node.x, node.time, away.data());
+        curve_.hyperbola(node.beta, on, slope);
+        add(-1.0, on.data(), away.data(), n_);
+        return away;
+    }
+
+    // The node at beta before its first evaluation, and beta' there, with the kinetic energy (J):
+    // that of the hyperbola, moved by the distance of the last nodes from it.  The mass matrix is
+    // that of the evaluation made last.
+    Node predicted(double beta, double energy, double& speed) {
+        Vector away(n_), tangent(n_), second, third;
+        curve_.hyperbola(beta, away, tangent);
+        std::vector<const Node*> known;
+        for (std::size_t k = found_.size() < 2 ? 0 : found_.size() - 2; k < found_.size(); ++k) {
+            const Node& node = found_[k].node;
+            if (node.beta * node.beta > constants_.extrapolated * std::abs(beta))
+                known.push_back(&node);
+        }
+        if (!known.empty()) {
+            const double b = known.back()->beta;
+            second = off_hyperbola(*known.back());
+            for (double& value : second) value /= b * b;
+            third.assign(n_, 0.0);
+            if (known.size() == 2) {
+                const double a = known.front()->beta;
+                third = second;
+                add(-1.0 / (a * a), off_hyperbola(*known.front()).data(), third.data(), n_);
+                for (double& value : third) value /= b - a;
+                add(-b, third.data(), second.data(), n_);
+            }
+            for (int j = 0; j < n_; ++j) {
+                away[j] += beta * beta * (second[j] + beta * third[j]);
+                tangent[j] += beta * (2.0 * second[j] + 3.0 * beta * third[j]);
+            }
+        }
+        Node out;
+        out.beta = beta;
+        out.x = critical_.x;
+        out.time = critical_.t;
+        closures_.move(away.data(), out.x, out.time);
+        if (!driven_) out.inertia = inertia(tangent);
+        out.tangent = std::move(tangent);
+        speed = this->speed(out, energy);
+        set_rates(out, speed);
+        return out;
+    }
+
+    double inertia(const Vector& tangent) const {
+        Vector own(nv_), mass(nv_);
+        for (int j = 0; j < nv_; ++j) own[j] = tangent[j] * closures_.unit(j);
+        system_.mass_times(own.data(), mass.data());
+        return dot(own.data(), mass.data(), nv_);
+    }
+
+    static void set_rates(Node& node, double speed) {
+        node.rates = node.tangent;
+        for (double& value : node.rates) value *= speed;
+    }
+
+    // The node from an evaluation of `guess`, at its own time with drives, else at t.
+    Node again(const Node& guess, double t, bool closed) {
+        return evaluated(guess.x, driven_ ? guess.time : t, guess.beta, guess.rates, closed);
+    }
+
+    // Whether a node is on the curve and was evaluated with the rates of the speed, for the
+    // tolerance or to rounding.
+    bool solved(const Node& node, double speed) const {
+        const double distance = std::hypot(node.beta, curve_.width);
+        const double rounding = constants_.place_rounding / distance;
+        if (!(node.off <= constants_.passage_converged * rtol_ * distance + rounding)) return false;
+        double change = 0.0, most = 0.0;
+        for (int j = 0; j < n_; ++j) {
+            const double rate = speed * node.tangent[j];
+            change = std::max(change, std::abs(rate - node.rates[j]));
+            most = std::max(most, std::abs(rate));
+        }
+        return change <= (constants_.passage_turned * rtol_ + rounding / distance) * most;
+    }
+
+    void panel(double a, double b) {
+        const Vector& x = collocation_.nodes;
+        const double start = width_ * std::sinh(a), power = found_.back().node.power;
+        Vector slope(count_), t(count_ + 1), energies(count_ + 1), times(count_ + 1);
+        Vector works(count_), durations(count_);
+        std::vector<Node> nodes(count_);
+        for (int i = 0; i < count_; ++i) {
+            const double xi = a + (b - a) * x[i], beta = width_ * std::sinh(xi);
+            const double energy = energy_ + power * (beta - start);
+            if (!(energy > 0.0)) throw NoPassage{};
+            double rate;
+            nodes[i] = predicted(beta, energy, rate);
+            slope[i] = width_ * std::cosh(xi) * (b - a);
+            durations[i] = slope[i] / rate;
+        }
+        integrate(durations, clock_, t);
+        for (int i = 0; i < count_; ++i) nodes[i] = again(nodes[i], t[i], false);
+        for (int sweep = 0;; ++sweep) {
+            if (sweep == constants_.passage_sweeps) throw NoPassage{};
+            for (int i = 0; i < count_; ++i) works[i] = slope[i] * nodes[i].power;
+            integrate(works, energy_, energies);
+            for (double value : energies)
+                if (!(value > 0.0)) throw NoPassage{};
+            for (int i = 0; i < count_; ++i) {
+                durations[i] = slope[i] / speed(nodes[i], energies[i]);
+                if (!(durations[i] > 0.0)) throw NoPassage{};
+            }
+            integrate(durations, clock_, times);
+            bool done = true;
+            for (int i = 0; i < count_; ++i) {
+                const double rate = slope[i] / durations[i];
+                if (solved(nodes[i], rate)) continue;
+                done = false;
+                set_rates(nodes[i], rate);
+                nodes[i] = again(nodes[i], times[i], false);
+            }
+            if (done) break;
+        }
+        const double begin = clock_, energy_before = energy_;
+        energy_ = energies[count_];
+        clock_ = times[count_];
+        for (int i = 0; i < count_; ++i) {
+            const double time = driven_ ? nodes[i].time : times[i];
+            if (time < end_) found_.push_back({std::move(nodes[i]), energies[i], time});
+        }
+        if (!(clock_ >= end_)) return;
+        // The end of the run or of its smooth interval lies in the panel.
+        Vector own{0.0}, clock{begin}, energetic{energy_before};
+        own.insert(own.end(), x.begin(), x.end());
+        own.push_back(1.0);
+        clock.insert(clock.end(), times.begin(), times.end());
+        energetic.insert(energetic.end(), energies.begin(), energies.end());
+        const double at = bisected(own, clock, end_);
+        point(width_ * std::sinh(a + (b - a) * at), interpolated(own, energetic, at), end_);
+    }
+
+    // start + the integrals of `values` (k,) up to the nodes and to the end (k + 1,).
+    void integrate(const Vector& values, double start, Vector& out) const {
+        for (int i = 0; i < count_; ++i)
+            out[i] = start + dot(&collocation_.integrals[i * count_], values.data(), count_);
+        out[count_] = start + dot(collocation_.weights.data(), values.data(), count_);
+    }
+
+    // Goes on to beta, where the motion has the kinetic energy (J) at t; a residual that counts as
+    // zero is closed again.
+    void point(double beta, double energy, double t) {
+        double rate;
+        Node node = predicted(beta, energy, rate);
+        for (int sweep = 0;; ++sweep) {
+            if (sweep == constants_.passage_sweeps) throw NoPassage{};
+            node = again(node, t, true);
+            rate = speed(node, energy);
+            if (solved(node, rate)) break;
+            set_rates(node, rate);
+        }
+        found_.push_back({std::move(node), energy, t});
+    }
+
+    double interpolation_error(double a, double b, bool layer) const {
+        using Complex = std::complex<double>;
+        const double middle = 0.5 * (a + b), half = 0.5 * (b - a), quarter = std::atan(1.0);
+        const Complex of_curve = std::asinh(Complex(0.0, constants_.curvature / width_));
+        const Complex places[] = {{of_curve.real(), 2.0 * quarter},
+                                  {-of_curve.real(), 2.0 * quarter},
+                                  {0.0, quarter}};
+        double error = 0.0;
+        for (int k = 0; k < (layer ? 3 : 2); ++k) {
+            const Complex z = (places[k] - middle) / half, root = std::sqrt(z * z - 1.0);
+            const double radius = std::max(std::abs(z + root), std::abs(z - root));
+            error = std::max(error, std::pow(radius, -count_));
+        }
+        return error;
+    }
+
+    Vector panel_edges(double reach, bool layer) const {
+        const auto accurate = [&](double a, double b) {
+            const double error = interpolation_error(a, b, layer);
+            return error <= std::min(constants_.relative_panel_error,
+                                     constants_.panel_error * rtol_ / (width_ * std::sinh(b)));
+        };
+        const double within = 4.0 / 3.0 * constants_.layer, shortest = constants_.shortest_panel;
+        double edge = reach;
+        Vector out{reach};
+        while (edge > shortest && !(edge <= within && accurate(-edge, edge))) {
+            double length = edge > within ? edge - constants_.layer : 0.5 * edge;
+            while (length > shortest && !accurate(edge - length, edge))
+                length *= constants_.panel_shrinkage;
+            edge -= length;
+            out.push_back(edge);
+        }
+        Vector edges;
+        for (double x : out) edges.push_back(-x);
+        edges.insert(edges.end(), out.rbegin(), out.rend());
+        return edges;
+    }
+
+    // The polynomial through values at x, at a point between.
+    static double interpolated(const Vector& x, const Vector& values, double at) {
+        double above = 0.0, below = 0.0;
+        for (std::size_t i = 0; i < x.size(); ++i) {
+            if (at == x[i]) return values[i];
+            double product = at - x[i];
+            for (std::size_t k = 0; k < x.size(); ++k)
+                if (k != i) product *= x[i] - x[k];
+            above += values[i] / product;
+            below += 1.0 / product;
+        }
+        return above / below;
+    }
+
+    double bisected(const Vector& x, const Vector& values, double value) const {
+        double low = x.front(), high = x.back();
+        for (int k = 0; k < constants_.bisections; ++k) {
+            const double middle = 0.5 * (low + high);
+            (interpolated(x, values, middle) < value ? low : high) = middle;
+        }
+        return 0.5 * (low + high);
+    }
+
+    UnitClosures& closures_;
+    System& system_;
+    const CriticalConfiguration& critical_;
+    const Constants& constants_;
+    const Collocation& collocation_;
+    const int count_, nq_, nv_, n_;
+    const bool driven_;
+    const double rtol_, end_;
+    SaddleCurve curve_;
+    double heading_ = 1.0, width_ = 1.0, energy_ = 0.0, clock_ = 0.0;
+    std::vector<Found> found_;
+};
+
+}  // namespace
+
+std::vector<PassagePoint> passage_along_curve(UnitClosures& closures,
+                                              const CriticalConfiguration& critical, double t,
+                                              const std::vector<double>& state, double end,
+                                              bool exact, double rtol,
+                                              const Collocation& collocation,
+                                              const Constants& constants) {
+    try {
+        return Passage(closures, critical, t, state, end, exact, rtol, collocation, constants)
+            .points();
+    } catch (const NoPassage&) {
+        return {};
+    }
+}
+
+}  // namespace srm

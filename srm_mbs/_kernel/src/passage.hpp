@@ -1,0 +1,40 @@
+// Passages of critical configurations that steps cannot make: integration/critical_passages.py.
+#pragma once
+
+#include <vector>
+
+#include "critical.hpp"
+#include "system.hpp"
+#include "struct_fields.hpp"
+
+namespace srm {
+
+#define SRM_COLLOCATION(field)                                                    \
+    field(std::vector<double>, nodes)     /* (k,), Gauss nodes on [0, 1] */       \
+    field(std::vector<double>, weights)   /* (k,) */                              \
+    field(std::vector<double>, integrals) /* (k, k), of the basis up to the nodes */
+
+struct Collocation {
+    SRM_FIELDS(SRM_COLLOCATION)
+
+    void check() const;
+};
+
+// A point of a motion.
+struct PassagePoint {
+    double t, sigma;
+    std::vector<double> state;  // (nx,)
+    std::vector<double> rate;   // (2 nv,)
+};
+
+// The points of the motion from `state` at t past a critical configuration, along the curve of
+// closed configurations, up to the time `end`; the start is the first of them.  Empty if the motion
+// has no such passage.  Throws EvaluationError.  `exact`: the residual counts as zero.
+std::vector<PassagePoint> passage_along_curve(UnitClosures& closures,
+                                              const CriticalConfiguration& critical, double t,
+                                              const std::vector<double>& state, double end,
+                                              bool exact, double rtol,
+                                              const Collocation& collocation,
+                                              const Constants& constants);
+
+}  // namespace srm

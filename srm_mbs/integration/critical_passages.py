@@ -76,7 +76,7 @@ CONVERGED = 0.01
 rtol."""
 TURNED = 1.0
 """Largest relative change of the rates in that sweep, over rtol."""
-PLACE_ROUNDING = 1e-15
+PLACE_ROUNDING = 5e-15
 """Rounding (units^2) of a place on the curve, times its distance from the critical configuration."""
 EXTRAPOLATED = 1e-4
 """|beta| (units) from which the distance of the curve from its hyperbola is known beyond

@@ -51,8 +51,9 @@ class AlmostChangePoint:
     def levels(self) -> tuple[float, float]:
         """kappa and lambda; the ideal lengths cancel exactly."""
         a, b, c, g = self.crank, self.coupler, self.rocker, self.ground
-        kappa = 0.5 * ((g - a) ** 2 - (b - c) ** 2) - 0.5 * self.d * (2.0 * (b - c) + self.d)
-        lam = 0.5 * ((b + c) ** 2 - (a + g) ** 2) + 0.5 * self.d * (2.0 * (b + c) + self.d)
+        d = (b + self.d) - b  # as the length of the coupler has it
+        kappa = 0.5 * ((g - a) ** 2 - (b - c) ** 2) - 0.5 * d * (2.0 * (b - c) + d)
+        lam = 0.5 * ((b + c) ** 2 - (a + g) ** 2) + 0.5 * d * (2.0 * (b + c) + d)
         return kappa, lam
 
     def half_angles(self, p: Any) -> tuple[Any, Any, Any, Any, Any, Any]:

@@ -16,7 +16,7 @@ from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.critical_passages import CriticalPassages, ExaminedPassage
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.driver import RunRecord, StepSink, Tick
-from srm_mbs.integration.events import EventWatch, Stop, step_dense
+from srm_mbs.integration.events import EventWatch
 from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
 from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.messages import RunFailure, StopReason

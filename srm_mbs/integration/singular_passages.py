@@ -70,6 +70,9 @@ DIP_WIDTHS = (1, 3)
 """Recorded intervals on either side of a minimum in which it is looked for, one after the other."""
 MAX_REFINEMENTS = 12
 """Steps of the search for the minimum of a singular value."""
+SMALLEST_REFINEMENT = 1e-7
+"""Step of that search, over the time in which it began, below which the next one, far shorter, is
+beyond the accuracy of the run."""
 CROSSING_SEARCH = 0.3
 """Distance (rad, scene diagonals) from the dense output within which the singular configuration of
 a crossing is looked for."""
@@ -148,6 +151,7 @@ class ConstraintMonitor:
         The square of the value is a parabola where the motion passes.
         """
         times, squares = t.tolist(), (values**2).tolist()
+        shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
         for _ in range(MAX_REFINEMENTS):
             a, b, c = times
             fa, fb, fc = squares
@@ -156,7 +160,7 @@ class ConstraintMonitor:
                 break
             slope = (fb - fa) / (b - a)
             new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
-            if not a < new < c or abs(new - b) <= 1e-10 * (c - a):
+            if not a < new < c or abs(new - b) <= shortest:
                 break
             value = float(self.smallest(np.array([new]))[0]) ** 2
             left = new < b
@@ -528,17 +532,23 @@ def find_crossings(
     t, sigma = t[inside], sigma[inside]
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
-    monitor = ConstraintMonitor(analysis, dense, tolerance)
+    monitor = None
     if analysis.sigma_reference < SMALL_REFERENCE_PIVOT:
+        monitor = ConstraintMonitor(analysis, dense, tolerance)
         sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
     found: dict[float, Crossing] = {}
     lowest = _lowest(t, sigma, scheme.n_stages)
-    for begin, end in _windows(_may_vanish(sigma, lowest, scheme.n_stages)):
+    windows = [
+        (begin, end, dips)
+        for begin, end in _windows(_may_vanish(sigma, lowest, scheme.n_stages))
+        if (dips := _dips(sigma[begin : end + 1], lowest[begin:end]))
+    ]
+    if not windows and not (steps.placements == CRITICAL).any():
+        return ()
+    monitor = monitor or ConstraintMonitor(analysis, dense, tolerance)
+    for begin, end, dips in windows:
         own = slice(begin, end + 1)
-        dips = _dips(sigma[own], lowest[begin:end])
-        if not dips:
-            continue
         largest = begin + int(np.argmax(sigma[own]))
         scale = float(monitor.smallest(t[largest : largest + 1])[0])
         for first, k, last in dips:

@@ -149,7 +149,7 @@ def test_no_tolerance_is_an_outlier_with_masses_over_eight_decades(share: float)
 
 
 LENGTHS = {"five_bar": 3.0, "squeezing_mechanism": 0.03}
-"""Lengths (s) of runs where they are not 5 s: a chaotic motion, and one of the official benchmark."""
+"""Lengths (s) of runs other than 5 s: of a chaotic motion, and of the official benchmark."""
 OUTLIER = 5.0
 """Largest ratio of the errors at two neighbouring tolerances of 21 from 1e-2 to 1e-12."""
 UNKNOWN = 3.0

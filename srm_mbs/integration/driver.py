@@ -102,6 +102,8 @@ class RunRecord:
     rest
         Time (s) and state (nx,) at the start of the steps that are still here; None if none was
         taken.
+    memory
+        The integrator's state after the last of them, of a run of the reference.
     """
 
     t0: float
@@ -119,6 +121,7 @@ class RunRecord:
     made: int = 0
     watched_time: float = 0.0
     rest: tuple[float, FloatArray] | None = None
+    memory: IntegratorState | None = None
 
     def mark_finished(self, t_end: float) -> None:
         """Mark it as complete."""
@@ -350,9 +353,13 @@ def integrate(
                 passages.accepted(result)
             if accept(result, proposal.t_new):
                 break
-            if jump.found() and breakpoints is not None and t < breakpoints.end:
+            if jump.found() and t < (t_end if breakpoints is None else breakpoints.end):
                 record.breaks.append(len(record.times))
-                memory = breakpoints.past_jump(t, x, memory)
+                if breakpoints is None:
+                    system.begin_step(t, x)
+                    memory = method.resume(system, t, x, memory, norm)
+                else:
+                    memory = breakpoints.past_jump(t, x, memory)
             if sink is not None and len(record.steps) >= sink.block:
                 sink.take(record.data(method.scheme, system.tangent_size))
                 record.rest = t, x
@@ -365,7 +372,7 @@ def integrate(
     # An interrupt between the two appends would leave one list longer.
     del record.times[min(len(record.times), len(record.steps)) :]
     del record.steps[len(record.times) :]
-    record.wall_time = time.perf_counter() - started
+    record.wall_time, record.memory = time.perf_counter() - started, memory
     return record
 
 

@@ -291,6 +291,8 @@ class ReferenceRun(IncrementalRun):
         )
         if record.times:
             self._t, self._state = record.times[-1], record.steps[-1].state
+        if record.memory is not None:
+            self._memory = record.memory
         self._steps += len(record.times)
         self._rejected += sum(a.decision is StepDecision.REJECTED for a in record.attempts)
         self._zone_steps += sum(step.zone is not None for step in record.steps)

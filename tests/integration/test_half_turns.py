@@ -141,3 +141,14 @@ def test_a_bushing_that_turns_back_below_half_a_turn_does_not_jump(backend: str)
     assert "half a turn" not in run.message
     w = np.sqrt(STIFFNESS / AXIAL)
     assert run.v[:, 0] == pytest.approx(speed * np.cos(w * run.t), abs=1e-7)
+
+
+@on_both
+def test_a_simulator_passes_half_turns(backend: str) -> None:
+    speed = 1.05 * np.pi * np.sqrt(STIFFNESS / AXIAL)
+    mechanism = wheel(pin.JointModelRZ(), [speed], (0.0, 0.0, STIFFNESS))
+    simulator = srm.Simulator(mechanism, rtol=1e-9, backend=backend)
+    for _ in range(60):
+        simulator.step(0.1)
+    expected = spinning(np.array([simulator.t]), speed)[0]
+    assert simulator.v[0] == pytest.approx(expected, abs=1e-7)

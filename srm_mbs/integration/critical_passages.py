@@ -36,7 +36,7 @@ from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 
-SEARCH = 0.3
+SEARCH = 0.6
 """Distance (rad, scene diagonals) from the predicted passage within which its critical
 configuration is looked for."""
 PASSED = 0.5
@@ -76,7 +76,7 @@ CONVERGED = 0.01
 rtol."""
 TURNED = 1.0
 """Largest relative change of the rates in that sweep, over rtol."""
-PLACE_ROUNDING = 5e-15
+PLACE_ROUNDING = 2e-15
 """Rounding (units^2) of a place on the curve, times its distance from the critical configuration."""
 EXTRAPOLATED = 1e-4
 """|beta| (units) from which the distance of the curve from its hyperbola is known beyond

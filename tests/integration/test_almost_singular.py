@@ -113,11 +113,11 @@ def test_bars_of_any_difference_turn_the_corner(d: float, rtol: float, backend: 
     check(d, rtol, backend)
 
 
-def test_narrow_layers_cost_at_most_twice_the_evaluations_of_equal_bars() -> None:
-    for rtol in (1e-6, 1e-9):
-        equal = srm.simulate(slider_crank(0.0), T_END, rtol=rtol).stats.evaluations
-        for d in (1e-4, -1e-6, 1e-8, -1e-12):
-            assert check(d, rtol).stats.evaluations < 2 * equal
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-9, 1e-12])
+def test_layers_cost_at_most_twice_the_evaluations_of_equal_bars(rtol: float) -> None:
+    equal = srm.simulate(slider_crank(0.0), T_END, rtol=rtol).stats.evaluations
+    for d in (1e-1, 1e-2, -1e-2, -1e-3, 1e-4, -1e-6, 1e-8, -1e-12):
+        assert check(d, rtol).stats.evaluations <= 2 * equal
 
 
 @pytest.mark.parametrize("d", [0.0, 1e-12, 1e-6, -1e-3, 1e-1])

@@ -1,0 +1,70 @@
+"""Four-bars that avoid their change points by the length of their coupler.
+
+The reference is the closed form of their motion, without closures and without Pinocchio
+(:mod:`tests.support.change_point`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from tests.support.change_point import CHANGE_POINTS, AlmostChangePoint
+
+T_END = 5.0
+OFFSETS = [sign * 10.0**-k for k in range(1, 13) for sign in (1, -1)]
+
+
+def check(name: str, d: float, rtol: float, backend: str) -> None:
+    four_bar = AlmostChangePoint(*CHANGE_POINTS[name], d)
+    solution = srm.simulate(
+        four_bar.mechanism(), T_END, rtol=rtol, singular_tolerance=0.0, backend=backend
+    )
+    assert solution.success, solution.message
+    assert four_bar.error(solution) < 1000.0 * rtol + 1e-9
+
+
+@pytest.mark.parametrize("name", CHANGE_POINTS)
+@pytest.mark.parametrize("d", [1e-2, -1e-5, 1e-8, -1e-11])
+@pytest.mark.parametrize(("rtol", "backend"), [(1e-4, "python"), (1e-9, "kernel")])
+def test_a_four_bar_next_to_its_change_point_follows_the_length_of_its_coupler(
+    name: str, d: float, rtol: float, backend: str
+) -> None:
+    check(name, d, rtol, backend)
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("name", CHANGE_POINTS)
+@pytest.mark.parametrize("backend", ["kernel", "python"])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-9, 1e-12])
+@pytest.mark.parametrize("d", OFFSETS)
+def test_couplers_of_any_difference_turn_the_corner(
+    name: str, d: float, rtol: float, backend: str
+) -> None:
+    check(name, d, rtol, backend)
+
+
+@pytest.mark.parametrize("name", CHANGE_POINTS)
+@pytest.mark.parametrize("d", [1e-1, -1e-1, 1e-6, -1e-6])
+def test_the_closed_form_closes_the_loop_and_its_rates_are_its_derivatives(
+    name: str, d: float
+) -> None:
+    four_bar = AlmostChangePoint(*CHANGE_POINTS[name], d)
+    p = np.linspace(0.1, 1.4, 14)
+    angles, slopes = four_bar.motion(p)
+    coupler = four_bar.coupler + d
+    bars = zip((four_bar.crank, coupler, -four_bar.rocker), angles)
+    end = sum(length * np.exp(1j * angle) for length, angle in bars)
+
+    np.testing.assert_allclose(end, four_bar.ground, atol=1e-14)
+    ahead, behind = (four_bar.motion(p + step)[0] for step in (1e-6, -1e-6))
+    np.testing.assert_allclose((ahead - behind) / 2e-6, slopes, rtol=1e-6, atol=1e-6)
+
+
+def test_a_four_bar_meets_its_change_points_several_times() -> None:
+    for name in CHANGE_POINTS:
+        four_bar = AlmostChangePoint(*CHANGE_POINTS[name], 1e-6)
+        run = srm.simulate(four_bar.mechanism(), T_END, singular_tolerance=0.0)
+        assert len(run.crossings) >= 8
+        assert {passage.kind for passage in run.crossings} == {"avoided"}

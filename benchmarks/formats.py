@@ -30,6 +30,9 @@ except srm.InputError as error:
     sys.exit(3)
 """
 REFUSED = 3
+KINDS = ("loaded", "refused", "no mechanism", "slow", "fault")
+NO_MECHANISM = ("nothing in this mechanism can move", "there is no <body>", "unknown element <")
+"""Beginnings of refusals of objects, scenes and fragments that others include."""
 SUFFIXES = (".xml", ".mjcf", ".urdf", ".sdf", ".world")
 ROOTS = {"robot": "URDF", "sdf": "SDF", "mujoco": "MJCF"}
 ROOT_TAG = re.compile(rb"<([A-Za-z_][\w.:-]*)")
@@ -45,7 +48,8 @@ class Outcome:
     path, format
         Of the file.
     kind
-        ``loaded``, ``refused``, ``slow`` or ``fault`` (a traceback or a signal).
+        One of :data:`KINDS`; ``no mechanism``: an object, a scene or a fragment, which others
+        include; ``fault``: a traceback or a signal.
     reason
         Of a refusal or a fault.
     seconds
@@ -88,7 +92,12 @@ def attempt(path: Path, form: str, limit: float) -> Outcome:
     if done.returncode == 0:
         return Outcome(path, form, "loaded", "", seconds)
     if done.returncode == REFUSED:
-        return Outcome(path, form, "refused", done.stdout.strip(), seconds)
+        reason = done.stdout.strip()
+        element, _, problem = reason.partition("|")
+        part = problem.startswith(NO_MECHANISM[:2]) or (
+            element == "<mujoco>" and problem.startswith(NO_MECHANISM[2])
+        )
+        return Outcome(path, form, "no mechanism" if part else "refused", reason, seconds)
     lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
     return Outcome(path, form, "fault", lines[-1], seconds)
 
@@ -97,9 +106,9 @@ def table(folder: Path, outcomes: list[Outcome]) -> str:
     """Outcomes by package, in Markdown."""
     rows = Counter((o.path.relative_to(folder).parts[0], o.format, o.kind) for o in outcomes)
     places = sorted({(package, form) for package, form, _ in rows})
-    lines = ["| package | format | files | loaded | refused | slow | faults |", "|---" * 7 + "|"]
+    lines = [f"| package | format | files | {' | '.join(KINDS)} |", "|---" * 8 + "|"]
     for place in places:
-        kinds = [rows[(*place, kind)] for kind in ("loaded", "refused", "slow", "fault")]
+        kinds = [rows[(*place, kind)] for kind in KINDS]
         lines.append(f"| {' | '.join([*place, str(sum(kinds)), *map(str, kinds)])} |")
     return "\n".join(lines)
 

@@ -44,6 +44,8 @@ OTHER_STARTS = 8
 """Random starts of that search."""
 SEARCH_STEPS = 200
 """Evaluations of the trust-region solve."""
+RESTART_STEPS = 100
+"""The same of each restart, so that loops that cannot close are refused in reasonable time."""
 POLISHING_EVALUATIONS = 61
 """Evaluations of Newton's iteration after it."""
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
@@ -294,7 +296,8 @@ def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexAr
     best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
     for size in (0.0, *PERTURBATIONS):
         spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
-        q = close_positions(problem, problem.move(start, spread, free), free)
+        steps = RESTART_STEPS if size else SEARCH_STEPS
+        q = close_positions(problem, problem.move(start, spread, free), free, steps)
         if problem.closed(q):
             break
         gap = float(np.linalg.norm(problem.mismatch(q)))

@@ -15,6 +15,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles
+from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
@@ -35,6 +36,8 @@ JOINT_TYPES = {
     "HelicalUnaligned": "screw",
 }
 """Pinocchio's joint types as URDF calls them."""
+MAX_RESIDUALS = 100
+"""Singular passages whose residuals are looked at."""
 MAX_LISTED = 8
 """Longest list of numbers that is given in full; of longer ones the ends."""
 BUSHING_ANGULAR = [False, False, False, True, True, True]
@@ -66,7 +69,7 @@ def run_rows(solution: SimulationResult, *, passages: bool = True) -> list[tuple
         rows += [
             ("placements", f"{stats.placements} in advance, {stats.replaced} redone"),
             ("zone steps", f"{stats.zone_steps}"),
-            *([("singular passages", f"{len(solution.crossings)}")] if passages else []),
+            *([("singular passages", _passages_text(solution))] if passages else []),
             ("largest ||g||", f"{position:.2e} (m, rad)"),
             ("largest ||G v||", f"{rate:.2e} (m/s, rad/s)"),
         ]
@@ -75,6 +78,18 @@ def run_rows(solution: SimulationResult, *, passages: bool = True) -> list[tuple
         ("wall time", f"{stats.wall_time:.3g} s"),
     ]
     return rows
+
+
+def _passages_text(solution: SimulationResult) -> str:
+    """Number of the singular passages, and the residuals that the closures have there."""
+    crossings = solution.crossings
+    listed = crossings[:MAX_RESIDUALS]
+    found = [abs(one.residual) for one in listed if one.residual is not None]
+    if not max(found, default=0.0) > ROUNDED_RESIDUAL:
+        return f"{len(crossings)}"
+    avoided = sum(one.kind == "avoided" for one in listed)
+    some = "" if len(listed) == len(crossings) else f" of the first {len(listed)}"
+    return f"{len(crossings)}; residuals{some} up to {max(found):.1e}, {avoided} avoided"
 
 
 def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:

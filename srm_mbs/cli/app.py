@@ -269,7 +269,8 @@ def convert(
 def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe = None) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
-    With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.
+    With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.  Of
+    a saved run (.npz) first a summary, with the residuals of the singular configurations it met.
     """
     from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (
@@ -278,9 +279,16 @@ def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe =
         joint_rows,
         loop_rows,
         mechanism_rows,
+        run_rows,
     )
 
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside, keyframe=keyframe)
+    if Path(model).suffix == ".npz":
+        solution = srm_mbs.load_solution(model, allow_outside=allow_outside)
+        table(run_rows(solution))
+        echo("")
+        mechanism = solution.mechanism
+    else:
+        mechanism = srm_mbs.load(model, allow_outside=allow_outside, keyframe=keyframe)
     table(mechanism_rows(mechanism))
     for header, rows in (
         (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),

@@ -77,7 +77,8 @@ rtol."""
 TURNED = 1.0
 """Largest relative change of the rates in that sweep, over rtol."""
 PLACE_ROUNDING = 2e-15
-"""Rounding (units^2) of a place on the curve, times its distance from the critical configuration."""
+"""Rounding (units^2) of a place on the curve, times its distance from the critical
+configuration."""
 EXTRAPOLATED = 1e-4
 """|beta| (units) from which the distance of the curve from its hyperbola is known beyond
 rounding."""
@@ -400,7 +401,7 @@ class PassageAlongCurve:
             if not (energies > 0.0).all():
                 raise ValueError("the energy does not suffice to pass")
             speeds = [self._speed(*one) for one in zip(nodes, energies.tolist())]
-            if not (speeds * slope > 0.0).all():
+            if not (np.array(speeds) * slope > 0.0).all():
                 raise ValueError("the drives lead where the mechanism cannot follow")
             times = self._clock + weights @ (slope / speeds)
             left = [i for i, node in enumerate(nodes) if not self._solved(node, speeds[i])]

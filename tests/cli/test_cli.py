@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,21 @@ def saved_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("saved") / "run.npz"
     run("simulate", "slider_crank", "--t-end", 2, "--out", path)
     return path
+
+
+def test_info_of_a_saved_run_shows_the_residuals_of_the_singular_configurations_it_met(
+    saved_run: Path, tmp_path: Path
+) -> None:
+    ideal = srm.load("slider_crank")
+    pin = replace(ideal.loops[0], a=srm.Anchor("rod", xyz=(2.0 + 1e-6, 0.0, 0.0)))
+    almost = srm.Mechanism(ideal.model, (pin,))
+    state = srm.assemble(almost, {"crank": 0.3}, {"crank": 8.0}, guess={"rod": -0.6})
+    srm.simulate(almost.with_state(state.q, state.v), 0.5).save(tmp_path / "almost.npz")
+
+    assert row(run("info", saved_run), "singular passages") == "1"
+    assert row(run("info", tmp_path / "almost.npz"), "singular passages").endswith(
+        "; residuals up to 2.6e-07, 1 avoided"
+    )
 
 
 # -- help -------------------------------------------------------------------------------------

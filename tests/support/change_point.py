@@ -163,7 +163,8 @@ class AlmostChangePoint:
     def error(self, solution: srm.Solution) -> float:
         """Largest error of angles and rates at the end of a run: of the angles and rates there for
         the value of p, and of the time, times the rates."""
-        (start, rate, energy), sign = self.begin, np.sign(self.begin[1])
+        start, rate, energy = self.begin
+        sign = np.sign(rate)
         q, v, t = solution.q[-1], solution.v[-1], float(solution.t[-1])
         angles = np.array([q[0], q[0] + q[1], q[2]])
         rates = np.array([v[0], v[0] + v[1], v[2]])

@@ -222,3 +222,10 @@ class CartesianPendulum:
     def step_limit(self, state: FloatArray) -> float:
         """No limit."""
         return np.inf
+
+    def begin_step(self, t: float, state: FloatArray) -> None:
+        """Nothing jumps."""
+
+    def past_jump(self, t: float, state: FloatArray) -> float:
+        """Nothing jumps."""
+        return -np.inf

@@ -55,7 +55,7 @@ LAYER = 1.5
 """|xi| up to which the panel in the middle reaches; a third more instead of a short panel more."""
 SHORTEST_PANEL = 0.1
 """Length of a panel in xi, at least."""
-PANEL_ERROR = 10.0
+PANEL_ERROR = 1.0
 """Largest error of interpolation on a panel (units), over rtol.  Gauss quadrature, which leads from
 panel to panel, is far more accurate."""
 RELATIVE_PANEL_ERROR = 0.01

@@ -13,7 +13,7 @@ import pytest
 import srm_mbs as srm
 from tests.support.backends import needs_kernel, on_both
 from tests.support.mechanisms import floating_ring
-from tests.support.memory import growth, needs_linux
+from tests.support.memory import ON_LINUX, growth
 from tests.support.snapshots import check_messages, refused
 
 
@@ -297,7 +297,7 @@ def test_drives_have_their_knots_between_steps_and_on_them(backend: str, dt: flo
 
 
 @needs_kernel
-@needs_linux
+@pytest.mark.skipif(not ON_LINUX, reason="reads /proc/self/status")
 def test_memory_does_not_grow(slider_crank: srm.Mechanism) -> None:
     simulator = srm.Simulator(slider_crank, tableau="erk4", step=1e-3, backend="kernel")
 

@@ -16,7 +16,7 @@ from srm_mbs.simulation import streamed_output
 from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
-from tests.support.memory import needs_linux
+from tests.support.memory import ON_LINUX
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -137,7 +137,7 @@ print(runs[0].stats.steps, used)
 """
 
 
-@needs_linux
+@pytest.mark.skipif(not ON_LINUX, reason="reads /proc/self/status")
 @pytest.mark.stress
 def test_ten_thousand_turns_with_two_output_times_take_little_memory() -> None:
     command = [sys.executable, "-c", LONG_RUN, "10000"]

@@ -10,10 +10,13 @@ from pathlib import Path
 import pytest
 
 from tests.stress.isolation import ROOT
-from tests.support.memory import needs_linux
+from tests.support.memory import ON_LINUX
 from tests.support.urdf_files import tree
 
-pytestmark = [pytest.mark.stress, needs_linux]
+pytestmark = [
+    pytest.mark.stress,
+    pytest.mark.skipif(not ON_LINUX, reason="reads /proc/self/status"),
+]
 
 ROWS = 10**7
 MEGABYTES = 500

@@ -12,7 +12,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.constraints import row_algebra
 from srm_mbs.integration.kernel import backend
 from tests.support import reduced
-from tests.support.memory import growth, needs_linux
+from tests.support.memory import ON_LINUX, growth
 
 pytestmark = [
     pytest.mark.stress,
@@ -30,7 +30,7 @@ def check_cranks(solution: srm.Solution, n: int) -> None:
         assert np.abs(rate - expected[:, 1]).max() < 1e-7
 
 
-@needs_linux
+@pytest.mark.skipif(not ON_LINUX, reason="reads /proc/self/status")
 @pytest.mark.parametrize("n", [320, 640])
 def test_hundreds_of_loops_load_and_run(n: int) -> None:
     """Pinocchio's own workspace would take 8 GB for 320 loops, 67 GB for 640."""

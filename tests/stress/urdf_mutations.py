@@ -127,8 +127,8 @@ class UrdfMutator:
             return None
         change = f"{place.path} deleted"
         written_out = None
-        if place.drawn:
-            expectation = unchanged()
+        if place.drawn or (tag == "link" and node.get("name") == "world"):
+            expectation = unchanged()  # the ground needs no link
         elif tag in OPTIONAL or tag == "inertial":
             expectation = legal(*MOVING)
             if tag == "inertial":

@@ -1,7 +1,7 @@
 """Memory of this process, as Linux counts it.
 
 ``ru_maxrss`` does not serve: it never falls, and in a child it begins at the largest memory of the
-process that started it.
+process that started it.  Nothing heavy is imported here: children measure themselves with it.
 """
 
 from __future__ import annotations
@@ -12,11 +12,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
-needs_linux = pytest.mark.skipif(
-    not sys.platform.startswith("linux"), reason="reads /proc/self/status"
-)
+ON_LINUX = sys.platform.startswith("linux")
 
 
 def largest() -> float:

@@ -223,6 +223,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    time_dependent = True
     singularities = None
 
     def __init__(

@@ -229,6 +229,15 @@ class Mechanics(Manifold):
         """Whether a controller acts."""
         return self._controller is not None
 
+    @cached_property
+    def time_dependent(self) -> bool:
+        """Whether drives, laws of forces, functions of the user or a controller act, which may
+        depend on time; one whose output is held does not."""
+        forces = [] if self._forces is None else self._forces.constants()
+        laws = any(len(force.get("curves", ())) for force in forces)
+        acts = self.controlled and self.held is None
+        return acts or self.has_user_forces or laws or bool(self.mechanism.drives)
+
     @property
     def has_user_forces(self) -> bool:
         """Whether force elements are functions of the user."""

@@ -159,6 +159,10 @@ class System(Protocol):
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
 
     @property
+    def time_dependent(self) -> bool:
+        """Whether rates may depend on time itself."""
+
+    @property
     def singularities(self) -> SingularityAnalysis | None:
         """Data for the analysis of singular configurations; None without closures, and for DAEs,
         whose equations are known at single points only."""

@@ -38,25 +38,27 @@ void StepRecords::append(const StepResult& r, double t_new, int placement) {
     ranks.push_back(r.rank);
     error_ratios.push_back(r.error_ratio);
     placements.push_back(placement);
+    stiff.push_back(r.stiff ? 1.0 : 0.0);
     held.push_back(r.held ? 1.0 : 0.0);
 }
 
 void StepRecords::clear() {
     for (auto* values : {&times, &states, &rates, &corrections, &sigmas, &ranks, &error_ratios,
-                         &placements, &held, &breaks, &break_rates})
+                         &placements, &stiff, &held, &breaks, &break_rates})
         values->clear();
     zones.clear();
 }
 
-Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
-         IntegratorState memory_, std::vector<double> state_, SmoothIntervals intervals,
-         const RunOptions& options)
+Run::Run(System& system, SplitStep step_, std::unique_ptr<SplitStep> stiff_step,
+         std::unique_ptr<Control> control_, IntegratorState memory_, std::vector<double> state_,
+         SmoothIntervals intervals, const RunOptions& options)
     : system(system),
       step(std::move(step_)),
       control(std::move(control_)),
       memory(std::move(memory_)),
       state(std::move(state_)),
       end_rate(2 * system.nv),
+      stiff_step_(std::move(stiff_step)),
       intervals_(std::move(intervals)),
       eps_factor_(options.eps_factor),
       eps_power_(options.eps_power),
@@ -66,9 +68,7 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
       smallest_(constants().smallest_step * std::abs(t_end() - options.t0)),
       open_residual_(constants().open_residual),
       search_below_(constants().search_below),
-      examines_(options.examines),
-      abscissae_(step.scheme.c) {
-    abscissae_.push_back(1.0);
+      examines_(options.examines) {
     enter_interval();
 }
 
@@ -188,7 +188,8 @@ Stop Run::attempt(StepDecision& decision) {
     try {
         const double theta =
             eps_factor_ > 0.0 ? -std::expm1(-h / (eps_factor_ * std::pow(h, eps_power_))) : 1.0;
-        result = &step.make(t_, h, state.data(), memory, theta);
+        made_by_ = &stepper();
+        result = &made_by_->make(t_, h, state.data(), memory, theta);
     } catch (const EvaluationError&) {
         evaluation_failed = true;
     }
@@ -210,7 +211,7 @@ Stop Run::attempt(StepDecision& decision) {
     records.append(*result, proposal.t_new, placement);
     end_rate = result->end_rate;
     std::copy(result->state.begin(), result->state.end(), state.begin());
-    step.accept(memory);
+    made_by_->accept(memory);
     t_ = proposal.t_new;
     if (made_++ % steps == 0) watched_time_ = t_;
     return t_ < t_end() ? Stop::chunk : Stop::finished;
@@ -221,9 +222,11 @@ bool Run::passes_residual(const StepResult& r) {
     if (known_ || r.quiet) return false;
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
     if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return false;
-    const double zero = zero_within(abscissae_, r.sigmas);
+    std::vector<double> abscissae(made_by_->scheme.c);
+    abscissae.push_back(1.0);
+    const double zero = zero_within(abscissae, r.sigmas);
     const bool inside = 0.0 < zero && zero <= 1.0;
-    return examine(r.t + (inside ? zero : abscissae_[low - r.sigmas.begin()]) * r.h);
+    return examine(r.t + (inside ? zero : abscissae[low - r.sigmas.begin()]) * r.h);
 }
 
 // Whether the critical configuration of the passage expected at `zero` has a residual.

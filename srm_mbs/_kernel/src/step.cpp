@@ -16,9 +16,14 @@ void ButcherTableau::check() const {
     expect_size("c", c.size(), s);
     if (!error.empty()) expect_size("error", error.size(), s + 1);
     expect_size("gap_half_widths", gap_half_widths.size(), gap_centres.size());
+    expect_within("lead", lead, 0, static_cast<long>(s) - 1);
+    if (!implicit.empty()) expect_size("implicit", implicit.size(), s * s);
 }
 
-void ErrorNorm::check() const { expect_size("one", one.size(), atol.size()); }
+void ErrorNorm::check() const {
+    expect_size("one", one.size(), atol.size());
+    expect_size("unit", unit.size(), atol.size());
+}
 
 void IntegratorState::check() const {
     expect_size("state_scale", state_scale.size(), rate.size());
@@ -93,6 +98,63 @@ SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& co
     result.sigmas.resize(s + 1);
     result.multiplier.resize(nv_);
     deficient_stages_.reserve(s + 1);
+    apart_.resize(n_);
+    if (scheme.implicit.empty()) return;
+    const double gamma = scheme.implicit[scheme.lead * (s + 1)];
+    linear_ = std::make_unique<LinearStages>(system, gamma, norm.unit, constants);
+    linear_weights_.resize(s * s);
+    time_shares_.resize(s);
+    for (int i = 0; i < s; ++i)
+        for (int j = 0; j <= i; ++j) {
+            time_shares_[i] += scheme.implicit[i * s + j];
+            if (j < i) linear_weights_[i * s + j] = scheme.implicit[i * s + j] / gamma;
+        }
+}
+
+// The rate of the stage j of a linearly implicit scheme, from the chart rate in its place.
+void SplitStep::linear_rate(int j) {
+    const int s = scheme.stages(), n = n_;
+    double* const rate = &result.rates[j * n];
+    const double* by_time = linear_->by_time().data();
+    std::fill(error_.begin(), error_.end(), 0.0);
+    for (int k = scheme.lead; k < j; ++k)
+        add(linear_weights_[j * s + k], &result.rates[k * n], error_.data(), n);
+    const double share = h_ * time_shares_[j];
+    for (int i = 0; i < n; ++i) rate[i] += error_[i] + share * by_time[i];
+    linear_->solve(rate);
+    for (int i = 0; i < n; ++i) rate[i] -= error_[i];
+}
+
+// h |lambda|, seen from the last two stages of an explicit step; NaN if they do not differ.
+double SplitStep::stiffness() const {
+    const int s = scheme.stages(), n = n_;
+    const double *last = &result.rates[s * n], *other = last - n;
+    double* const change = scratch_.data();
+    for (int i = nv_; i < n; ++i) change[i] = last[i] - other[i];
+    const double dq = system_.position_norm(apart_.data());
+    const double dv = system_.position_norm(&apart_[nv_]);
+    if (!(dq > 0.0 && dv > 0.0)) return std::numeric_limits<double>::quiet_NaN();
+    const double da = system_.position_norm(change + nv_);
+    return h_ * std::min(da / dv, std::sqrt(da / dq));
+}
+
+// Takes the step into account, which was accepted: methods/stiffness.py.
+void SplitStep::count_stiffness(IntegratorState& memory) {
+    if (!linear_) {
+        if (memory.stiff || !(scheme.stable_to > 0.0) || norm.negligible == 0.0) return;
+        if (!monitored_ && stiffness() > scheme.stable_to) {
+            ++memory.stiff_steps;
+            memory.other_steps = 0;
+        } else if (memory.stiff_steps && ++memory.other_steps == constants.other_steps) {
+            memory.stiff_steps = memory.other_steps = 0;
+        }
+    } else if (memory.stiff) {
+        const bool stiff = !(linear_->stiffness(h_) < constants.not_stiff);
+        memory.stiff_steps = stiff ? 0 : memory.stiff_steps + 1;
+    }
+    if (memory.stiff_steps < constants.stiff_steps) return;
+    memory.stiff = !memory.stiff;
+    memory.stiff_steps = memory.other_steps = 0;
 }
 
 // Error of h times the tangent rate at a stage that lies off the closures by `error` (n,).
@@ -264,7 +326,8 @@ const StepResult& SplitStep::make(double t, double h, const double* state,
     h_ = h;
     monitored_ = constrained && memory.sigma < constants.monitored_below +
                                                    constants.far_steps * sigma_change;
-    lingers_ = monitored_ && memory.lingering && theta == 1.0;
+    lingers_ = monitored_ && memory.lingering && theta == 1.0 && !linear_;
+    r.stiff = memory.stiff;
     if (monitored_) {
         for (int i = 0; i < n_; ++i) weights_[i] = norm.weight(i, memory.state_scale[i]);
         prepare_branch(memory, t + h, sigma_change);
@@ -297,18 +360,30 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     const System::ZoneView none;
     std::copy(memory.rate.begin(), memory.rate.end(), r.rates.begin());
     r.sigmas[0] = memory.sigma;
+    if (linear_) {
+        linear_->prepare(t, h_, state, memory.rate.data(), memory.state_scale.data(),
+                         monitored_ ? branch_.zone : none);
+        for (int j = 0; j <= scheme.lead; ++j) {
+            std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
+            r.sigmas[j] = memory.sigma;
+        }
+        linear_rate(scheme.lead);
+    }
     deficient_stages_.clear();
     r.rank = std::numeric_limits<int>::max();
     r.held = false;
     moved_end_ = false;
     noded_ = noded_end_ = r.lost_branch = false;
     if (lingers_) away_.clear();
-    for (int j = 1; j <= s; ++j) {
+    for (int j = scheme.lead + 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
         std::fill(delta_.begin(), delta_.end(), 0.0);
         for (int k = 0; k < j; ++k)
             if (a[k] != 0.0) add(h_ * a[k], &r.rates[k * n], delta_.data(), n);
+        if (j == s - 1) apart_ = delta_;
+        if (end)
+            for (int i = 0; i < n; ++i) apart_[i] = delta_[i] - apart_[i];
         system_.retract(state, delta_.data(), x_.data());
         const double fraction = end ? 1.0 : scheme.c[j];
         const double time = t + fraction * h_;
@@ -334,6 +409,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         }
         system_.rate(rate_.data());
         system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
+        if (linear_ && !end) linear_rate(j);
         if (system_.rank_deficient()) {
             r.rank = std::min(r.rank, system_.rank());
             deficient_stages_.push_back(j);
@@ -415,6 +491,7 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
 void SplitStep::accept(IntegratorState& memory) {
     const StepResult& r = result;
     ++memory.steps;
+    count_stiffness(memory);
     memory.rate.swap(result.end_rate);
     result.end_rate = memory.rate;  // equal sizes: copies without allocating
     memory.sigma = r.sigmas[scheme.stages()];

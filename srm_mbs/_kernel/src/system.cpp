@@ -362,6 +362,12 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     if (closed_) projection_->factorisations = 0;
 }
 
+bool System::time_dependent() const {
+    return controller_ || driven() ||
+           std::any_of(data_.forces.begin(), data_.forces.end(),
+                       [](const ForceElement& force) { return !force.curves.empty(); });
+}
+
 bool System::holds(const double* force) const {
     return held_.size() >= static_cast<std::size_t>(nv) &&
            std::equal(force, force + nv, held_.end() - nv);

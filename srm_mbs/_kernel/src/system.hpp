@@ -193,6 +193,9 @@ public:
     int rows() const { return data_.rows; }
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
+    // Whether rates may depend on time itself: held forces do not.
+    bool time_dependent() const;
+    const std::vector<GroupJoint>& groups() const { return data_.groups; }
     double unit(int j) const { return data_.unit[j]; }
     double residual_scale(int row) const { return data_.residual_scale[row]; }
 

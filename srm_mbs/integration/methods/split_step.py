@@ -25,7 +25,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem
-from srm_mbs.dynamics.system import System
+from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA, StageNodes
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -36,15 +36,21 @@ from srm_mbs.integration.methods.near_singular import (
     WATCHED_SIGMA,
     BranchStages,
 )
+from srm_mbs.integration.methods.stiffness import count_stiffness, stiffness_of
 
 RESIDUAL_EVERY = 16
 """Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
 
 
+StageRate = Callable[[int, FloatArray], FloatArray]
+"""(j, chart rate (n,) at the stage j) -> the rate K_j (n,) of the scheme."""
+
+
 @lru_cache(maxsize=64)
 def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
-    """Weights (s, s) and abscissae (s,) of the stages after the first, and of the end."""
-    return np.vstack([scheme.A[1:], scheme.b]), [*scheme.c[1:].tolist(), 1.0]
+    """Weights (k, s) and abscissae (k,) of the stages after the first, and of the end."""
+    first = scheme.lead + 1
+    return np.vstack([scheme.A[first:], scheme.b]), [*scheme.c[first:].tolist(), 1.0]
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,30 @@ class SplitStep:
 
     scheme: ButcherTableau
     eps: Callable[[float], float] | None = None
+
+    @property
+    def uses_nodes(self) -> bool:
+        """Whether stages of lingering motions are solved by nodes of the branch."""
+        return self.eps is None
+
+    def stage_rates(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+        zone: Zone | None,
+        rates: FloatArray,
+    ) -> tuple[StageRate, float]:
+        """How the rates of the scheme follow from the chart rates of the stages, and the stiffness
+        as far as it is known before the step.
+
+        ``rates`` (s + 1, n) receives the rates of the stages at the start of the step.
+        """
+        rates[0] = memory.rate
+        return lambda _, rate: rate, np.nan
 
     def start(
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm
@@ -92,7 +122,7 @@ class SplitStep:
         zone = None
         if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
             weights = norm.weights(memory.state_scale)
-            if memory.lingering and theta == 1.0 and isinstance(system, ClosedSystem):
+            if memory.lingering and self.uses_nodes and isinstance(system, ClosedSystem):
                 nodes = StageNodes(system, t, state, history.away)
             lingers = nodes is not None
             branch = BranchStages(
@@ -103,11 +133,13 @@ class SplitStep:
         # Stages.  Zeros, because each stage weighs all s rates: those still to come with 0.
         rates = np.zeros((s + 1, system.tangent_size))
         weighed = rates[:s]
-        rates[0] = memory.rate
-        all_sigmas = [start]
+        first = scheme.lead + 1
+        rate_of, stiffness = self.stage_rates(system, t, h, state, memory, norm, zone, rates)
+        all_sigmas = [start] * first
         deficient: list[tuple[int, int, bool]] = []
-        for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
-            delta = stage_weights.dot(weighed)
+        delta = np.zeros(system.tangent_size)
+        for j, stage_weights, fraction in zip(range(first, s + 1), h * all_weights, fractions):
+            before, delta = delta, stage_weights.dot(weighed)
             x = system.retract(state, delta)
             time = t + fraction * h
             terms = system.evaluate(time, x, zone if nodes is None else None)
@@ -123,7 +155,7 @@ class SplitStep:
             if branch is not None:
                 terms, x, moved = branch(terms, time, fraction, x)
             rate = terms.rate()
-            rates[j] = system.chart_rate(delta, rate)
+            rates[j] = rate_of(j, system.chart_rate(delta, rate))
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
         sigma = all_sigmas[-1]
@@ -183,7 +215,12 @@ class SplitStep:
             rank=terms.rank,
             state_scale=state_scale,
             multiplier=multiplier,
+            stiff=memory.stiff,
+            stiffness=stiffness,
         )
+        if scheme.stable_to is not None and branch is None and norm.negligible > 0.0:
+            change_of_rate = rates[s] - rates[s - 1]
+            result.stiffness = stiffness_of(system, h, delta - before, change_of_rate)
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
         if due and history is not None and theta == 1.0 and away is None:
             result.constraint_residual = terms.constraint_residual()
@@ -207,8 +244,10 @@ class SplitStep:
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
         memory.state_scale = result.state_scale
+        memory.linearisation = None
         if memory.history is not None:
             memory.history = history_after(memory.history, result)
+        count_stiffness(memory, result.stiffness, self.scheme)
 
     def resume(
         self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
@@ -216,6 +255,8 @@ class SplitStep:
         """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
         fresh = self.start(system, t, state, norm)
         fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
+        fresh.stiff, fresh.stiff_steps = memory.stiff, memory.stiff_steps
+        fresh.other_steps = memory.other_steps
         return fresh
 
 

@@ -1,0 +1,149 @@
+r"""The linearly implicit step of the split PSRM, for stiff problems.
+
+The stages integrate the same equations as those of :mod:`srm_mbs.integration.methods.split_step`, in
+the chart at the start of the step, where x = x_n (+) delta and delta' = D(t, delta).  With
+J = dD/d delta and D_t there, the rate of the stage i is
+
+    (1 - h gamma J) (K_i + w_i) = D(t_i, h sum_{j<i} a_ij K_j) + w_i + h (sum_j g_ij) D_t,
+    w_i = sum_{j<i} g_ij K_j / gamma
+
+(G. Steinebach, BIT Numer. Math. 63 (2023) 27; E. Hairer, G. Wanner, *Solving Ordinary Differential
+Equations II*, 2nd edition, Springer 1996, IV.7).  The order depends on J: it is found anew at every
+accepted state, by one-sided differences.  Everything else, the correction at the end, the zone and
+the placement, is that of explicit steps; only stages of motions that linger next to a singular
+configuration are not solved by nodes of the branch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System, Zone
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
+from srm_mbs.integration.methods.split_step import SplitStep, StageRate
+from srm_mbs.integration.methods.stiffness import largest_eigenvalue
+
+DIFFERENCE = 2.0**-26
+"""Step of a difference by a coordinate, over its size: the root of the rounding."""
+TIME_DIFFERENCE = 2.0**-17
+"""Step of a difference by time, over that of the integration: the third root of the rounding,
+because that difference is of second order."""
+SHORTEST_DIFFERENCE = 64.0
+"""Shortest step of a difference by time, in units of rounding of the time."""
+
+
+def rounded_down(sizes: FloatArray) -> FloatArray:
+    """The powers of 2 up to ``sizes``: steps that a sum with a coordinate does not round."""
+    return np.ldexp(0.5, np.frexp(sizes)[1])
+
+
+def linearised(
+    system: System,
+    t: float,
+    h: float,
+    state: FloatArray,
+    memory: IntegratorState,
+    norm: ErrorNorm,
+    zone: Zone | None,
+) -> Linearisation:
+    """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s)."""
+    # That of the memory is the one before the last correction, which stiff forces notice.
+    rate = system.evaluate(t, state, zone).rate().copy()
+    n = len(rate)
+    unit = norm.one if norm.unit is None else norm.unit
+    steps = rounded_down(DIFFERENCE * np.maximum(unit, memory.state_scale))
+    J = np.empty((n, n))
+    for j, step in enumerate(steps.tolist()):
+        delta = np.zeros(n)
+        delta[j] = step
+        terms = system.evaluate(t, system.retract(state, delta), zone)
+        J[:, j] = (system.chart_rate(delta, terms.rate()) - rate) / step
+    by_time = np.zeros(n)
+    if system.time_dependent:
+        shortest = SHORTEST_DIFFERENCE * np.spacing(abs(t))
+        tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
+        first, second = (
+            system.evaluate(t + k * tau, state, zone).rate().copy() - rate for k in (1.0, 2.0)
+        )
+        by_time = (4.0 * first - second) / (2.0 * tau)
+    return Linearisation(rate, J, by_time)
+
+
+@dataclass(frozen=True)
+class LinearSplitStep(SplitStep):
+    """Steps of a linearly implicit ``scheme``; see :class:`SplitStep`."""
+
+    @property
+    def uses_nodes(self) -> bool:
+        """No: see the module."""
+        return False
+
+    def stage_rates(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+        zone: Zone | None,
+        rates: FloatArray,
+    ) -> tuple[StageRate, float]:
+        """See :class:`SplitStep`; the equations are linearised here."""
+        from scipy.linalg import lu_factor, lu_solve
+
+        scheme, n = self.scheme, system.tangent_size
+        assert scheme.implicit is not None
+        lead, end = scheme.lead, scheme.n_stages
+        known = memory.linearisation
+        if known is None:
+            known = linearised(system, t, h, state, memory, norm, zone)
+            memory.linearisation = known
+        gamma = float(scheme.implicit[lead, lead])
+        factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)
+        before = np.tril(scheme.implicit, -1) / gamma
+        time_shares = h * scheme.implicit.sum(axis=1)
+
+        def rate_of(j: int, rate: FloatArray) -> FloatArray:
+            if j == end:
+                return rate
+            w = before[j] @ rates[:end]
+            solved = lu_solve(factors, rate + w + time_shares[j] * known.by_time, check_finite=False)
+            return np.asarray(solved - w, dtype=np.float64)
+
+        rates[:lead] = known.rate
+        rates[lead] = rate_of(lead, known.rate)
+        unit = norm.one if norm.unit is None else norm.unit
+        k = system.multiplier_part.start
+        return rate_of, largest_eigenvalue(known.J, h, unit, k)
+
+
+@dataclass(frozen=True)
+class SwitchingStep(SplitStep):
+    """Explicit steps of ``scheme``, and those of its scheme for stiff problems where it is stiff."""
+
+    def _stepper(self, stiff: bool) -> SplitStep:
+        return LinearSplitStep(self.scheme.member(True), self.eps) if stiff else self._explicit
+
+    @property
+    def _explicit(self) -> SplitStep:
+        return SplitStep(self.scheme, self.eps)
+
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        return self._stepper(memory.stiff).step(system, t, h, state, memory, norm)
+
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        self._stepper(result.stiff).accept(memory, result)

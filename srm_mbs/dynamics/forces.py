@@ -60,6 +60,17 @@ class Evaluator(ABC):
         """Its potential energy (J), if it has one; ``data`` need hold the placements only."""
         return 0.0
 
+    law_count = 0
+    """Number of its laws between links."""
+
+    def laws(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Values (law_count,) of its laws: forces and moments, each along its own direction."""
+        return np.zeros(0)
+
+    def apply(self, tau: FloatArray, data: pin.Data, values: FloatArray) -> None:
+        """Add the generalised forces to ``tau`` (nv,) if ``values`` (law_count,) act in place of
+        its laws."""
+
     @abstractmethod
     def constants(self) -> dict[str, Any] | None:
         """Constants for the compiled kernel, of which ``kind`` numbers the kinds as forces.hpp
@@ -139,7 +150,27 @@ class SpringDamperEvaluator(Evaluator):
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_length = float(force.rest_length or 0.0)
 
+        self.law_count = 1 if self.rest_length else 0
+
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        force, at_a, _ = self._force(data)
+        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+
+    def laws(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
+        """The force along the line."""
+        if not self.law_count:
+            return np.zeros(0)
+        force, _, line = self._force(data)
+        return np.array([force @ line])
+
+    def apply(self, tau: FloatArray, data: pin.Data, values: FloatArray) -> None:
+        force, at_a, line = self._force(data)
+        if self.law_count:
+            force = values[0] * line
+        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+
+    def _force(self, data: pin.Data) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Force (3,) on a, the point at which it acts, and the direction of the line."""
         at_a = self.a.placement(data).translation
         at_b = self.b.placement(data).translation
         apart = at_a - at_b
@@ -159,7 +190,7 @@ class SpringDamperEvaluator(Evaluator):
             # Points that meet move along the line that joins them.
             along = apart * ((apart / length) @ rate / length) if length else rate
             force -= self.damping * along
-        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+        return force, at_a, apart / (length or 1.0)
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         apart = self.a.placement(data).translation - self.b.placement(data).translation
@@ -211,6 +242,8 @@ class BushingEvaluator(Evaluator):
         self.support = self.a.support - self.b.support
         self.stiffness = np.array(force.stiffness, dtype=float)
         self.damping = np.array(force.damping, dtype=float)
+        self._own = np.flatnonzero((self.stiffness > 0.0) | (self.damping > 0.0))
+        self.law_count = len(self._own)
 
     @property
     def turns(self) -> bool:
@@ -223,6 +256,27 @@ class BushingEvaluator(Evaluator):
         return pin.log3(relative.rotation)  # type: ignore[no-any-return]
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        self._act(tau, data, *self._forces(data))
+
+    def laws(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
+        """The forces and moments that are not always zero, with the opposite sign."""
+        return np.concatenate(self._forces(data))[self._own]
+
+    def apply(self, tau: FloatArray, data: pin.Data, values: FloatArray) -> None:
+        both = np.zeros(6)
+        both[self._own] = values
+        self._act(tau, data, both[:3], both[3:])
+
+    def _act(
+        self, tau: FloatArray, data: pin.Data, force: FloatArray, moment: FloatArray
+    ) -> None:
+        Ta, Tb = self.a.placement(data), self.b.placement(data)
+        L = pin.Jlog3(Tb.actInv(Ta).rotation)
+        force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
+        add_wrench(tau, data, self.support, force, moment, Ta.translation)
+
+    def _forces(self, data: pin.Data) -> tuple[FloatArray, FloatArray]:
+        """Force (3,) along b's axes, and moment (3,) as it does work on the rotation vector."""
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         relative = Tb.actInv(Ta)
         turn = pin.log3(relative.rotation)
@@ -237,8 +291,7 @@ class BushingEvaluator(Evaluator):
             spin = L.T @ (Tb.rotation.T @ W.angular)
             force = force + self.damping[:3] * rate
             moment = moment + self.damping[3:] * spin
-        force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
-        add_wrench(tau, data, self.support, force, moment, Ta.translation)
+        return force, moment
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         relative = self.b.placement(data).actInv(self.a.placement(data))
@@ -461,6 +514,38 @@ class ForceKinematics:
         tau = np.zeros(self._nv)
         for element in self._elements:
             if isinstance(element, _UserForceEvaluator):
+                element.add(tau, data, q, v, t)
+        return tau
+
+    def coordinates(self) -> list[int]:
+        """Velocity indices of the coordinates on which springs and limits act."""
+        kinds = TorsionSpringEvaluator | LimitSpringEvaluator
+        return [e.in_v for e in self._elements if isinstance(e, kinds)]
+
+    def laws(
+        self, data: pin.Data, q: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        """Laws of the coordinates (nv,), and those of each element between links."""
+        along = np.zeros(self._nv)
+        for element in self._elements:
+            if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
+                element.add(along, data, q, v, 0.0)
+        return along, [e.laws(data, q, v) for e in self._elements if e.law_count]
+
+    def generalised_with(
+        self, data: pin.Data, q: FloatArray, v: FloatArray, t: float, applied: FloatArray
+    ) -> FloatArray:
+        """As :meth:`generalised`, where ``applied`` act in place of the laws between links, and
+        no springs on coordinates."""
+        tau = np.zeros(self._nv)
+        first = 0
+        for element in self._elements:
+            if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
+                continue
+            if element.law_count:
+                element.apply(tau, data, applied[first : first + element.law_count])
+                first += element.law_count
+            else:
                 element.add(tau, data, q, v, t)
         return tau
 

@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
@@ -213,6 +213,8 @@ class Mechanics(Manifold):
         self._friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
+        self._applied: FloatArray | None = None
+        self._laws_at: tuple[FloatArray, FloatArray] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Terms and workspaces share memory, which copies of them would not.
@@ -295,10 +297,49 @@ class Mechanics(Manifold):
             return np.zeros(v.shape)
         return -self._friction * np.tanh(v / self._friction_speed)
 
+    @cached_property
+    def _law_coordinates(self) -> IndexArray:
+        """Velocity indices of the coordinates with a law."""
+        acted = (self._damping != 0.0) | (self._friction != 0.0)
+        if self._forces is not None:
+            acted[self._forces.coordinates()] = True
+        return np.flatnonzero(acted)
+
+    @property
+    def laws(self) -> FloatArray:
+        """Values (m,) of the laws of forces at the stage evaluated last: those of the coordinates
+        with damping, friction, springs or limits, then those of the elements between links."""
+        assert self._laws_at is not None
+        q, v = self._laws_at
+        along = self.damping_force(v) + self.friction_force(v)
+        between: list[FloatArray] = []
+        if self._forces is not None:
+            springs, between = self._forces.laws(self.data, q, v)
+            along = along + springs
+        return np.concatenate([along[self._law_coordinates], *between])
+
+    def apply_laws(self, values: FloatArray | None) -> None:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        self._applied = values
+
+    def _passive_force(self, v: FloatArray) -> FloatArray:
+        """Damping and friction, or what acts in place of the laws of the coordinates."""
+        if self._applied is None:
+            return self.damping_force(v) + self.friction_force(v)
+        force = np.zeros(self.nv)
+        force[self._law_coordinates] = self._applied[: len(self._law_coordinates)]
+        return force
+
+    def _element_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        assert self._forces is not None
+        if self._applied is None:
+            return self._forces.generalised(self.data, q, v, t)
+        applied = self._applied[len(self._law_coordinates) :]
+        return self._forces.generalised_with(self.data, q, v, t, applied)
+
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Controller, joint damping and joint friction (nv,)."""
-        passive = self.damping_force(v) + self.friction_force(v)
-        return self.controlled_force(t, q, v) + passive
+        return self.controlled_force(t, q, v) + self._passive_force(v)
 
     def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
@@ -307,7 +348,7 @@ class Mechanics(Manifold):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._forces.generalised(self.data, q, v, t)
+            force = force + self._element_force(t, q, v)
         gravity: FloatArray = pin.computeGeneralizedGravity(self.model, self.data, q)
         return force - gravity
 
@@ -398,7 +439,8 @@ class OpenSystem(Mechanics):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._forces.generalised(self.data, q, v, t)
+            force = force + self._element_force(t, q, v)
+        self._laws_at = q, v
         rate = self._terms.rate()
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(self.model, self.data, q, v, force)
@@ -516,7 +558,8 @@ class ClosedSystem(Mechanics):
         pin.crba(model, data, q, pin.Convention.WORLD)
         f = self.applied_force(t, q, v) - pin.nonLinearEffects(model, data, q, v)
         if self._forces is not None:
-            f += self._forces.generalised(data, q, v, t)
+            f += self._element_force(t, q, v)
+        self._laws_at = q, v
         loops = self.loops
         loops.update(data, q)
         loops.move_to(t)

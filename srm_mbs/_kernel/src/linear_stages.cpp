@@ -25,6 +25,7 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
     : system_(system),
       nv_(system.nv),
       n_(2 * system.nv),
+      count_(system.resolve_laws()),
       gamma_(gamma),
       unit_(std::move(unit)),
       constants_(constants),
@@ -32,9 +33,13 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
       known_rate_(n_),
       rate_(n_),
       by_time_(n_),
+      applied_(count_),
+      laws_(count_),
       B_(nv_ * nv_),
       C_(nv_ * nv_),
       D_(nv_ * nv_),
+      L_(count_ * n_),
+      W_(count_ * nv_),
       S_(nv_ * nv_),
       CS_(nv_ * nv_),
       factors_(nv_ * nv_),
@@ -45,31 +50,39 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
       other_(n_),
       work_(n_) {}
 
-void LinearStages::prepare(double t, double h, const double* state, const double* rate,
-                           const double* state_scale, const System::ZoneView& zone) {
-    const bool same = known_ && known_time_ == t &&
-                      std::equal(known_state_.begin(), known_state_.end(), state) &&
-                      std::equal(known_rate_.begin(), known_rate_.end(), rate);
+void LinearStages::prepare(double t, double h, const double* state,
+                           const std::vector<double>& rate,
+                           const std::vector<double>& state_scale,
+                           const std::vector<double>& laws, const System::ZoneView& zone) {
+    const bool same = known_ && known_time_ == t && known_rate_ == rate && known_laws_ == laws &&
+                      std::equal(known_state_.begin(), known_state_.end(), state);
     if (!same) {
         known_ = false;
-        linearise(t, h, state, state_scale, zone);
+        linearise(t, h, state, state_scale, laws, zone);
         known_time_ = t;
+        known_rate_ = rate;
+        known_laws_ = laws;
         std::copy_n(state, known_state_.size(), known_state_.begin());
-        std::copy_n(rate, n_, known_rate_.begin());
         known_ = true;
     }
     factorise(h * gamma_);
 }
 
-void LinearStages::linearise(double t, double h, const double* state, const double* state_scale,
-                             const System::ZoneView& zone) {
-    const int nv = nv_, n = n_;
+void LinearStages::linearise(double t, double h, const double* state,
+                             const std::vector<double>& state_scale,
+                             const std::vector<double>& laws, const System::ZoneView& zone) {
+    const int nv = nv_, n = n_, m = count_;
+    if (!laws.empty()) expect_size("laws", laws.size(), static_cast<std::size_t>(m));
     const auto rate_at = [&](double time, const double* x, double* out) {
         system_.evaluate(time, x, zone);
         system_.rate(out);
     };
     // The rate of the memory is the one before the last correction, which stiff forces notice.
+    system_.apply_laws(laws.empty() ? nullptr : laws.data());
     rate_at(t, state, rate_.data());
+    laws_ = system_.law_values();
+    applied_ = laws.empty() ? laws_ : laws;
+    system_.apply_laws(m ? applied_.data() : nullptr);
     std::fill(delta_.begin(), delta_.end(), 0.0);
     for (int j = 0; j < n; ++j) {
         const double step =
@@ -84,19 +97,36 @@ void LinearStages::linearise(double t, double h, const double* state, const doub
         }
         double* const column = position ? &C_[j * nv] : &D_[(j - nv) * nv];
         for (int i = 0; i < nv; ++i) column[i] = (probe_[nv + i] - rate_[nv + i]) / step;
+        for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / step;
         delta_[j] = 0.0;
     }
     std::fill(by_time_.begin(), by_time_.end(), 0.0);
-    if (!system_.time_dependent()) return;
-    const double spacing =
-        std::nextafter(std::abs(t), std::numeric_limits<double>::infinity()) - std::abs(t);
-    const double tau = rounded_down(
-        std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
-    rate_at(t + tau, state, probe_.data());
-    rate_at(t + 2.0 * tau, state, other_.data());
-    for (int i = 0; i < n; ++i)
-        by_time_[i] =
-            (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
+    if (system_.time_dependent()) {
+        const double spacing =
+            std::nextafter(std::abs(t), std::numeric_limits<double>::infinity()) - std::abs(t);
+        const double tau = rounded_down(
+            std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
+        rate_at(t + tau, state, probe_.data());
+        rate_at(t + 2.0 * tau, state, other_.data());
+        for (int i = 0; i < n; ++i)
+            by_time_[i] =
+                (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
+    }
+    // Accelerations are linear in the laws that act.
+    const double change = std::max(1.0, largest(applied_.data(), m));
+    for (int k = 0; k < m; ++k) {
+        const double before = applied_[k];
+        applied_[k] += change;
+        rate_at(t, state, probe_.data());
+        applied_[k] = before;
+        for (int i = 0; i < nv; ++i)
+            W_[k * nv + i] = (probe_[nv + i] - rate_[nv + i]) / change;
+    }
+    for (int j = 0; j < n; ++j) {
+        double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
+        for (int k = 0; k < m; ++k)
+            if (L_[j * m + k] != 0.0) add(L_[j * m + k], &W_[k * nv], column, nv);
+    }
 }
 
 void LinearStages::factorise(double k) {
@@ -133,9 +163,11 @@ void LinearStages::factorise(double k) {
         throw EvaluationError{Failure::acceleration};
 }
 
-void LinearStages::solve(double* x) {
-    const int nv = nv_;
+void LinearStages::solve(double* x, const double* laws, const double* applied,
+                         double* law_rates) {
+    const int nv = nv_, m = count_;
     double* const y = x + nv;
+    for (int k = 0; k < m; ++k) add(laws[k] - applied[k], &W_[k * nv], y, nv);
     for (int j = 0; j < nv; ++j)
         if (x[j] != 0.0) add(k_ * x[j], &CS_[j * nv], y, nv);
     lu_solve(factors_.data(), nv, pivots_.data(), y);
@@ -146,9 +178,11 @@ void LinearStages::solve(double* x) {
             add(x[joint.start + j], &S_[(joint.start + j) * nv + joint.start], out, joint.size);
         std::copy_n(out, joint.size, x + joint.start);
     }
+    for (int k = 0; k < m; ++k) law_rates[k] = (laws[k] - applied[k]) / k_;
+    for (int j = 0; j < n_; ++j) add(x[j], &L_[j * m], law_rates, m);
 }
 
-void LinearStages::apply(const std::vector<double>& x, std::vector<double>& out) const {
+void LinearStages::multiply(const std::vector<double>& x, std::vector<double>& out) const {
     const int nv = nv_;
     for (int i = 0; i < nv; ++i) {
         out[i] = x[nv + i];
@@ -176,7 +210,7 @@ double LinearStages::stiffness(double h) {
             if (!(last > 0.0)) return 0.0;
             for (double& value : work_) value /= last;
         }
-        apply(work_, other_);
+        multiply(work_, other_);
         for (int i = 0; i < n; ++i) work_[i] = h * other_[i];
     }
     return std::sqrt(size(work_));

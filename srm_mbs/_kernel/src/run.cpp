@@ -107,6 +107,7 @@ double Run::direct_from() const {
 bool Run::restart_interval() {
     system.evaluate(t_, state.data(), System::ZoneView{});
     system.rate(memory.rate.data());
+    memory.laws.clear();
     memory.sigma = system.sigma();
     system.state_scale(state.data(), memory.state_scale.data());
     if (!memory.history) return true;

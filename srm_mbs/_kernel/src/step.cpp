@@ -104,6 +104,8 @@ SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& co
     linear_ = std::make_unique<LinearStages>(system, gamma, norm.unit, constants);
     linear_weights_.resize(s * s);
     time_shares_.resize(s);
+    law_rates_.resize(s * linear_->count());
+    law_shares_.resize(linear_->count());
     for (int i = 0; i < s; ++i)
         for (int j = 0; j <= i; ++j) {
             time_shares_[i] += scheme.implicit[i * s + j];
@@ -111,18 +113,34 @@ SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& co
         }
 }
 
-// The rate of the stage j of a linearly implicit scheme, from the chart rate in its place.
-void SplitStep::linear_rate(int j) {
-    const int s = scheme.stages(), n = n_;
-    double* const rate = &result.rates[j * n];
+// The laws of the forces that act in the stage j, or at the end those of the end state itself.
+void SplitStep::apply_laws(int j) {
+    const int s = scheme.stages(), m = linear_->count();
+    applied_ = linear_->applied();
+    const double* a = j < s ? &scheme.A[j * s] : scheme.b.data();
+    for (int k = scheme.lead; k < j; ++k)
+        if (a[k] != 0.0) add(h_ * a[k], &law_rates_[k * m], applied_.data(), m);
+    system_.apply_laws(j < s && m ? applied_.data() : nullptr);
+}
+
+// The rate of the stage j of a linearly implicit scheme, from the chart rate in its place and the
+// laws there.
+void SplitStep::linear_rate(int j, const std::vector<double>& laws) {
+    const int s = scheme.stages(), n = n_, m = linear_->count();
+    double *const rate = &result.rates[j * n], *const law_rate = &law_rates_[j * m];
     const double* by_time = linear_->by_time().data();
     std::fill(error_.begin(), error_.end(), 0.0);
-    for (int k = scheme.lead; k < j; ++k)
-        add(linear_weights_[j * s + k], &result.rates[k * n], error_.data(), n);
+    std::fill(law_shares_.begin(), law_shares_.end(), 0.0);
+    for (int k = scheme.lead; k < j; ++k) {
+        const double weight = linear_weights_[j * s + k];
+        add(weight, &result.rates[k * n], error_.data(), n);
+        add(weight, &law_rates_[k * m], law_shares_.data(), m);
+    }
     const double share = h_ * time_shares_[j];
     for (int i = 0; i < n; ++i) rate[i] += error_[i] + share * by_time[i];
-    linear_->solve(rate);
+    linear_->solve(rate, laws.data(), applied_.data(), law_rate);
     for (int i = 0; i < n; ++i) rate[i] -= error_[i];
+    for (int k = 0; k < m; ++k) law_rate[k] -= law_shares_[k];
 }
 
 // h |lambda|, seen from the last two stages of an explicit step; NaN if they do not differ.
@@ -360,14 +378,26 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     const System::ZoneView none;
     std::copy(memory.rate.begin(), memory.rate.end(), r.rates.begin());
     r.sigmas[0] = memory.sigma;
+    // While it lives, the system finds the laws of forces.
+    struct Tracking {
+        System* system;
+        explicit Tracking(System* tracked) : system(tracked) {
+            if (system) system->track_laws(true);
+        }
+        ~Tracking() {
+            if (system) system->track_laws(false);
+        }
+    };
+    const Tracking tracking(linear_ ? &system_ : nullptr);
     if (linear_) {
-        linear_->prepare(t, h_, state, memory.rate.data(), memory.state_scale.data(),
+        linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws,
                          monitored_ ? branch_.zone : none);
         for (int j = 0; j <= scheme.lead; ++j) {
             std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
             r.sigmas[j] = memory.sigma;
         }
-        linear_rate(scheme.lead);
+        applied_ = linear_->applied();
+        linear_rate(scheme.lead, linear_->laws());
     }
     deficient_stages_.clear();
     r.rank = std::numeric_limits<int>::max();
@@ -385,6 +415,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         if (end)
             for (int i = 0; i < n; ++i) apart_[i] = delta_[i] - apart_[i];
         system_.retract(state, delta_.data(), x_.data());
+        if (linear_) apply_laws(j);
         const double fraction = end ? 1.0 : scheme.c[j];
         const double time = t + fraction * h_;
         system_.evaluate(time, x_.data(), monitored_ && !lingers_ ? branch_.zone : none);
@@ -409,7 +440,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         }
         system_.rate(rate_.data());
         system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
-        if (linear_ && !end) linear_rate(j);
+        if (linear_ && !end) linear_rate(j, system_.law_values());
         if (system_.rank_deficient()) {
             r.rank = std::min(r.rank, system_.rank());
             deficient_stages_.push_back(j);
@@ -492,6 +523,10 @@ void SplitStep::accept(IntegratorState& memory) {
     const StepResult& r = result;
     ++memory.steps;
     count_stiffness(memory);
+    if (linear_)
+        memory.laws = applied_;
+    else
+        memory.laws.clear();
     memory.rate.swap(result.end_rate);
     result.end_rate = memory.rate;  // equal sizes: copies without allocating
     memory.sigma = r.sigmas[scheme.stages()];

@@ -64,6 +64,7 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     field(long, steps)                                                                    \
     field(bool, stiff)                      /* the problem was found to be stiff */       \
     field(int, stiff_steps)                 /* that speak for a change of that, */        \
+    field(std::vector<double>, laws)        /* (m,), of forces, in linearly implicit steps */ \
     field(int, other_steps)                 /* and those after the last of them that do not */ \
     field(std::optional<MultiplierHistory>, history) /* none without closures */
 
@@ -126,7 +127,8 @@ private:
     bool solve_on_branch(double t, double start, const double* state,
                          const IntegratorState& memory);
     bool project_stage(double t, double c, const IntegratorState& memory, double sigma_change);
-    void linear_rate(int j);
+    void linear_rate(int j, const std::vector<double>& laws);
+    void apply_laws(int j);
     double stiffness() const;
     void count_stiffness(IntegratorState& memory);
     void evaluate_stages(double t, const double* state, const IntegratorState& memory,
@@ -154,6 +156,7 @@ private:
     // gamma, and the sums of its rows (s,).
     std::unique_ptr<LinearStages> linear_;
     std::vector<double> linear_weights_, time_shares_;
+    std::vector<double> law_rates_, applied_, law_shares_;  // (s, m); (m,) of a stage
     std::vector<double> apart_;  // (n,), the arguments of the last two stages, one from the other
     std::vector<double> away_;
     Branch branch_;

@@ -355,11 +355,35 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
+    track_laws(false);
     held_from_.clear();
     held_.clear();
     between(-std::numeric_limits<double>::infinity(), std::numeric_limits<double>::infinity());
     evaluations = 0;
     if (closed_) projection_->factorisations = 0;
+}
+
+int System::resolve_laws() {
+    std::vector<bool> passive(nv, false);
+    for (const auto* factors : {&data_.damping, &data_.friction})
+        for (std::size_t i = 0; i < factors->size(); ++i)
+            if ((*factors)[i] != 0.0) passive[i] = true;
+    laws_.resolve(data_.forces, passive);
+    return laws_.count();
+}
+
+// The laws of coordinates, as far as they are damping and friction; applied ones act.
+void System::passive_forces() {
+    for (int i = 0; i < nv; ++i) {
+        const int law = laws_.of_coordinate(i);
+        if (law < 0) continue;
+        double force = 0.0;
+        if (!data_.damping.empty()) force -= data_.damping[i] * v_[i];
+        if (!data_.friction.empty())
+            force -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+        laws_.values[law] = force;
+        if (laws_.applied) f_[i] += laws_.applied[law];
+    }
 }
 
 bool System::time_dependent() const {
@@ -426,7 +450,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     std::copy(state + nq, state + nq + nv, w.v.data());
     std::copy(state + nq, state + nq + nv, v_.begin());
     std::fill(f_.begin(), f_.end(), 0.0);
-    if (!data_.damping.empty())
+    if (!data_.damping.empty() && !laws_.applied)
         for (int i = 0; i < nv; ++i) f_[i] = -data_.damping[i] * v_[i];
     if (controller_) {
         controller_(t, state, state + nq, acted_.data());
@@ -434,13 +458,16 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     if (const double* force = held_force(t))
         for (int i = 0; i < nv; ++i) f_[i] += force[i];
-    for (std::size_t i = 0; i < data_.friction.size(); ++i)
-        f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    if (!laws_.applied)
+        for (std::size_t i = 0; i < data_.friction.size(); ++i)
+            f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
+    if (laws) passive_forces();
     if (!closed_) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
             pinocchio::computeJointJacobians(w.model, w.data);
-            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data(), laws);
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
@@ -451,7 +478,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
     if (!data_.forces.empty())
-        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data());
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), f_.data(), laws);
     update_closures(state, true);
     update_drives(t, true);
     Projection& p = *projection_;

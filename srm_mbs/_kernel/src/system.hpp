@@ -193,6 +193,15 @@ public:
     int rows() const { return data_.rows; }
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
+    // The laws of forces in linearly implicit steps: their number; their values, which evaluations
+    // find while they are tracked; what acts in their place, or, if null, they themselves.
+    int resolve_laws();
+    void track_laws(bool tracked) {
+        tracks_laws_ = tracked;
+        laws_.applied = nullptr;
+    }
+    void apply_laws(const double* values) { laws_.applied = values; }
+    const std::vector<double>& law_values() const { return laws_.values; }
     // Whether rates may depend on time itself: held forces do not.
     bool time_dependent() const;
     const std::vector<GroupJoint>& groups() const { return data_.groups; }
@@ -215,6 +224,9 @@ private:
 
     double first_ = -std::numeric_limits<double>::infinity();
     double last_ = std::numeric_limits<double>::infinity();
+    void passive_forces();
+    ForceLaws laws_;
+    bool tracks_laws_ = false;
     std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;
     Controller controller_;

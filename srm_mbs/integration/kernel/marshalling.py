@@ -213,6 +213,7 @@ def state_struct(memory: IntegratorState) -> Any:
         stiff=memory.stiff,
         stiff_steps=memory.stiff_steps,
         other_steps=memory.other_steps,
+        laws=_NO_NUMBERS if memory.laws is None else memory.laws,
         history=None if history is None else history_struct(history),
     )
 
@@ -231,6 +232,7 @@ def state_from(struct: Any) -> IntegratorState:
         struct.stiff,
         struct.stiff_steps,
         struct.other_steps,
+        struct.laws if len(struct.laws) else None,
     )
 
 

@@ -74,11 +74,21 @@ class Linearisation:
         Derivatives of the chart rates by the chart coordinates.
     by_time : (n,)
         Their derivatives by time.
+    applied, laws : (m,)
+        What acts in place of the laws of forces there, and what they are.
+    by_coordinates : (m, n)
+        Derivatives of the laws by the chart coordinates.
+    by_laws : (n, m)
+        Derivatives of the chart rates by what acts in place of the laws.
     """
 
     rate: FloatArray
     J: FloatArray
     by_time: FloatArray
+    applied: FloatArray
+    laws: FloatArray
+    by_coordinates: FloatArray
+    by_laws: FloatArray
 
 
 @dataclass
@@ -107,6 +117,8 @@ class IntegratorState:
     stiff_steps, other_steps
         Steps that speak for a change of ``stiff``, and those after the last of them that do not
         (:mod:`srm_mbs.integration.methods.stiffness`).
+    laws : (m,) or None
+        Values of the laws of forces that linearly implicit steps carry; None after other steps.
     linearisation
         The equations linearised at the current state, once a step has needed them.
     """
@@ -121,6 +133,7 @@ class IntegratorState:
     stiff: bool = False
     stiff_steps: int = 0
     other_steps: int = 0
+    laws: FloatArray | None = None
     linearisation: Linearisation | None = None
 
     def set_first_stage(
@@ -184,6 +197,8 @@ class StepResult:
         Whether nodes of the branch were wanted and not found.
     stiff
         Whether the problem had been found to be stiff before the step.
+    laws : (m,) or None
+        The laws of forces at the end of a linearly implicit step.
     stiffness
         Estimate of h |lambda|, lambda the largest eigenvalue of the linearised equations; NaN if
         the step does not show it.
@@ -211,6 +226,7 @@ class StepResult:
     away: FloatArray | None = None
     lost_branch: bool = False
     stiff: bool = False
+    laws: FloatArray | None = None
     stiffness: float = np.nan
 
 

@@ -16,6 +16,7 @@ configuration are not solved by nodes of the branch.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
-from srm_mbs.integration.methods.split_step import SplitStep, StageRate
+from srm_mbs.integration.methods.split_step import SplitStep, Stages
 from srm_mbs.integration.methods.stiffness import largest_eigenvalue
 
 DIFFERENCE = 2.0**-26
@@ -50,26 +51,71 @@ def linearised(
     zone: Zone | None,
 ) -> Linearisation:
     """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s)."""
-    # That of the memory is the one before the last correction, which stiff forces notice.
-    rate = system.evaluate(t, state, zone).rate().copy()
-    n = len(rate)
+    n, k = system.tangent_size, system.multiplier_part.start
     unit = norm.one if norm.unit is None else norm.unit
+
+    def rate_at(time: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rate = system.evaluate(time, x, zone).rate().copy()
+        return rate, system.laws
+
+    # The rate of the memory is the one before the last correction, which stiff forces notice.
+    system.apply_laws(memory.laws)
+    rate, laws = rate_at(t, state)
+    applied = laws if memory.laws is None else memory.laws
+    m = len(applied)
+    system.apply_laws(applied if m else None)
     steps = rounded_down(DIFFERENCE * np.maximum(unit, memory.state_scale))
-    J = np.empty((n, n))
+    J, by_coordinates = np.empty((n, n)), np.empty((m, n))
     for j, step in enumerate(steps.tolist()):
         delta = np.zeros(n)
         delta[j] = step
-        terms = system.evaluate(t, system.retract(state, delta), zone)
-        J[:, j] = (system.chart_rate(delta, terms.rate()) - rate) / step
+        there, own = rate_at(t, system.retract(state, delta))
+        J[:, j] = (system.chart_rate(delta, there) - rate) / step
+        by_coordinates[:, j] = (own - laws) / step
     by_time = np.zeros(n)
     if system.time_dependent:
         shortest = SHORTEST_DIFFERENCE * np.spacing(abs(t))
         tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
-        first, second = (
-            system.evaluate(t + k * tau, state, zone).rate().copy() - rate for k in (1.0, 2.0)
-        )
+        first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
         by_time = (4.0 * first - second) / (2.0 * tau)
-    return Linearisation(rate, J, by_time)
+    # Accelerations are linear in what acts in place of the laws.
+    change = max(1.0, float(np.abs(applied).max(initial=0.0)))
+    by_laws = np.zeros((n, m))
+    for i in range(m):
+        system.apply_laws(applied + change * (np.arange(m) == i))
+        by_laws[k:, i] = (rate_at(t, state)[0] - rate)[k:] / change
+    J += by_laws @ by_coordinates
+    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws)
+
+
+class LinearStages(Stages):
+    """The stages of one linearly implicit step.
+
+    Parameters
+    ----------
+    rate_of
+        (stage, its chart rate (n,), the laws there (m,)) -> its rate (n,) in the scheme.
+    apply
+        Lets the laws of a stage act, which it returns (m,).
+    """
+
+    def __init__(
+        self,
+        system: System,
+        rate_of: Callable[[int, FloatArray, FloatArray], FloatArray],
+        apply: Callable[[int], FloatArray],
+        stiffness: float,
+    ) -> None:
+        self._system, self._rate_of, self._apply = system, rate_of, apply
+        self.stiffness = stiffness
+
+    def begin(self, j: int) -> None:
+        """See :class:`Stages`."""
+        self.laws = self._apply(j)
+
+    def rate(self, j: int, rate: FloatArray) -> FloatArray:
+        """See :class:`Stages`."""
+        return self._rate_of(j, rate, self._system.laws)
 
 
 @dataclass(frozen=True)
@@ -81,6 +127,21 @@ class LinearSplitStep(SplitStep):
         """No: see the module."""
         return False
 
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        try:
+            return super().step(system, t, h, state, memory, norm)
+        finally:
+            system.apply_laws(None)
+
     def stage_rates(
         self,
         system: System,
@@ -91,7 +152,7 @@ class LinearSplitStep(SplitStep):
         norm: ErrorNorm,
         zone: Zone | None,
         rates: FloatArray,
-    ) -> tuple[StageRate, float]:
+    ) -> Stages:
         """See :class:`SplitStep`; the equations are linearised here."""
         from scipy.linalg import lu_factor, lu_solve
 
@@ -106,19 +167,29 @@ class LinearSplitStep(SplitStep):
         factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)
         before = np.tril(scheme.implicit, -1) / gamma
         time_shares = h * scheme.implicit.sum(axis=1)
+        law_rates = np.zeros((end, len(known.laws)))
 
-        def rate_of(j: int, rate: FloatArray) -> FloatArray:
-            if j == end:
-                return rate
-            w = before[j] @ rates[:end]
-            solved = lu_solve(factors, rate + w + time_shares[j] * known.by_time, check_finite=False)
-            return np.asarray(solved - w, dtype=np.float64)
+        def apply(j: int) -> FloatArray:
+            """Let the laws of the stage ``j`` act, or at the end those of the end state itself."""
+            weights = scheme.A[j] if j < end else scheme.b
+            applied = known.applied + h * weights @ law_rates
+            system.apply_laws(applied if j < end and len(applied) else None)
+            return applied
+
+        def rate_of(j: int, rate: FloatArray, laws: FloatArray) -> FloatArray:
+            w, law_w = before[j] @ rates[:end], before[j] @ law_rates
+            missing = laws - (known.applied + h * scheme.A[j] @ law_rates)
+            given = rate + w + time_shares[j] * known.by_time + known.by_laws @ missing
+            solved = np.asarray(lu_solve(factors, given, check_finite=False), dtype=np.float64)
+            law_rates[j] = missing / (h * gamma) + known.by_coordinates @ solved - law_w
+            return solved - w
 
         rates[:lead] = known.rate
-        rates[lead] = rate_of(lead, known.rate)
+        rates[lead] = rate_of(lead, known.rate, known.laws)
         unit = norm.one if norm.unit is None else norm.unit
         k = system.multiplier_part.start
-        return rate_of, largest_eigenvalue(known.J, h, unit, k)
+        stiffness = largest_eigenvalue(known.J, h, unit, k)
+        return LinearStages(system, rate_of, apply, stiffness)
 
 
 @dataclass(frozen=True)

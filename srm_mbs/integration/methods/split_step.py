@@ -42,8 +42,26 @@ RESIDUAL_EVERY = 16
 """Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
 
 
-StageRate = Callable[[int, FloatArray], FloatArray]
-"""(j, chart rate (n,) at the stage j) -> the rate K_j (n,) of the scheme."""
+class Stages:
+    """How the rates of a scheme follow from the chart rates of its stages: they are the same.
+
+    Attributes
+    ----------
+    stiffness
+        As far as it is known before the step.
+    laws : (m,) or None
+        Laws of forces at the stage begun last, if the scheme carries them.
+    """
+
+    stiffness: float = np.nan
+    laws: FloatArray | None = None
+
+    def begin(self, j: int) -> None:
+        """Prepare the system for the stage ``j``."""
+
+    def rate(self, j: int, rate: FloatArray) -> FloatArray:
+        """The rate (n,) of the stage ``j`` in the scheme, from the chart rate."""
+        return rate
 
 
 @lru_cache(maxsize=64)
@@ -83,14 +101,11 @@ class SplitStep:
         norm: ErrorNorm,
         zone: Zone | None,
         rates: FloatArray,
-    ) -> tuple[StageRate, float]:
-        """How the rates of the scheme follow from the chart rates of the stages, and the stiffness
-        as far as it is known before the step.
-
-        ``rates`` (s + 1, n) receives the rates of the stages at the start of the step.
-        """
+    ) -> Stages:
+        """What the scheme makes of the stages; ``rates`` (s + 1, n) receives the rates of those at
+        the start of the step."""
         rates[0] = memory.rate
-        return lambda _, rate: rate, np.nan
+        return Stages()
 
     def start(
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm
@@ -134,13 +149,14 @@ class SplitStep:
         rates = np.zeros((s + 1, system.tangent_size))
         weighed = rates[:s]
         first = scheme.lead + 1
-        rate_of, stiffness = self.stage_rates(system, t, h, state, memory, norm, zone, rates)
+        stages = self.stage_rates(system, t, h, state, memory, norm, zone, rates)
         all_sigmas = [start] * first
         deficient: list[tuple[int, int, bool]] = []
         delta = np.zeros(system.tangent_size)
         for j, stage_weights, fraction in zip(range(first, s + 1), h * all_weights, fractions):
             before, delta = delta, stage_weights.dot(weighed)
             x = system.retract(state, delta)
+            stages.begin(j)
             time = t + fraction * h
             terms = system.evaluate(time, x, zone if nodes is None else None)
             all_sigmas.append(terms.sigma)
@@ -155,7 +171,8 @@ class SplitStep:
             if branch is not None:
                 terms, x, moved = branch(terms, time, fraction, x)
             rate = terms.rate()
-            rates[j] = rate_of(j, system.chart_rate(delta, rate))
+            chart_rate = system.chart_rate(delta, rate)
+            rates[j] = chart_rate if j == s else stages.rate(j, chart_rate)
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
         sigma = all_sigmas[-1]
@@ -216,7 +233,8 @@ class SplitStep:
             state_scale=state_scale,
             multiplier=multiplier,
             stiff=memory.stiff,
-            stiffness=stiffness,
+            stiffness=stages.stiffness,
+            laws=stages.laws,
         )
         if scheme.stable_to is not None and branch is None and norm.negligible > 0.0:
             change_of_rate = rates[s] - rates[s - 1]
@@ -244,7 +262,7 @@ class SplitStep:
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
         memory.state_scale = result.state_scale
-        memory.linearisation = None
+        memory.linearisation, memory.laws = None, result.laws
         if memory.history is not None:
             memory.history = history_after(memory.history, result)
         count_stiffness(memory, result.stiffness, self.scheme)

@@ -451,6 +451,10 @@ class DaeSystem:
         """0: no state is another one's rate."""
         return np.zeros_like(delta)
 
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        """Infinite: a DAE has no friction."""
+        return np.full(self.nx, np.inf)
+
     def apply_laws(self, values: FloatArray | None) -> None:
         """Nothing: a DAE has no forces."""
 

@@ -60,21 +60,26 @@ class Evaluator(ABC):
         """Its potential energy (J), if it has one; ``data`` need hold the placements only."""
         return 0.0
 
-    law_count = 0
-    """Number of its laws between links."""
-
-    def laws(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
-        """Values (law_count,) of its laws: forces and moments, each along its own direction."""
-        return np.zeros(0)
-
-    def apply(self, tau: FloatArray, data: pin.Data, values: FloatArray) -> None:
-        """Add the generalised forces to ``tau`` (nv,) if ``values`` (law_count,) act in place of
-        its laws."""
-
     @abstractmethod
     def constants(self) -> dict[str, Any] | None:
         """Constants for the compiled kernel, of which ``kind`` numbers the kinds as forces.hpp
         does; None for functions of the user, which the kernel calls."""
+
+
+class LawEvaluator(Evaluator):
+    """An element between links with laws: forces and moments, each along its own direction."""
+
+    law_count: int
+    """Number of its laws."""
+
+    @abstractmethod
+    def laws(self, data: pin.Data) -> FloatArray:
+        """Values (law_count,) of its laws."""
+
+    @abstractmethod
+    def apply(self, tau: FloatArray, data: pin.Data, values: FloatArray) -> None:
+        """Add the generalised forces to ``tau`` (nv,) if ``values`` (law_count,) act in place of
+        its laws."""
 
 
 class ResolvedAnchor:
@@ -140,7 +145,7 @@ class ValuesOverTime:
         return {"numbers": self._numbers, "curves": curves}
 
 
-class SpringDamperEvaluator(Evaluator):
+class SpringDamperEvaluator(LawEvaluator):
     """A :class:`~srm_mbs.model.forces.SpringDamper`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: SpringDamper) -> None:
@@ -156,7 +161,7 @@ class SpringDamperEvaluator(Evaluator):
         force, at_a, _ = self._force(data)
         add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
 
-    def laws(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
+    def laws(self, data: pin.Data) -> FloatArray:
         """The force along the line."""
         if not self.law_count:
             return np.zeros(0)
@@ -233,7 +238,7 @@ class WrenchEvaluator(Evaluator):
         } | self.wrench.constants()
 
 
-class BushingEvaluator(Evaluator):
+class BushingEvaluator(LawEvaluator):
     """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Bushing) -> None:
@@ -258,7 +263,7 @@ class BushingEvaluator(Evaluator):
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         self._act(tau, data, *self._forces(data))
 
-    def laws(self, data: pin.Data, q: FloatArray, v: FloatArray) -> FloatArray:
+    def laws(self, data: pin.Data) -> FloatArray:
         """The forces and moments that are not always zero, with the opposite sign."""
         return np.concatenate(self._forces(data))[self._own]
 
@@ -267,9 +272,7 @@ class BushingEvaluator(Evaluator):
         both[self._own] = values
         self._act(tau, data, both[:3], both[3:])
 
-    def _act(
-        self, tau: FloatArray, data: pin.Data, force: FloatArray, moment: FloatArray
-    ) -> None:
+    def _act(self, tau: FloatArray, data: pin.Data, force: FloatArray, moment: FloatArray) -> None:
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         L = pin.Jlog3(Tb.actInv(Ta).rotation)
         force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
@@ -530,7 +533,7 @@ class ForceKinematics:
         for element in self._elements:
             if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
                 element.add(along, data, q, v, 0.0)
-        return along, [e.laws(data, q, v) for e in self._elements if e.law_count]
+        return along, [e.laws(data) for e in self._elements if isinstance(e, LawEvaluator)]
 
     def generalised_with(
         self, data: pin.Data, q: FloatArray, v: FloatArray, t: float, applied: FloatArray
@@ -542,7 +545,7 @@ class ForceKinematics:
         for element in self._elements:
             if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
                 continue
-            if element.law_count:
+            if isinstance(element, LawEvaluator):
                 element.apply(tau, data, applied[first : first + element.law_count])
                 first += element.law_count
             else:

@@ -29,7 +29,7 @@ from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
-from srm_mbs.dynamics.forces import resolved_forces
+from srm_mbs.dynamics.forces import ForceKinematics, resolved_forces
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
@@ -214,7 +214,7 @@ class Mechanics(Manifold):
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
         self._applied: FloatArray | None = None
-        self._laws_at: tuple[FloatArray, FloatArray] | None = None
+        self._laws_at = np.zeros(self.nq), np.zeros(self.nv)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Terms and workspaces share memory, which copies of them would not.
@@ -309,7 +309,6 @@ class Mechanics(Manifold):
     def laws(self) -> FloatArray:
         """Values (m,) of the laws of forces at the stage evaluated last: those of the coordinates
         with damping, friction, springs or limits, then those of the elements between links."""
-        assert self._laws_at is not None
         q, v = self._laws_at
         along = self.damping_force(v) + self.friction_force(v)
         between: list[FloatArray] = []
@@ -317,6 +316,12 @@ class Mechanics(Manifold):
             springs, between = self._forces.laws(self.data, q, v)
             along = along + springs
         return np.concatenate([along[self._law_coordinates], *between])
+
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        own = self._friction_speed + FRICTION_PART * np.abs(v)
+        limits = np.where(self._friction != 0.0, own, np.inf)
+        return np.concatenate([np.full(self.nv, np.inf), limits])
 
     def apply_laws(self, values: FloatArray | None) -> None:
         """See :class:`~srm_mbs.dynamics.system.System`."""
@@ -330,12 +335,14 @@ class Mechanics(Manifold):
         force[self._law_coordinates] = self._applied[: len(self._law_coordinates)]
         return force
 
-    def _element_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
-        assert self._forces is not None
+    def _element_force(
+        self, forces: ForceKinematics, t: float, q: FloatArray, v: FloatArray
+    ) -> FloatArray:
+        """The generalised forces (nv,) of the elements, or of what acts in place of their laws."""
         if self._applied is None:
-            return self._forces.generalised(self.data, q, v, t)
+            return forces.generalised(self.data, q, v, t)
         applied = self._applied[len(self._law_coordinates) :]
-        return self._forces.generalised_with(self.data, q, v, t, applied)
+        return forces.generalised_with(self.data, q, v, t, applied)
 
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Controller, joint damping and joint friction (nv,)."""
@@ -348,7 +355,7 @@ class Mechanics(Manifold):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._element_force(t, q, v)
+            force = force + self._element_force(self._forces, t, q, v)
         gravity: FloatArray = pin.computeGeneralizedGravity(self.model, self.data, q)
         return force - gravity
 
@@ -405,6 +412,9 @@ class Mechanics(Manifold):
         return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 
+FRICTION_PART = 0.01
+"""Part of a rate, beside the friction speed, by which stiff steps may err where friction acts: a
+tolerance far above that speed never lets a joint come to rest."""
 DEPENDENT_DRIVE = 1e-10
 """Part of a drive's motion without those of others below which it is one of theirs."""
 _OVERFLOW = 1e100
@@ -439,7 +449,7 @@ class OpenSystem(Mechanics):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._element_force(t, q, v)
+            force = force + self._element_force(self._forces, t, q, v)
         self._laws_at = q, v
         rate = self._terms.rate()
         rate[: self.nv] = v
@@ -558,7 +568,7 @@ class ClosedSystem(Mechanics):
         pin.crba(model, data, q, pin.Convention.WORLD)
         f = self.applied_force(t, q, v) - pin.nonLinearEffects(model, data, q, v)
         if self._forces is not None:
-            f += self._element_force(t, q, v)
+            f += self._element_force(self._forces, t, q, v)
         self._laws_at = q, v
         loops = self.loops
         loops.update(data, q)

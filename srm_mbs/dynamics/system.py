@@ -167,6 +167,10 @@ class System(Protocol):
         """Values (m,) of the laws of forces at the stage evaluated last, as
         :meth:`apply_laws` counts them."""
 
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        """Errors (n,) of a tangent from which the friction at the rates ``v`` (k,) is another;
+        infinite where there is none."""
+
     def apply_laws(self, values: FloatArray | None) -> None:
         """Let ``values`` (m,) act in evaluations in place of the laws of forces that damp or store
         energy; None for the laws themselves."""

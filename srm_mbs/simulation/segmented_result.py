@@ -248,10 +248,7 @@ def _joined(parts: Sequence[StepData]) -> StepData:
         stop=None,
         breaks=np.concatenate([part.breaks + start for start, part in zip(at, parts)]),
         break_rates=rows("break_rates"),
-        **{
-            name: rows(name)
-            for name in _ROWS
-        },
+        **{name: rows(name) for name in _ROWS},
     )
 
 

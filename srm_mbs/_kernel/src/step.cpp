@@ -1,5 +1,6 @@
 #include "step.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -156,18 +157,36 @@ double SplitStep::stiffness() const {
     return h_ * std::min(da / dv, std::sqrt(da / dq));
 }
 
+// Whether an acceleration varies over the step by more than what would stop the coordinate within
+// it, and by more than the tolerance: that of friction, whose sign steps take at random.
+bool SplitStep::chatters(const IntegratorState& memory) const {
+    const int s = scheme.stages(), n = n_;
+    for (int i = nv_; i < n; ++i) {
+        const double before = std::abs(memory.rate[i - nv_]);
+        const double least = std::max({before, std::abs(result.end_rate[i - nv_]),
+                                       norm.weight(i, before)}) / h_;
+        double low = result.rates[i], high = low;
+        for (int j = 1; j <= s; ++j) {
+            low = std::min(low, result.rates[j * n + i]);
+            high = std::max(high, result.rates[j * n + i]);
+        }
+        if (high - low > least) return true;
+    }
+    return false;
+}
+
 // Takes the step into account, which was accepted: methods/stiffness.py.
 void SplitStep::count_stiffness(IntegratorState& memory) {
     if (!linear_) {
         if (memory.stiff || !(scheme.stable_to > 0.0) || norm.negligible == 0.0) return;
-        if (!monitored_ && stiffness() > scheme.stable_to) {
+        if (!monitored_ && (stiffness() > scheme.stable_to || chatters(memory))) {
             ++memory.stiff_steps;
             memory.other_steps = 0;
         } else if (memory.stiff_steps && ++memory.other_steps == constants.other_steps) {
             memory.stiff_steps = memory.other_steps = 0;
         }
     } else if (memory.stiff) {
-        const bool stiff = !(linear_->stiffness(h_) < constants.not_stiff);
+        const bool stiff = !(linear_->stiffness(h_) < constants.not_stiff) || chatters(memory);
         memory.stiff_steps = stiff ? 0 : memory.stiff_steps + 1;
     }
     if (memory.stiff_steps < constants.stiff_steps) return;
@@ -502,6 +521,9 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
         error_[i] = h_ * std::abs(error_[i]);
         weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));
     }
+    for (int i = 0; linear_ && i < nv_; ++i)
+        weights_[nv_ + i] =
+            std::min(weights_[nv_ + i], system_.friction_tolerance(i, r.end_rate[i]));
     if (monitored_) {
         // Counted always, the uncertainty of the predicted multiplier would shorten the steps next
         // to the singular configuration for ever.

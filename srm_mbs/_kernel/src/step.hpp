@@ -130,6 +130,7 @@ private:
     void linear_rate(int j, const std::vector<double>& laws);
     void apply_laws(int j);
     double stiffness() const;
+    bool chatters(const IntegratorState& memory) const;
     void count_stiffness(IntegratorState& memory);
     void evaluate_stages(double t, const double* state, const IntegratorState& memory,
                          double sigma_change);

@@ -23,6 +23,9 @@ using pinocchio_model::Argument;
 namespace {
 
 constexpr double overflow = 1e100;
+constexpr double friction_part = 0.01;  // FRICTION_PART of dynamics/multibody.py
+// Coordinates of an open mechanism up to which its mass matrix is factorised in stiff steps.
+constexpr int one_pass_size = 12;
 constexpr double two_pi = 6.283185307179586;
 
 // The placement of a joint in the world; its velocity and bias acceleration (with -gravity), in its
@@ -386,6 +389,12 @@ void System::passive_forces() {
     }
 }
 
+double System::friction_tolerance(int i, double v) const {
+    if (data_.friction.empty() || data_.friction[i] == 0.0)
+        return std::numeric_limits<double>::infinity();
+    return data_.friction_speed + friction_part * std::abs(v);
+}
+
 bool System::time_dependent() const {
     return controller_ || driven() ||
            std::any_of(data_.forces.begin(), data_.forces.end(),
@@ -463,6 +472,20 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
             f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
     if (laws) passive_forces();
+    if (!closed_ && laws && nv <= one_pass_size) {
+        // The one pass over the tree that closures have costs less than three.
+        pinocchio_model::compute_terms(w);
+        for (int i = 0; i < nv; ++i) rate_[i] = f_[i] - w.data.nle[i];
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), rate_.data(), laws);
+        double M[one_pass_size * one_pass_size];
+        int pivots[one_pass_size];
+        for (int j = 0; j < nv; ++j)
+            for (int i = 0; i <= j; ++i) M[j * nv + i] = M[i * nv + j] = w.data.M(i, j);
+        if (!lu_factor(M, nv, pivots)) throw EvaluationError{Failure::acceleration};
+        lu_solve(M, nv, pivots, rate_.data());
+        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
+        return;
+    }
     if (!closed_) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);

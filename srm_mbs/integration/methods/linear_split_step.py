@@ -1,7 +1,7 @@
 r"""The linearly implicit step of the split PSRM, for stiff problems.
 
-The stages integrate the same equations as those of :mod:`srm_mbs.integration.methods.split_step`, in
-the chart at the start of the step, where x = x_n (+) delta and delta' = D(t, delta).  With
+The stages integrate the equations of :mod:`srm_mbs.integration.methods.split_step`, in the chart
+at the start of the step, where x = x_n (+) delta and delta' = D(t, delta).  With
 J = dD/d delta and D_t there, the rate of the stage i is
 
     (1 - h gamma J) (K_i + w_i) = D(t_i, h sum_{j<i} a_ij K_j) + w_i + h (sum_j g_ij) D_t,
@@ -9,9 +9,19 @@ J = dD/d delta and D_t there, the rate of the stage i is
 
 (G. Steinebach, BIT Numer. Math. 63 (2023) 27; E. Hairer, G. Wanner, *Solving Ordinary Differential
 Equations II*, 2nd edition, Springer 1996, IV.7).  The order depends on J: it is found anew at every
-accepted state, by one-sided differences.  Everything else, the correction at the end, the zone and
-the placement, is that of explicit steps; only stages of motions that linger next to a singular
-configuration are not solved by nodes of the branch.
+accepted state, by one-sided differences.
+
+**Laws of forces.**  Dampers, springs, bushings and friction act along directions N(q) that turn
+with the configuration: f = f_0(q, v, t) + N(q) y, y = F(q, v).  Evaluated at stages, a law of a
+large constant c errs by c h^2, and steps would shrink like c^(-1/4).  So its value y is a variable
+of its own: 0 = F(q, v) - y is linearised like the other equations (the same reference, VI.3), the
+stages evaluate the forces with their own y, and what is nonlinear no longer contains c.  With
+L = dF/d delta and W = dD/dy the full J is that with y held, plus W L; what a stage's law lacks,
+r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) + L (K + w) - w_y.
+
+Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
+only stages of motions that linger next to a singular configuration are not solved by nodes of the
+branch.
 """
 
 from __future__ import annotations
@@ -142,6 +152,13 @@ class LinearSplitStep(SplitStep):
         finally:
             system.apply_laws(None)
 
+    @property
+    def _implicit(self) -> FloatArray:
+        """The g_ij of the scheme."""
+        if self.scheme.implicit is None:
+            raise ValueError(f"the tableau {self.scheme.name!r} is explicit")
+        return self.scheme.implicit
+
     def stage_rates(
         self,
         system: System,
@@ -156,17 +173,16 @@ class LinearSplitStep(SplitStep):
         """See :class:`SplitStep`; the equations are linearised here."""
         from scipy.linalg import lu_factor, lu_solve
 
-        scheme, n = self.scheme, system.tangent_size
-        assert scheme.implicit is not None
+        scheme, n, implicit = self.scheme, system.tangent_size, self._implicit
         lead, end = scheme.lead, scheme.n_stages
         known = memory.linearisation
         if known is None:
             known = linearised(system, t, h, state, memory, norm, zone)
             memory.linearisation = known
-        gamma = float(scheme.implicit[lead, lead])
+        gamma = float(implicit[lead, lead])
         factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)
-        before = np.tril(scheme.implicit, -1) / gamma
-        time_shares = h * scheme.implicit.sum(axis=1)
+        before = np.tril(implicit, -1) / gamma
+        time_shares = h * implicit.sum(axis=1)
         law_rates = np.zeros((end, len(known.laws)))
 
         def apply(j: int) -> FloatArray:
@@ -182,7 +198,7 @@ class LinearSplitStep(SplitStep):
             given = rate + w + time_shares[j] * known.by_time + known.by_laws @ missing
             solved = np.asarray(lu_solve(factors, given, check_finite=False), dtype=np.float64)
             law_rates[j] = missing / (h * gamma) + known.by_coordinates @ solved - law_w
-            return solved - w
+            return np.asarray(solved - w)
 
         rates[:lead] = known.rate
         rates[lead] = rate_of(lead, known.rate, known.laws)
@@ -194,7 +210,7 @@ class LinearSplitStep(SplitStep):
 
 @dataclass(frozen=True)
 class SwitchingStep(SplitStep):
-    """Explicit steps of ``scheme``, and those of its scheme for stiff problems where it is stiff."""
+    """Steps of ``scheme``, and where the problem is stiff those of its scheme for that."""
 
     def _stepper(self, stiff: bool) -> SplitStep:
         return LinearSplitStep(self.scheme.member(True), self.eps) if stiff else self._explicit

@@ -36,7 +36,7 @@ from srm_mbs.integration.methods.near_singular import (
     WATCHED_SIGMA,
     BranchStages,
 )
-from srm_mbs.integration.methods.stiffness import count_stiffness, stiffness_of
+from srm_mbs.integration.methods.stiffness import chatters, count_stiffness, stiffness_of
 
 RESIDUAL_EVERY = 16
 """Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
@@ -209,6 +209,9 @@ class SplitStep:
         if scheme.error is not None:
             error = h * (scheme.error @ rates)
             weights = norm.weights(np.maximum(memory.state_scale, state_scale))
+            if scheme.implicit is not None:
+                k = system.multiplier_part.start
+                weights = np.minimum(weights, system.friction_tolerance(end_rate[:k]))
             if branch is not None and history is not None:
                 if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:
                     error = np.abs(error)
@@ -236,9 +239,15 @@ class SplitStep:
             stiffness=stages.stiffness,
             laws=stages.laws,
         )
-        if scheme.stable_to is not None and branch is None and norm.negligible > 0.0:
+        explicit = scheme.stable_to is not None and branch is None and norm.negligible > 0.0
+        if explicit:
             change_of_rate = rates[s] - rates[s - 1]
             result.stiffness = stiffness_of(system, h, delta - before, change_of_rate)
+        if explicit or scheme.implicit is not None:
+            k = system.multiplier_part.start
+            v = np.array([memory.rate[:k], end_rate[:k]])
+            if k and chatters(h, v, rates[:, k:], norm.weights(memory.state_scale)[k:]):
+                result.stiffness = np.inf
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
         if due and history is not None and theta == 1.0 and away is None:
             result.constraint_residual = terms.constraint_residual()

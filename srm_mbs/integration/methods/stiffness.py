@@ -1,9 +1,10 @@
 r"""Whether a problem is stiff: seen from its explicit steps, and from its linearised equations.
 
-The last two stages of an explicit step, the end point among them, lie at the same time.  In a stiff
-problem their arguments differ along the fastest mode, by (dq, dv), and their rates by (dv', da).
-With lambda the eigenvalue of the mode, |da| = |lambda| |dv| and |da| = |lambda|^2 |dq|.  Both ratios
-have to show it: a vibration that steps follow has every ratio |da| / |dv|, depending on its phase.
+The last two stages of an explicit step, the end point among them, lie at the same time.  In a
+stiff problem their arguments differ along the fastest mode, by (dq, dv), and their rates by
+(dv, da).  With lambda the eigenvalue of the mode, |da| = |lambda| |dv| = |lambda|^2 |dq|.  Both
+ratios have to show it: a vibration that steps follow has every ratio |da| / |dv|, depending on its
+phase.
 Counted are steps with h |lambda| beyond the bound of stability (E. Hairer, G. Wanner, *Solving
 Ordinary Differential Equations II*, 2nd edition, Springer 1996, IV.2).
 """
@@ -42,6 +43,22 @@ def stiffness_of(system: System, h: float, difference: FloatArray, change: Float
     if not (dq > 0.0 and dv > 0.0):
         return math.nan
     return h * min(da / dv, math.sqrt(da / dq))
+
+
+def chatters(h: float, v: FloatArray, accelerations: FloatArray, weights: FloatArray) -> bool:
+    """Whether an acceleration varies over a step of ``h`` (s) by more than what would stop the
+    coordinate within it, and by more than the tolerance: that of friction, whose sign steps take
+    at random.
+
+    Parameters
+    ----------
+    v : (2, k), accelerations : (j, k)
+        Rates at the ends of the step, and their derivatives at its stages.
+    weights : (k,)
+        Tolerances of the rates.
+    """
+    change = h * np.ptp(accelerations, axis=0)
+    return bool((change > np.maximum(np.abs(v).max(axis=0), weights)).any())
 
 
 def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:

@@ -235,10 +235,8 @@ def _rodas5p() -> ButcherTableau:
     def weights(values: Sequence[float]) -> list[float]:
         return [*[0.0] * lead, *values, 0.0]
 
-    rows = (own.B, *own.D)
-    dense = DenseExtension(
-        "rodas5p", 4, 0, [weights(row) for row in rows], np.zeros((0, s + 1)), np.zeros(0)
-    )
+    rows = np.array([weights(row) for row in (own.B, *own.D)])
+    dense = DenseExtension("rodas5p", 4, 0, rows, np.zeros((0, s + 1)), np.zeros(0))
     return ButcherTableau(
         name="rodas5p",
         order=5,

@@ -157,11 +157,13 @@ double SplitStep::stiffness() const {
     return h_ * std::min(da / dv, std::sqrt(da / dq));
 }
 
-// Whether an acceleration varies over the step by more than what would stop the coordinate within
-// it, and by more than the tolerance: that of friction, whose sign steps take at random.
+// Whether the acceleration of a coordinate with friction varies over the step by more than what
+// would stop it within the step, and by more than the tolerance: stages take its sign at random.
 bool SplitStep::chatters(const IntegratorState& memory) const {
     const int s = scheme.stages(), n = n_;
+    if (!system_.has_friction()) return false;
     for (int i = nv_; i < n; ++i) {
+        if (!std::isfinite(system_.friction_tolerance(i - nv_, 0.0))) continue;
         const double before = std::abs(memory.rate[i - nv_]);
         const double least = std::max({before, std::abs(result.end_rate[i - nv_]),
                                        norm.weight(i, before)}) / h_;

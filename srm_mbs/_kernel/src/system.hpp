@@ -202,6 +202,7 @@ public:
     }
     void apply_laws(const double* values) { laws_.applied = values; }
     const std::vector<double>& law_values() const { return laws_.values; }
+    bool has_friction() const { return !data_.friction.empty(); }
     // Error of the rate v of a coordinate from which its friction is another; infinite without.
     double friction_tolerance(int i, double v) const;
     // Whether rates may depend on time itself: held forces do not.

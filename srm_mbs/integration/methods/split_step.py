@@ -246,7 +246,8 @@ class SplitStep:
         if explicit or scheme.implicit is not None:
             k = system.multiplier_part.start
             v = np.array([memory.rate[:k], end_rate[:k]])
-            if k and chatters(h, v, rates[:, k:], norm.weights(memory.state_scale)[k:]):
+            rubs = np.isfinite(system.friction_tolerance(end_rate[:k])[k:])
+            if chatters(h, v, rates[:, k:], norm.weights(memory.state_scale)[k:], rubs):
                 result.stiffness = np.inf
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
         if due and history is not None and theta == 1.0 and away is None:

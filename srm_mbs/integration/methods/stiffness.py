@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.methods.base import IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -45,10 +45,12 @@ def stiffness_of(system: System, h: float, difference: FloatArray, change: Float
     return h * min(da / dv, math.sqrt(da / dq))
 
 
-def chatters(h: float, v: FloatArray, accelerations: FloatArray, weights: FloatArray) -> bool:
-    """Whether an acceleration varies over a step of ``h`` (s) by more than what would stop the
-    coordinate within it, and by more than the tolerance: that of friction, whose sign steps take
-    at random.
+def chatters(
+    h: float, v: FloatArray, accelerations: FloatArray, weights: FloatArray, rubs: BoolArray
+) -> bool:
+    """Whether the acceleration of a coordinate with friction varies over a step of ``h`` (s) by
+    more than what would stop it within the step, and by more than the tolerance: stages take its
+    sign at random.
 
     Parameters
     ----------
@@ -56,9 +58,13 @@ def chatters(h: float, v: FloatArray, accelerations: FloatArray, weights: FloatA
         Rates at the ends of the step, and their derivatives at its stages.
     weights : (k,)
         Tolerances of the rates.
+    rubs : (k,)
+        Which coordinates have friction.
     """
+    if not rubs.any():
+        return False
     change = h * np.ptp(accelerations, axis=0)
-    return bool((change > np.maximum(np.abs(v).max(axis=0), weights)).any())
+    return bool((change > np.maximum(np.abs(v).max(axis=0), weights))[rubs].any())
 
 
 def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:

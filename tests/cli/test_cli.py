@@ -64,7 +64,7 @@ def saved_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("name", "words"),
     [
         ("simulate", "--t-end --method --tableau --rtol --atol --step --backend --out --plot"),
-        ("simulate", "--csv --html --play MODEL psrm dop853 auto|python|kernel"),
+        ("simulate", "--csv --html --play MODEL psrm auto auto|python|kernel"),
         ("info", "MODEL degrees of freedom rank redundant"),
         ("models", "package"),
         ("play", "RUN browser"),

@@ -157,7 +157,7 @@ def cases() -> dict[str, tuple[srm.Mechanism, dict[str, Any]]]:
     own = srm.UserForce(user_damper, name="damper")
     return {
         "bushing": (bushed_four_bar(1e-6), {}),
-        "friction": (rubbing("four_bar", 2.0, 1e-5), {"t_end": 6.0}),
+        "friction": (rubbing("four_bar", 2.0, 1e-3), {"t_end": 6.0, "rtol": 1e-8}),
         "governor": (srm.load("flyball_governor"), {}),
         "controller": (follower_mechanism, {"controller": force}),
         "sampled": (bushed_four_bar(1e-6), {"controller": swaying, "sample_time": 5e-2}),

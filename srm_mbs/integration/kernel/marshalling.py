@@ -320,7 +320,7 @@ SchemeDense = tuple[list[float], Any]
 
 
 def scheme_dense(scheme: ButcherTableau) -> SchemeDense:
-    """What dense output needs of ``scheme``."""
+    """Abscissae and extension of ``scheme``."""
     return scheme.abscissae.tolist(), extension_struct(scheme.dense)
 
 

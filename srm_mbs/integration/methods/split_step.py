@@ -102,8 +102,7 @@ class SplitStep:
         zone: Zone | None,
         rates: FloatArray,
     ) -> Stages:
-        """What the scheme makes of the stages; ``rates`` (s + 1, n) receives the rates of those at
-        the start of the step."""
+        """The stages of one step; ``rates`` (s + 1, n) receives the rates of those at its start."""
         rates[0] = memory.rate
         return Stages()
 

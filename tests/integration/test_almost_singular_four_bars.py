@@ -29,7 +29,10 @@ def check(name: str, d: float, rtol: float, backend: str) -> None:
 
 @pytest.mark.parametrize("name", CHANGE_POINTS)
 @pytest.mark.parametrize("d", [1e-2, -1e-5, 1e-8, -1e-11])
-@pytest.mark.parametrize(("rtol", "backend"), [(1e-4, "python"), (1e-9, "kernel")])
+@pytest.mark.parametrize(
+    ("rtol", "backend"),
+    [pytest.param(1e-4, "python", marks=pytest.mark.stress), (1e-9, "kernel")],
+)
 def test_a_four_bar_next_to_its_change_point_follows_the_length_of_its_coupler(
     name: str, d: float, rtol: float, backend: str
 ) -> None:

@@ -106,6 +106,7 @@ def tumbling(t_end: float, v0: np.ndarray) -> tuple[np.ndarray, int]:
     return y[4:], jumps
 
 
+@pytest.mark.stress
 @on_both
 def test_a_tumbling_body_agrees_with_scipy_beyond_half_turns(backend: str) -> None:
     v0 = np.array([1.0, -2.0, 11.0])
@@ -119,6 +120,7 @@ def test_a_tumbling_body_agrees_with_scipy_beyond_half_turns(backend: str) -> No
         assert run.v[-1] == pytest.approx(expected, abs=30.0 * rtol + 1e-11)
 
 
+@pytest.mark.stress
 @on_both
 def test_fixed_steps_keep_their_order_beyond_half_turns(backend: str) -> None:
     """The steps return to their grid."""

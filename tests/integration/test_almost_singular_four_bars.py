@@ -47,7 +47,7 @@ def test_couplers_of_any_difference_turn_the_corner(
     name: str, d: float, rtol: float, backend: str, request: pytest.FixtureRequest
 ) -> None:
     if name == "parallelogram" and abs(d) == 1e-12 and rtol == 1e-12:
-        # Sixteen passages; rounding over the width of the layer (docs/limits.md): up to 5e-9.
+        # Sixteen passages; rounding over the width of the layer (docs/limits.md) is the bound.
         request.applymarker(pytest.mark.xfail(strict=False))
     check(name, d, rtol, backend)
 

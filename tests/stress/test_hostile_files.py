@@ -119,6 +119,13 @@ def _mjcf_circle(folder: Path) -> str:
     return "m0.xml"
 
 
+def _replicated(opened: str) -> str:
+    """An MJCF file with a body in the replicates that ``opened`` begins."""
+    closed = "</replicate>" * opened.count("<")
+    body = '<body name="b"><joint name="j"/><geom size="0.1"/></body>'
+    return f"<mujoco><worldbody>{opened}{body}{closed}</worldbody></mujoco>"
+
+
 def _sparse(folder: Path) -> str:
     with (folder / "robot.urdf").open("wb") as file:
         file.write(b'<robot name="r">')
@@ -152,6 +159,8 @@ CASES: dict[str, Case] = {
     **{f"mesh of MJCF: {k}": v for k, v in _special(_mesh).items()},
     "SDF files that include each other twice": _sdf_circle,
     "MJCF files that include each other twice": _mjcf_circle,
+    "24,000 bodies by a replicate": _one("m.xml", lambda: _replicated('<replicate count="24000">')),
+    "replicates of replicates": _one("m.xml", lambda: _replicated('<replicate count="300">' * 250)),
     "100,000 dotted keys in one": _one("m.toml", lambda: "format = 1\n" + "a." * 10**5 + "b = 1\n"),
     "100,000 dotted keys in a header": _one(
         "m.toml", lambda: "format = 1\n[" + "'a' . " * 10**5 + "b]\n"

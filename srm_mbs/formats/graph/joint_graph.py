@@ -36,8 +36,6 @@ FREEDOM = {
 """Degrees of freedom of the types of joint."""
 ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
-NO_LIMIT = OPEN_LIMIT
-"""The number that stands for "no limit" (any unit)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,10 +112,10 @@ class Joint:
     axis: Direction = (1.0, 0.0, 0.0)
     second_axis: Direction | None = None
     pitch: float = 0.0
-    lower: float = -NO_LIMIT
-    upper: float = NO_LIMIT
-    effort: float = NO_LIMIT
-    speed: float = NO_LIMIT
+    lower: float = -OPEN_LIMIT
+    upper: float = OPEN_LIMIT
+    effort: float = OPEN_LIMIT
+    speed: float = OPEN_LIMIT
     damping: float = 0.0
     friction: float = 0.0
     stiffness: float = 0.0

@@ -17,17 +17,19 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.graph.joint_graph import NO_LIMIT, Body, Joint, inertia_at
+from srm_mbs.formats.graph.joint_graph import Body, Joint, inertia_at
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
 from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.forces import OPEN_LIMIT
 from srm_mbs.model.reach import Reach
 
 JOINT_TYPES = ("hinge", "slide", "ball", "free")
 """The default first."""
-MOST_REPLICATED = 10**5
-"""Number of elements that the replicates of a file add."""
+MOST_REPLICATED = 2000
+"""Number of elements that the replicates of a file add: a line of text makes no more than some
+hundred bodies, which load in two seconds."""
 FLAGS = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
 """Properties of a joint, and the flags that switch them off."""
 URDF_TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
@@ -386,5 +388,5 @@ def _limits(given: Attributes, in_si: Callable[[float], float], ref: float) -> d
         return {}
     if low >= high:
         raise given.fault("the range does not increase", "Exchange the two")
-    clipped: FloatArray = np.clip([in_si(low) - ref, in_si(high) - ref], -NO_LIMIT, NO_LIMIT)
+    clipped: FloatArray = np.clip([in_si(low) - ref, in_si(high) - ref], -OPEN_LIMIT, OPEN_LIMIT)
     return {"lower": float(clipped[0]), "upper": float(clipped[1])}

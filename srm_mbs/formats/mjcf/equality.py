@@ -51,10 +51,14 @@ class EqualityReader:
     def __init__(self, values: MjcfValues, tree: BodyReader, sections: Sequence[Element]) -> None:
         self.values, self.tree = values, tree
         self._tendons: list[tuple[str, Element]] = []
+        self._fixed_tendons: dict[str, Element] = {}
         for section in sections:
             values.children(section, "<tendon>", ("spatial", "fixed"), (), ("spatial", "fixed"))
             for i, node in enumerate(section):
-                self._tendons.append((node.get("name") or f"{node.tag}_tendon_{i + 1}", node))
+                name = node.get("name") or f"{node.tag}_tendon_{i + 1}"
+                self._tendons.append((name, node))
+                if node.tag == "fixed":
+                    self._fixed_tendons[name] = node
         self.loops: list[dict[str, Any]] = []
         self.forces: list[dict[str, Any]] = []
         self.lock: list[str] = []
@@ -66,6 +70,12 @@ class EqualityReader:
         """Read an ``<equality>`` section."""
         values = self.values
         disabled = "equality" in values.off
+        kinds = {
+            "connect": self._connect,
+            "weld": self._weld,
+            "joint": self._joint,
+            "tendon": self._tendon,
+        }
         values.children(section, "<equality>", (*KINDS, *REFUSED), (), (*KINDS, *REFUSED))
         for node in section:
             name = node.get("name") or f"{node.tag}_{len(self.loops) + len(self.lock) + 1}"
@@ -80,12 +90,6 @@ class EqualityReader:
                 )
             if given.text("solref") or given.text("solimp"):
                 values.remark("solref and solimp (softness) do not act: closures are rigid", name)
-            kinds = {
-                "connect": self._connect,
-                "weld": self._weld,
-                "joint": self._joint,
-                "tendon": self._tendon,
-            }
             kinds[node.tag](name, given)
 
     def _given(self, node: Element, where: str) -> Attributes:
@@ -141,8 +145,8 @@ class EqualityReader:
         self._close(name, "point", [(body, _point(at)) for body, at in ends], given)
 
     def _weld(self, name: str, given: Attributes) -> None:
-        turns = given.number("torquescale", 1.0) == 0.0
-        if "torquescale" in given and not turns:
+        may_turn = given.number("torquescale", 1.0) == 0.0
+        if "torquescale" in given and not may_turn:
             self.values.remark("torquescale does not act: closures are rigid", name)
         ends = self._sites(given)
         if not ends:
@@ -158,7 +162,7 @@ class EqualityReader:
                 placements = self.tree.placements
                 in_first = placements[first].actInv(placements[second]) * at
             ends = [(first, in_first), (second, at)]
-        if turns:  # MuJoCo's rows of the rotation are zero
+        if may_turn:  # MuJoCo's rows of the rotation are zero
             self._close(name, "point", [(body, _point(at)) for body, at in ends], given)
         else:
             self._close(name, "frame", ends, given)
@@ -179,12 +183,11 @@ class EqualityReader:
         sides = []
         for key in ("tendon1", "tendon2"):
             if key in given:
-                found = dict(self._tendons).get(given.text(key))
-                if found is None or found.tag != "fixed":
-                    fixed = [known for known, node in self._tendons if node.tag == "fixed"]
-                    problem = f"there is no fixed tendon {given.text(key)!r}"
-                    raise self.values.unknown(given.where, problem, fixed)
-                sides.append(self._coefficients(given.text(key), found))
+                found = given.text(key)
+                if found not in self._fixed_tendons:
+                    problem = f"there is no fixed tendon {found!r}"
+                    raise self.values.unknown(given.where, problem, self._fixed_tendons)
+                sides.append(self._coefficients(found, self._fixed_tendons[found]))
         self._couple(name, given, sides)
 
     def _coefficients(self, name: str, node: Element) -> dict[str, float]:

@@ -7,7 +7,7 @@ in the world, and quaternions begin with the real part.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.errors import known_names
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.mjcf.attributes import Attributes, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
@@ -42,7 +43,7 @@ class KeyframeReader:
                 name = node.get("name") or str(len(self.keys))
                 self.keys[name] = values.own(node, f"<keyframe>, key {name!r}")
 
-    def start(self, wanted: str | None, closed: bool, joints: Sequence[str]) -> dict[str, Any]:
+    def start(self, wanted: str | None, closed: bool, joints: Collection[str]) -> dict[str, Any]:
         """The entry ``initial`` of a description that starts in the keyframe ``wanted``.
 
         Parameters
@@ -60,11 +61,11 @@ class KeyframeReader:
             If there is no such keyframe, or its numbers do not fit the joints.
         """
         if wanted is None:
-            for name in self.keys:
+            if self.keys:
                 self.values.remark(
-                    f"a run starts in the pose of the file, and not in this keyframe: "
-                    f"srm.load(..., keyframe={name!r}), --keyframe {name}",
-                    f"<keyframe>, key {name!r}",
+                    "a run starts in the pose of the file; srm.load(..., keyframe=NAME) and "
+                    "--keyframe NAME start in one of its keyframes",
+                    known_names(self.keys),
                 )
             return {}
         if wanted not in self.keys:
@@ -72,11 +73,9 @@ class KeyframeReader:
             raise self.values.unknown("<keyframe>", problem, self.keys)
         given, order = self.keys[wanted], self.tree.order
         sizes = np.array([SIZES[kind] for _, kind, _ in order]).reshape(-1, 2)
-        totals = sizes.sum(axis=0).tolist()
-        texts = [given.text(key).strip() for key in ("qpos", "qvel")]
         qpos, qvel = (
-            given.numbers(key, total) if text else None
-            for key, text, total in zip(("qpos", "qvel"), texts, totals)
+            given.numbers(key, total) if given.text(key).strip() else None
+            for key, total in zip(("qpos", "qvel"), sizes.sum(axis=0).tolist())
         )
         positions: dict[str, Any] = {}
         rates: dict[str, Any] = {}

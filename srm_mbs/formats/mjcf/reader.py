@@ -194,13 +194,10 @@ def translate(document: Document, options: Options) -> Translation:
         tree.free,
     )
     made = graph.translate()
-    joints = [
-        joint.get("name", "")
-        for joint in made.tree.findall("joint")
-        if joint.get("name") not in closures.lock
-    ]
+    joints = {joint.get("name", "") for joint in made.tree.findall("joint")}
+    joints -= set(closures.lock)
     if made.entries.get("base") == "floating":
-        joints.append(ROOT_JOINT)
+        joints.add(ROOT_JOINT)
     keyframes = KeyframeReader(values, tree, root.findall("keyframe"))
     start = keyframes.start(options.keyframe, bool(closures.loops), joints)
     if closures.held:

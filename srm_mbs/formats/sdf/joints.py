@@ -12,9 +12,10 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.graph.joint_graph import NO_LIMIT, Body, Direction, Joint
+from srm_mbs.formats.graph.joint_graph import Body, Direction, Joint
 from srm_mbs.formats.sdf.links import FRAMES_SINCE, MODEL, Frames, Scope, joint_frame
 from srm_mbs.formats.xml import XmlValues, words
+from srm_mbs.model.forces import OPEN_LIMIT
 
 TYPES = {
     "revolute": ("axis",),
@@ -272,8 +273,8 @@ class JointReader:
             value = None if text is None else self.values.limit(text, where, f"<{tag}>")
             # -1 as effort or velocity means no limit.
             if value is not None and (value >= 0.0 or key in ("lower", "upper")):
-                found[key] = float(np.clip(value, -NO_LIMIT, NO_LIMIT))
-        if found.get("lower", -NO_LIMIT) > found.get("upper", NO_LIMIT):
+                found[key] = float(np.clip(value, -OPEN_LIMIT, OPEN_LIMIT))
+        if found.get("lower", -OPEN_LIMIT) > found.get("upper", OPEN_LIMIT):
             raise self.values.fault(where, "<lower> is above <upper>", "Exchange them")
         return found
 

@@ -213,10 +213,10 @@ def simulate(
     method
         ``"psrm"``, ``"srm"`` or a method object: :class:`srm_mbs.PSRM`, :class:`srm_mbs.SRM`.
     tableau
-        Runge-Kutta scheme for a method given by name; by default ``"dop853"`` for psrm,
-        ``"tvd32"`` for srm.
+        Runge-Kutta scheme for a method given by name; by default ``"auto"`` for psrm, which is
+        ``"dop853"`` and, where the motion is stiff, ``"rodas5p"``; ``"tvd32"`` for srm.
     rtol
-        Relative tolerance: at most 1e-2 for the split PSRM with dop853, 1e-3 with another tableau,
+        Relative tolerance: at most 1e-2 for the split PSRM with auto and dop853, 1e-3 with another,
         1e-4 for sweeps; at least 1e-12 with closures or drives (1e-11 with tvd32), 2.2e-14 without:
         below, rounding decides.  Others are replaced with a warning.
     atol

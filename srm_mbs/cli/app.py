@@ -110,14 +110,14 @@ def simulate(
         option(
             "NAME",
             "Runge-Kutta scheme of the method.",
-            show_default="the method's: dop853 with psrm, tvd32 with srm",
+            show_default="the method's: auto with psrm, tvd32 with srm",
         ),
     ] = None,
     rtol: Annotated[
         float | None,
         option(
             "R",
-            "Relative tolerance, at most 1e-2 with psrm and dop853 (1e-3 with other tableaus, "
+            "Relative tolerance, at most 1e-2 with psrm and auto (1e-3 with other tableaus, "
             "1e-4 with srm).",
             show_default="the description's, else 1e-6",
         ),

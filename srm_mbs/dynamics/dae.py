@@ -223,6 +223,8 @@ class DaeSystem:
     """
 
     has_constraints = True
+    time_dependent = True
+    laws = np.zeros(0)
     singularities = None
 
     def __init__(
@@ -448,6 +450,13 @@ class DaeSystem:
     def rate_change(self, delta: FloatArray) -> FloatArray:
         """0: no state is another one's rate."""
         return np.zeros_like(delta)
+
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        """Infinite: a DAE has no friction."""
+        return np.full(self.nx, np.inf)
+
+    def apply_laws(self, values: FloatArray | None) -> None:
+        """Nothing: a DAE has no forces."""
 
     def position_norm(self, delta: FloatArray) -> float:
         """max |dx|; see :class:`~srm_mbs.dynamics.system.System`."""

@@ -71,6 +71,29 @@ class Evaluator(ABC):
         does; None for functions of the user, which the kernel calls."""
 
 
+class LawEvaluator(Evaluator):
+    """An element between links with laws: forces and moments, each along its own direction."""
+
+    law_count: int
+    """Number of its laws."""
+
+    @abstractmethod
+    def laws(self, data: pin.Data, step: BushingStep | None = None) -> FloatArray:
+        """Values (law_count,) of its laws; ``step``: that of a bushing to which the stage
+        belongs."""
+
+    @abstractmethod
+    def apply(
+        self,
+        tau: FloatArray,
+        data: pin.Data,
+        values: FloatArray,
+        step: BushingStep | None = None,
+    ) -> None:
+        """Add the generalised forces to ``tau`` (nv,) if ``values`` (law_count,) act in place of
+        its laws; ``step`` as for :meth:`laws`."""
+
+
 class ResolvedAnchor:
     """An anchor as a frame on the body of a joint, 0 for the world."""
 
@@ -134,7 +157,7 @@ class ValuesOverTime:
         return {"numbers": self._numbers, "curves": curves}
 
 
-class SpringDamperEvaluator(Evaluator):
+class SpringDamperEvaluator(LawEvaluator):
     """A :class:`~srm_mbs.model.forces.SpringDamper`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: SpringDamper) -> None:
@@ -144,7 +167,33 @@ class SpringDamperEvaluator(Evaluator):
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_length = float(force.rest_length or 0.0)
 
+        self.law_count = 1 if self.rest_length else 0
+
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        force, at_a, _ = self._force(data)
+        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+
+    def laws(self, data: pin.Data, step: BushingStep | None = None) -> FloatArray:
+        """The force along the line."""
+        if not self.law_count:
+            return np.zeros(0)
+        force, _, line = self._force(data)
+        return np.array([force @ line])
+
+    def apply(
+        self,
+        tau: FloatArray,
+        data: pin.Data,
+        values: FloatArray,
+        step: BushingStep | None = None,
+    ) -> None:
+        force, at_a, line = self._force(data)
+        if self.law_count:
+            force = values[0] * line
+        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+
+    def _force(self, data: pin.Data) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Force (3,) on a, the point at which it acts, and the direction of the line."""
         at_a = self.a.placement(data).translation
         at_b = self.b.placement(data).translation
         apart = at_a - at_b
@@ -164,7 +213,7 @@ class SpringDamperEvaluator(Evaluator):
             # Points that meet move along the line that joins them.
             along = apart * ((apart / length) @ rate / length) if length else rate
             force -= self.damping * along
-        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+        return force, at_a, apart / (length or 1.0)
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         apart = self.a.placement(data).translation - self.b.placement(data).translation
@@ -213,7 +262,7 @@ LOCATED_HALF_TURN = 1e-9
 """Distance (rad) from half a turn of the ends of steps that lie there."""
 
 
-class BushingEvaluator(Evaluator):
+class BushingEvaluator(LawEvaluator):
     """A :class:`~srm_mbs.model.forces.Bushing`, resolved against a model."""
 
     def __init__(self, model: pin.Model, force: Bushing) -> None:
@@ -222,6 +271,8 @@ class BushingEvaluator(Evaluator):
         self.support = self.a.support - self.b.support
         self.stiffness = np.array(force.stiffness, dtype=float)
         self.damping = np.array(force.damping, dtype=float)
+        self._own = np.flatnonzero((self.stiffness > 0.0) | (self.damping > 0.0))
+        self.law_count = len(self._own)
 
     @property
     def turns(self) -> bool:
@@ -248,6 +299,41 @@ class BushingEvaluator(Evaluator):
         step: BushingStep | None = None,
     ) -> None:
         """See :class:`Evaluator`; ``step``: to which the stage belongs."""
+        self._act(tau, data, *self._forces(data, step))
+
+    def laws(self, data: pin.Data, step: BushingStep | None = None) -> FloatArray:
+        """The forces and moments that are not always zero, with the opposite sign."""
+        force, moment, _ = self._forces(data, step)
+        return np.concatenate([force, moment])[self._own]
+
+    def apply(
+        self,
+        tau: FloatArray,
+        data: pin.Data,
+        values: FloatArray,
+        step: BushingStep | None = None,
+    ) -> None:
+        both = np.zeros(6)
+        both[self._own] = values
+        self._act(tau, data, both[:3], both[3:], self._forces(data, step)[2])
+
+    def _act(
+        self,
+        tau: FloatArray,
+        data: pin.Data,
+        force: FloatArray,
+        moment: FloatArray,
+        L: FloatArray,
+    ) -> None:
+        Ta, Tb = self.a.placement(data), self.b.placement(data)
+        force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
+        add_wrench(tau, data, self.support, force, moment, Ta.translation)
+
+    def _forces(
+        self, data: pin.Data, step: BushingStep | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Force (3,) along b's axes, moment (3,) as it does work on the rotation vector, and the
+        Jacobian (3, 3) of that vector."""
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         relative = Tb.actInv(Ta)
         turn = pin.log3(relative.rotation)
@@ -264,8 +350,7 @@ class BushingEvaluator(Evaluator):
             spin = L.T @ (Tb.rotation.T @ W.angular)
             force = force + self.damping[:3] * rate
             moment = moment + self.damping[3:] * spin
-        force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
-        add_wrench(tau, data, self.support, force, moment, Ta.translation)
+        return force, moment, L
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         relative = self.b.placement(data).actInv(self.a.placement(data))
@@ -590,6 +675,51 @@ class ForceKinematics:
         tau = np.zeros(self._nv)
         for element in self._elements:
             if isinstance(element, _UserForceEvaluator):
+                element.add(tau, data, q, v, t)
+        return tau
+
+    def coordinates(self) -> list[int]:
+        """Velocity indices of the coordinates on which springs and limits act."""
+        kinds = TorsionSpringEvaluator | LimitSpringEvaluator
+        return [e.in_v for e in self._elements if isinstance(e, kinds)]
+
+    def laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: Mapping[Evaluator, BushingStep] = MappingProxyType({}),
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        """Laws of the coordinates (nv,), and those of each element between links; ``step`` as for
+        :meth:`generalised`."""
+        along = np.zeros(self._nv)
+        for element in self._elements:
+            if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
+                element.add(along, data, q, v, 0.0)
+        between = [e for e in self._elements if isinstance(e, LawEvaluator)]
+        return along, [e.laws(data, step.get(e)) for e in between]
+
+    def generalised_with(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        t: float,
+        applied: FloatArray,
+        step: Mapping[Evaluator, BushingStep] = MappingProxyType({}),
+    ) -> FloatArray:
+        """As :meth:`generalised`, where ``applied`` act in place of the laws between links, and
+        no springs on coordinates."""
+        tau = np.zeros(self._nv)
+        first = 0
+        for element in self._elements:
+            if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
+                continue
+            if isinstance(element, LawEvaluator):
+                values = applied[first : first + element.law_count]
+                element.apply(tau, data, values, step.get(element))
+                first += element.law_count
+            else:
                 element.add(tau, data, q, v, t)
         return tau
 

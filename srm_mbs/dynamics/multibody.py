@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
@@ -34,6 +34,7 @@ from srm_mbs.dynamics.forces import (
     LOCATED_HALF_TURN,
     BushingStep,
     Evaluator,
+    ForceKinematics,
     resolved_forces,
 )
 from srm_mbs.dynamics.manifold import Manifold
@@ -220,6 +221,8 @@ class Mechanics(Manifold):
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
         self._bushings: dict[Evaluator, BushingStep] = {}
+        self._applied: FloatArray | None = None
+        self._laws_at = np.zeros(self.nq), np.zeros(self.nv)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Terms and workspaces share memory, which copies of them would not.
@@ -235,6 +238,15 @@ class Mechanics(Manifold):
     def controlled(self) -> bool:
         """Whether a controller acts."""
         return self._controller is not None
+
+    @cached_property
+    def time_dependent(self) -> bool:
+        """Whether drives, laws of forces, functions of the user or a controller act, which may
+        depend on time; one whose output is held does not."""
+        forces = [] if self._forces is None else self._forces.constants()
+        laws = any(len(force.get("curves", ())) for force in forces)
+        acts = self.controlled and self.held is None
+        return acts or self.has_user_forces or laws or bool(self.mechanism.drives)
 
     @property
     def has_user_forces(self) -> bool:
@@ -310,10 +322,56 @@ class Mechanics(Manifold):
             return np.zeros(v.shape)
         return -self._friction * np.tanh(v / self._friction_speed)
 
+    @cached_property
+    def _law_coordinates(self) -> IndexArray:
+        """Velocity indices of the coordinates with a law."""
+        acted = (self._damping != 0.0) | (self._friction != 0.0)
+        if self._forces is not None:
+            acted[self._forces.coordinates()] = True
+        return np.flatnonzero(acted)
+
+    @property
+    def laws(self) -> FloatArray:
+        """Values (m,) of the laws of forces at the stage evaluated last: those of the coordinates
+        with damping, friction, springs or limits, then those of the elements between links."""
+        q, v = self._laws_at
+        along = self.damping_force(v) + self.friction_force(v)
+        between: list[FloatArray] = []
+        if self._forces is not None:
+            springs, between = self._forces.laws(self.data, q, v, self._bushings)
+            along = along + springs
+        return np.concatenate([along[self._law_coordinates], *between])
+
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        own = self._friction_speed + FRICTION_PART * np.abs(v)
+        limits = np.where(self._friction != 0.0, own, np.inf)
+        return np.concatenate([np.full(self.nv, np.inf), limits])
+
+    def apply_laws(self, values: FloatArray | None) -> None:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        self._applied = values
+
+    def _passive_force(self, v: FloatArray) -> FloatArray:
+        """Damping and friction, or what acts in place of the laws of the coordinates."""
+        if self._applied is None:
+            return self.damping_force(v) + self.friction_force(v)
+        force = np.zeros(self.nv)
+        force[self._law_coordinates] = self._applied[: len(self._law_coordinates)]
+        return force
+
+    def _element_force(
+        self, forces: ForceKinematics, t: float, q: FloatArray, v: FloatArray
+    ) -> FloatArray:
+        """The generalised forces (nv,) of the elements, or of what acts in place of their laws."""
+        if self._applied is None:
+            return forces.generalised(self.data, q, v, t, self._bushings)
+        applied = self._applied[len(self._law_coordinates) :]
+        return forces.generalised_with(self.data, q, v, t, applied, self._bushings)
+
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Controller, joint damping and joint friction (nv,)."""
-        passive = self.damping_force(v) + self.friction_force(v)
-        return self.controlled_force(t, q, v) + passive
+        return self.controlled_force(t, q, v) + self._passive_force(v)
 
     def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
@@ -322,7 +380,7 @@ class Mechanics(Manifold):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._forces.generalised(self.data, q, v, t)
+            force = force + self._element_force(self._forces, t, q, v)
         gravity: FloatArray = pin.computeGeneralizedGravity(self.model, self.data, q)
         return force - gravity
 
@@ -379,6 +437,9 @@ class Mechanics(Manifold):
         return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 
+FRICTION_PART = 0.01
+"""Part of a rate, beside the friction speed, by which stiff steps may err where friction acts: a
+tolerance far above that speed never lets a joint come to rest."""
 DEPENDENT_DRIVE = 1e-10
 """Part of a drive's motion without those of others below which it is one of theirs."""
 _OVERFLOW = 1e100
@@ -413,7 +474,8 @@ class OpenSystem(Mechanics):
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
-            force = force + self._forces.generalised(self.data, q, v, t, self._bushings)
+            force = force + self._element_force(self._forces, t, q, v)
+        self._laws_at = q, v
         rate = self._terms.rate()
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(self.model, self.data, q, v, force)
@@ -531,7 +593,8 @@ class ClosedSystem(Mechanics):
         pin.crba(model, data, q, pin.Convention.WORLD)
         f = self.applied_force(t, q, v) - pin.nonLinearEffects(model, data, q, v)
         if self._forces is not None:
-            f += self._forces.generalised(data, q, v, t, self._bushings)
+            f += self._element_force(self._forces, t, q, v)
+        self._laws_at = q, v
         loops = self.loops
         loops.update(data, q)
         loops.move_to(t)

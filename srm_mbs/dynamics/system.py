@@ -159,6 +159,23 @@ class System(Protocol):
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
 
     @property
+    def time_dependent(self) -> bool:
+        """Whether rates may depend on time itself."""
+
+    @property
+    def laws(self) -> FloatArray:
+        """Values (m,) of the laws of forces at the stage evaluated last, as
+        :meth:`apply_laws` counts them."""
+
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        """Errors (n,) of a tangent from which the friction at the rates ``v`` (k,) is another;
+        infinite where there is none."""
+
+    def apply_laws(self, values: FloatArray | None) -> None:
+        """Let ``values`` (m,) act in evaluations in place of the laws of forces that damp or store
+        energy; None for the laws themselves."""
+
+    @property
     def singularities(self) -> SingularityAnalysis | None:
         """Data for the analysis of singular configurations; None without closures, and for DAEs,
         whose equations are known at single points only."""

@@ -521,7 +521,7 @@ class CriticalPassages:
         lowest = int(np.argmin(result.sigmas))
         if self._known or result.quiet or lowest == 0 or not may_cross(result):
             return None
-        abscissae = self._scheme.abscissae
+        abscissae = self._scheme.member(result.stiff).abscissae
         zero = zero_within(abscissae, result.sigmas)
         if zero is None or not 0.0 < zero <= 1.0:
             zero = float(abscissae[lowest])

@@ -94,8 +94,15 @@ def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
     compared with its change, or so close that only nodes of the branch solve them."""
     if not np.isfinite(sigmas).all():
         return False
-    change = float(np.max(np.abs(sigmas[1:] - sigmas[0]) / abscissae[1:]))
+    later = abscissae > 0.0
+    change = float(np.max(np.abs(sigmas[later] - sigmas[0]) / abscissae[later]))
     return bool(sigmas.min() < max(CLOSE_SIGMA * change, BRANCH_SIGMA))
+
+
+def _whole(scheme: ButcherTableau, steps: StepData) -> FloatArray:
+    """Weights (k,) of the rates of ``scheme`` over a whole step, of those that ``steps`` have."""
+    weights: FloatArray = scheme.dense.weights(np.ones(1))[0]
+    return weights[: steps.rates.shape[1]]
 
 
 class HermiteStep:
@@ -110,15 +117,15 @@ class HermiteStep:
     ----------
     system, steps, step
         The run, and the number of the step.
-    weights : (k,)
-        Weights of the rates over a whole step, of those that are in ``steps``.
+    scheme
+        The tableau of the run.
     """
 
-    def __init__(self, system: System, steps: StepData, step: int, weights: FloatArray) -> None:
+    def __init__(self, system: System, steps: StepData, step: int, scheme: ButcherTableau) -> None:
         self._system = system
         self._steps = steps
         self._step = step
-        self._weights = weights
+        self._scheme = scheme
         # Rates jump at breakpoints: a polynomial ends there.
         self._interval = steps.smooth_interval(step)
         self._start = steps.states[step]
@@ -173,9 +180,15 @@ class HermiteStep:
         included."""
         steps = self._steps
         own = slice(min(node, self._step), max(node, self._step))
-        count = len(self._weights)
         h = np.diff(steps.times[own.start : own.stop + 1])
-        moved: FloatArray = self._weights @ np.tensordot(h, steps.rates[own, :count], axes=1)
+        moved = np.zeros(steps.rates.shape[2])
+        stiff = steps.stiff[own] > 0.0
+        for kind in (False, True):
+            chosen = stiff == kind
+            if chosen.any():
+                weights = _whole(self._scheme.member(kind), steps)
+                rates = steps.rates[own][chosen, : len(weights)]
+                moved += weights @ np.tensordot(h[chosen], rates, axes=1)
         return moved if node > self._step else -moved
 
     def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
@@ -235,6 +248,9 @@ class StepData:
         Numbers of the steps that end on a breakpoint, counted from 1: the rates jump there.
     break_rates : (k, m)
         Tangent rates before those breakpoints.
+    stiff : (n,)
+        1 for steps before which the problem had been found to be stiff, else 0: those of the
+        tableau ``auto`` are then of its scheme for stiff problems.
     """
 
     times: FloatArray
@@ -251,6 +267,24 @@ class StepData:
     stop: float | None = None
     breaks: IndexArray = field(default_factory=lambda: np.zeros(0, dtype=int))
     break_rates: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    stiff: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.stiff):
+            object.__setattr__(self, "stiff", np.zeros(len(self.ranks)))
+
+    def stage_times(self, scheme: ButcherTableau) -> FloatArray:
+        """Times (n, s + 1) s of the stages and of the ends of the steps, those of ``sigmas``."""
+        one, other = (scheme.member(stiff).abscissae for stiff in (False, True))
+        abscissae = one if one is other else np.where(self.stiff[:, None] > 0.0, other, one)
+        stages: FloatArray = self.times[:-1, None] + abscissae * np.diff(self.times)[:, None]
+        return stages
+
+    @property
+    def stiff_intervals(self) -> list[tuple[float, float]]:
+        """Starts and ends (s) of the intervals of stiff steps."""
+        edges = np.flatnonzero(np.diff(self.stiff, prepend=0.0, append=0.0)).tolist()
+        return list(zip(self.times[edges[::2]].tolist(), self.times[edges[1::2]].tolist()))
 
     @property
     def end(self) -> float:
@@ -350,6 +384,7 @@ def step_data(
         stop=stop,
         breaks=np.array(breaks, dtype=int),
         break_rates=np.array([steps[i - 1].end_rate for i in breaks]).reshape(-1, tangent_size),
+        stiff=np.array([s.stiff for s in steps], dtype=float),
     )
 
 
@@ -392,8 +427,8 @@ class DenseOutput:
     ) -> None:
         self._system = system
         self._end_state = end_state
-        self._extension = scheme.dense
-        self._abscissae = scheme.abscissae
+        self._scheme = scheme
+        self._members = tuple(scheme.member(stiff) for stiff in (False, True))
         self._smooth: dict[int, HermiteStep] = {}
         self._steps = steps
         self._extra: dict[int, FloatArray] = {}
@@ -451,22 +486,20 @@ class DenseOutput:
     def complete(self) -> StepData:
         """The steps with the rates of all stages that dense output needs: for a reader without the
         controller."""
-        data, count = self._steps, self._extension.n_rates
+        data = self._steps
+        count = max(scheme.dense.n_rates for scheme in self._members)
         if not data.count or data.rates.shape[1] == count:
             return data
         rates = np.zeros((data.count, count, data.rates.shape[2]))
         rates[:, : data.rates.shape[1]] = data.rates
         for step, h in enumerate(np.diff(data.times)):
             if not self._between_neighbours(step):
-                rates[step] = self._all_rates(step, h)
+                own = self._all_rates(step, h)
+                rates[step, : len(own)] = own
         return replace(data, rates=rates)
 
-    @cached_property
-    def _whole(self) -> FloatArray:
-        """Weights of the rates over a whole step, of those that the steps have: those of extra
-        stages are zero."""
-        weights: FloatArray = self._extension.weights(np.ones(1))[0]
-        return weights[: self._steps.rates.shape[1]]
+    def _scheme_of(self, step: int) -> ButcherTableau:
+        return self._scheme.member(bool(self._steps.stiff[step]))
 
     def _between_neighbours(self, step: int) -> bool:
         """Whether a step is interpolated between ends of steps (:class:`HermiteStep`)."""
@@ -475,18 +508,20 @@ class DenseOutput:
         if data.placements[step] == CRITICAL:
             return True
         return last - first > 1 and (
-            step in data.zones or close_to_singular(self._abscissae, data.sigmas[step])
+            step in data.zones
+            or close_to_singular(self._scheme_of(step).abscissae, data.sigmas[step])
         )
 
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:
         data, system = self._steps, self._system
         if self._between_neighbours(step):
             if step not in self._smooth:
-                self._smooth[step] = HermiteStep(system, data, step, self._whole)
+                self._smooth[step] = HermiteStep(system, data, step, self._scheme)
             return self._smooth[step](theta)
         h = data.times[step + 1] - data.times[step]
         start = data.states[step]
-        weights, rates = h * self._extension.weights(theta), self._all_rates(step, h)
+        weights = h * self._scheme_of(step).dense.weights(theta)
+        rates = self._all_rates(step, h)
         ramps = self._ramps(step, theta, h)
         states = []
         for k in range(len(theta)):
@@ -505,9 +540,10 @@ class DenseOutput:
         return -np.outer(s, correction) + h * np.outer(r, slope)
 
     def _all_rates(self, step: int, h: float) -> FloatArray:
-        rates: FloatArray = self._steps.rates[step]
-        A, c = self._extension.extra_A, self._extension.extra_c
-        if len(rates) == self._extension.n_rates:  # no extra stages, or evaluated by the method
+        extension = self._scheme_of(step).dense
+        rates: FloatArray = self._steps.rates[step][: extension.n_rates]
+        A, c = extension.extra_A, extension.extra_c
+        if len(rates) == extension.n_rates:  # no extra stages, or evaluated by the method
             return rates
         if step not in self._extra:
             start, t = self._steps.states[step], self._steps.times[step]
@@ -550,6 +586,10 @@ def unwrapped_angles(
     # A long step may turn the joint by more than pi: its chart coordinate knows by how much.
     h = np.diff(steps.times)
     turned = h * (steps.rates[:, : scheme.n_stages, joint.idx_v] @ scheme.b)
+    if steps.stiff.any():
+        own = steps.stiff > 0.0
+        other = scheme.member(True)
+        turned[own] = h[own] * (steps.rates[own, : other.n_stages, joint.idx_v] @ other.b)
     unwrapped = principal[0] + np.concatenate([[0.0], np.cumsum(turned)])
     unwrapped = _nearest_turn(principal, unwrapped)
     step = np.clip(np.searchsorted(steps.times, t, side="right") - 1, 0, steps.count - 1)

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from srm_mbs.integration.methods.butcher import ButcherTableau
+
 TIMES_LISTED = 5
 """Times listed in a sentence, at most."""
 
@@ -61,6 +63,32 @@ DAE = ProblemVocabulary(
     "its right-hand side",
     "the problem has a solution from there on (solution.x[-1])",
 )
+
+
+def stiffness_sentence(
+    intervals: Sequence[tuple[float, float]], scheme: ButcherTableau, adaptive: bool
+) -> str:
+    """A sentence about where a run was found to be stiff; empty where it was not.
+
+    Parameters
+    ----------
+    intervals
+        Their starts and ends (s).
+    scheme
+        The tableau of the run.
+    adaptive
+        Whether steps follow a tolerance.
+    """
+    if not intervals or not adaptive:
+        return ""
+    listed = ", ".join(f"{start:.6g} to {end:.6g} s" for start, end in intervals[:TIMES_LISTED])
+    more = ", ..." if len(intervals) > TIMES_LISTED else ""
+    if scheme.stiff is not None:
+        return f" Stiff, with steps of {scheme.stiff.name}: t = {listed}{more}."
+    return (
+        f" The run is stiff from t = {intervals[0][0]:.6g} s on: the stability of {scheme.name} "
+        'limits its steps, not their accuracy. Use tableau="auto" or "rodas5p".'
+    )
 
 
 def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:

@@ -505,7 +505,7 @@ def _limit_at_start(
 def _uses_nodes(method: Method) -> bool:
     """Whether the steps of ``method`` solve stages by nodes of the branch."""
     stepper = getattr(method, "stepper", method)
-    return isinstance(stepper, SplitStep) and stepper.eps is None
+    return isinstance(stepper, SplitStep) and stepper.uses_nodes
 
 
 def start(

@@ -332,13 +332,14 @@ class Crossing:
         return before is not None and after is not None and before != after
 
 
-def _recorded(abscissae: FloatArray, steps: StepData) -> tuple[FloatArray, FloatArray]:
+def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, FloatArray]:
     """Times and sigmas of the stages in order of time, each time once."""
-    order = np.argsort(abscissae[1:], kind="stable") + 1
     h = np.diff(steps.times)
-    t = (steps.times[:-1, None] + h[:, None] * abscissae[order]).ravel()
-    sigma = steps.sigmas[:, order].ravel()
-    step_of = np.repeat(np.arange(steps.count), len(order))
+    stages = steps.stage_times(scheme)[:, 1:]
+    order = np.argsort(stages, axis=1, kind="stable")
+    t = np.take_along_axis(stages, order, axis=1).ravel()
+    sigma = np.take_along_axis(steps.sigmas[:, 1:], order, axis=1).ravel()
+    step_of = np.repeat(np.arange(steps.count), order.shape[1])
     t = np.concatenate([steps.times[:1], t])
     sigma = np.concatenate([steps.sigmas[0, :1], sigma])
     step_of = np.concatenate([[0], step_of])
@@ -527,7 +528,7 @@ def find_crossings(
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
-    t, sigma = _recorded(scheme.abscissae, steps)
+    t, sigma = _recorded(scheme, steps)
     inside = t <= steps.end
     t, sigma = t[inside], sigma[inside]
     if len(t) < 3 or not np.isfinite(sigma).all():

@@ -81,6 +81,9 @@ class Settings:
     singular_times: tuple[float, ...] = ()
     backend: str = "python"
     singular_tolerance: float = 1e-9
+    stiff: tuple[tuple[float, float], ...] = ()
+    """Intervals (s) in which the problem was found to be stiff: the tableau ``auto`` has its scheme
+    for stiff problems there, others are limited by their stability."""
 
 
 ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])

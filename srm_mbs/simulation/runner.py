@@ -46,7 +46,12 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.run import CompiledRun
 from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
-from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, branch_changes
+from srm_mbs.integration.messages import (
+    MECHANISM,
+    ProblemVocabulary,
+    branch_changes,
+    stiffness_sentence,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, method_messages
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
@@ -127,6 +132,8 @@ class Problem:
         Takes the steps of a run with output times; None without them.
     last_step
         Length (s) of the last step of the segment before, as far as it is used; 0 without one.
+    stiff
+        Whether that segment was stiff at its end.
     """
 
     mechanism: Mechanism
@@ -142,6 +149,7 @@ class Problem:
     kernel_system: Any = None
     stream: OutputStream | None = None
     last_step: float = 0.0
+    stiff: bool = False
 
 
 def run_segment(
@@ -266,7 +274,7 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
 def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     """The error norm with the tolerances of checked ``options``."""
     atol = absolute_tolerance(mechanism, options.atol, options.rtol)
-    return ErrorNorm(atol, options.rtol, options.negligible)
+    return ErrorNorm(atol, options.rtol, options.negligible, _units_of_states(mechanism))
 
 
 def initial_state(
@@ -382,6 +390,7 @@ def assemble_problem(
         mechanism, options, system, norm, state, intervals, on_kernel, held, watch, passages
     )
     problem.kernel_system, problem.last_step = kernel_system, last_step
+    problem.stiff = before is not None and bool(before.steps.stiff[-1:].any())
     # Sweeps say at the end what they met in their steps.
     if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
         by = "kernel" if on_kernel else "python"
@@ -422,7 +431,8 @@ def placed_control(
     check_embedded(scheme, step)
     control: StepSizeControl
     if step is None:
-        control = PIControl(t_end, first_step(), scheme.controller_order or 1)
+        orders = (scheme.member(stiff).controller_order or 1 for stiff in (False, True))
+        control = PIControl(t_end, first_step(), *orders)
     else:
         control = FixedStep(options.t0, t_end, step)
     placement = options.placement if system.has_constraints else None
@@ -464,6 +474,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.sample = sampler(system, problem.held, options.controller, kernel_system)
         handler.sample(t0, state)
     memory = start(system, method, t0, state, norm, options.t_end, evaluator)
+    memory.stiff = problem.stiff
     if kernel_system is None:
         found = integrate_steps(
             system,
@@ -618,8 +629,14 @@ def statistics(
     )
 
 
-def settings(options: RunOptions, norm: ErrorNorm, controlled: bool, backend: str) -> Settings:
-    """The settings of a run that was made with ``options``."""
+def settings(
+    options: RunOptions,
+    norm: ErrorNorm,
+    controlled: bool,
+    backend: str,
+    stiff: Sequence[tuple[float, float]] = (),
+) -> Settings:
+    """The settings of a run that was made with ``options``; ``stiff``: where it was (s)."""
     return Settings(
         type(options.method).__name__,
         options.method.scheme.name,
@@ -631,6 +648,7 @@ def settings(options: RunOptions, norm: ErrorNorm, controlled: bool, backend: st
         tuple(options.singular_times.tolist()),
         backend,
         options.singular_tolerance,
+        tuple(stiff),
     )
 
 
@@ -666,9 +684,11 @@ def assemble_result(
         # The reductions themselves: their methods cost more than they do here.
         least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
         turned = over_half_turn(mechanism, q)
+        stiff = data.stiff_intervals
     elif output is not None:
         stats = statistics(system, record, output.count, output.zone_steps, counters)
         least, largest, turned = output.least, output.largest, output.over_half_turn
+        stiff = output.stiff_intervals
         if options.controller is None and not system.has_user_forces:
             again = partial(
                 run_segment, mechanism, options._replace(t_eval=None, progress=False), result_type
@@ -691,11 +711,12 @@ def assemble_result(
         + branch_changes(suspected(counters), "the velocity turned", SMALLER_STEPS)
         + method_messages(options.method, record.steps, problem.norm)
         + ("" if problem.passages is None else problem.passages.message())
+        + stiffness_sentence(stiff, scheme, options.step is None)
         + _limits_left(mechanism, least, largest)
         + _half_turns(turned)
         + _driven_too_far(mechanism, record),
         stats=stats,
-        settings=settings(options, problem.norm, controlled, by),
+        settings=settings(options, problem.norm, controlled, by, stiff),
     )
 
 

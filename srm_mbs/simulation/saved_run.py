@@ -442,10 +442,12 @@ def steps_from(
     error_ratios = _array(arrays, "error_ratios", (n,), infinite=True)
     placements = _array(arrays, "placements", (n,))
     held = _array(arrays, "held", (n,))
+    stiff = _array(arrays, "stiff", (n,)) if "stiff" in arrays else np.zeros(n)
     for name, array, largest in (
         ("ranks", ranks, nv),
         ("placements", placements, len(STEP_PLACEMENTS) - 1),
         ("held", held, 1),
+        ("stiff", stiff, 1),
     ):
         _whole_numbers(name, array)
         _within(name, array, 0, largest)
@@ -472,6 +474,7 @@ def steps_from(
         stop=stop,
         breaks=breaks,
         break_rates=_array(arrays, "break_rates", (len(breaks), m)),
+        stiff=stiff,
     )
 
 
@@ -486,10 +489,13 @@ def check_steps_join(system: System, scheme: ButcherTableau, steps: StepData) ->
     ValueError, EvaluationError
         If a step ends elsewhere, or nowhere.
     """
-    weights = scheme.dense.weights(np.ones(1))[0][: steps.rates.shape[1]]
+    count = steps.rates.shape[1]
+    members = tuple(scheme.member(stiff).dense for stiff in (False, True))
+    wholes = tuple(dense.weights(np.ones(1))[0][:count] for dense in members)
     with np.errstate(over="ignore", invalid="ignore"):
         for i, h in enumerate(np.diff(steps.times).tolist()):
-            terms = h * weights[:, None] * steps.rates[i]
+            weights = wholes[int(steps.stiff[i])]
+            terms = h * weights[:, None] * steps.rates[i, : len(weights)]
             moved = terms.sum(axis=0)
             system.chart_rate(moved, moved)  # refuses joints that turn too far
             x, end = system.retract(steps.states[i], moved), steps.states[i + 1]

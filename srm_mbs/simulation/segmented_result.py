@@ -46,7 +46,9 @@ class SegmentedResult(SimulationResult):
         self._segments = tuple(segments)
         first = self.segments[0]
         self.mechanism = first.mechanism
-        self.scheme, self.settings = first.scheme, first.settings
+        self.scheme = first.scheme
+        stiff = tuple(times for part in self.segments for times in part.settings.stiff)
+        self.settings = replace(first.settings, stiff=stiff)
         self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
@@ -215,6 +217,9 @@ class SegmentedResult(SimulationResult):
         return tuple(dict.fromkeys(rows))
 
 
+_ROWS = ("rates", "sigmas", "ranks", "error_ratios", "placements", "held", "stiff")
+
+
 def _joined(parts: Sequence[StepData]) -> StepData:
     """One set of steps; the states are those before the jumps."""
     width = max(part.corrections.shape[1] for part in parts)
@@ -243,10 +248,7 @@ def _joined(parts: Sequence[StepData]) -> StepData:
         stop=None,
         breaks=np.concatenate([part.breaks + start for start, part in zip(at, parts)]),
         break_rates=rows("break_rates"),
-        **{
-            name: rows(name)
-            for name in ("rates", "sigmas", "ranks", "error_ratios", "placements", "held")
-        },
+        **{name: rows(name) for name in _ROWS},
     )
 
 

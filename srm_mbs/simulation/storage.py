@@ -15,7 +15,7 @@ import json
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -132,6 +132,13 @@ def _request(entry: saved_run.RequestEntry | None) -> RunOptions | None:
         values = dict(options["method"])
         options["method"] = METHODS[values.pop("kind")](**values)
     return RunOptions(entry.t_end, **options, lost=tuple(entry.lost))
+
+
+def _settings_entry(settings: Settings) -> dict[str, Any]:
+    """The settings as JSON, without what the steps tell."""
+    entry = asdict(settings)
+    del entry["stiff"]
+    return entry
 
 
 # -- writing ----------------------------------------------------------------------------------
@@ -251,7 +258,7 @@ def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dic
         },
         "structure": {name: getattr(structure, name) for name in STRUCTURE_VALUES}
         | {"length": structure.units.length, "rate": structure.units.rate},
-        "settings": asdict(solution.settings),
+        "settings": _settings_entry(solution.settings),
         "stats": asdict(solution.stats),
         "request": _request_entry(solution),
         "status": solution.status,
@@ -415,6 +422,7 @@ def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach = NO
         raise ValueError(f"settings.atol has {len(settings.atol)} numbers")
     scheme = get_tableau(settings.tableau)
     steps = saved_run.steps_from(mechanism, scheme, entry, arrays)
+    settings = replace(settings, stiff=tuple(steps.stiff_intervals))
     events = saved_run.events_from(mechanism.model, entry.events, steps, arrays)
     system = make_system(mechanism, saved_run.held_from(arrays, mechanism.model.nv))
     saved_run.check_steps_join(system, scheme, steps)

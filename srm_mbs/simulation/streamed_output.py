@@ -51,6 +51,8 @@ class StreamedOutput:
         Singular configurations that the run reached without momentum.
     over_half_turn
         Names of the bushings that turned by more than half a turn.
+    stiff_intervals
+        Starts and ends (s) of the intervals of stiff steps.
     """
 
     t: FloatArray
@@ -63,6 +65,7 @@ class StreamedOutput:
     largest: FloatArray
     bifurcations: tuple[Bifurcation, ...]
     over_half_turn: tuple[str, ...]
+    stiff_intervals: list[tuple[float, float]]
 
 
 def contiguous(parts: list[StepData]) -> StepData:
@@ -89,7 +92,7 @@ def contiguous(parts: list[StepData]) -> StepData:
 
 _ROWS = (
     *("rates", "corrections", "sigmas", "ranks", "error_ratios", "placements", "held"),
-    "break_rates",
+    *("stiff", "break_rates"),
 )
 
 
@@ -153,6 +156,7 @@ class OutputStream:
         self._known_angles: dict[int, float] = {}
         self._bifurcations: list[Bifurcation] = []
         self._turned: dict[str, None] = {}
+        self._stiff: list[tuple[float, float]] = []
         self._least = np.full(system.nq, np.inf)
         self._largest = np.full(system.nq, -np.inf)
 
@@ -169,6 +173,10 @@ class OutputStream:
         self._kept += data.count
         self._count += data.count
         self._zone_steps += len(data.zones)
+        for start, end in data.stiff_intervals:
+            if self._stiff and self._stiff[-1][1] == start:
+                start = self._stiff.pop()[0]
+            self._stiff.append((start, end))
 
     def finish(self, data: StepData, failed: bool) -> StepData | StreamedOutput:
         """After the last steps: all steps if they were kept, else the output.
@@ -192,6 +200,7 @@ class OutputStream:
             self._largest,
             tuple(self._bifurcations),
             tuple(self._turned),
+            self._stiff,
         )
 
     def _drop(self, final: bool, failed: bool = False) -> None:

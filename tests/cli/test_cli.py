@@ -80,7 +80,7 @@ def test_info_of_a_saved_run_shows_the_residuals_of_the_singular_configurations_
     ("name", "words"),
     [
         ("simulate", "--t-end --method --tableau --rtol --atol --step --backend --out --plot"),
-        ("simulate", "--csv --html --play MODEL psrm dop853 auto|python|kernel"),
+        ("simulate", "--csv --html --play MODEL psrm auto auto|python|kernel"),
         ("info", "MODEL degrees of freedom rank redundant"),
         ("models", "package"),
         ("play", "RUN browser"),
@@ -224,7 +224,7 @@ def test_simulate_prints_a_summary_and_writes_every_file(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("options", "end", "tableau", "rtol", "atol"),
     [
-        ("", "0.25 s", "dop853", 1e-7, 1e-9),
+        ("", "0.25 s", "auto", 1e-7, 1e-9),
         ("--t-end 0.5 --rtol 1e-5 --atol 1e-6 --tableau dopr54", "0.5 s", "dopr54", 1e-5, 1e-6),
     ],
 )

@@ -208,9 +208,7 @@ def test_a_run_logs_its_settings_end_and_singular_passages(logged: Any) -> None:
     assert said(logged, "slider_crank: assembled with crank held, closed to ", "DEBUG")
     solution = srm.simulate(mechanism, 5.0, rtol=1e-7)
     by = solution.settings.backend
-    assert said(
-        logged, f"slider_crank: from t = 0 to 5 s with PSRM dop853, rtol 1e-07, by the {by}"
-    )
+    assert said(logged, f"slider_crank: from t = 0 to 5 s with PSRM auto, rtol 1e-07, by the {by}")
     assert said(logged, f"slider_crank: finished after {solution.stats.steps} steps")
     assert said(logged, f"slider_crank: {solution.message}")
     assert len(solution.crossings) == 2
@@ -299,7 +297,7 @@ def test_the_list_of_commands_shows_whole_sentences() -> None:
 
 def test_verbose_shows_the_log_and_without_it_nothing_of_it_is_seen() -> None:
     logged = CliRunner().invoke(app, ["-v", "simulate", "slider_crank", "--t-end", "2"]).stderr
-    assert "info: slider_crank: from t = 0 to 2 s with PSRM dop853, rtol 1e-08" in logged
+    assert "info: slider_crank: from t = 0 to 2 s with PSRM auto, rtol 1e-08" in logged
     assert "debug: slider_crank: singular configuration of pin passed at t = " in logged
     quiet = CliRunner().invoke(app, ["simulate", "slider_crank", "--t-end", "2"])
     assert quiet.stderr == ""

@@ -36,6 +36,14 @@ namespace srm {
     field(double, branch_below)            /* sigma below which lingering stages use them */       \
     /* Evaluation of all closure rows: methods/split_step.py. */                                   \
     field(int, residual_interval)          /* accepted steps between two of them */                \
+    /* Stiffness: methods/stiffness.py; differences: methods/linear_split_step.py. */               \
+    field(int, stiff_steps)                /* that show that a problem is, or is not, stiff */     \
+    field(int, other_steps)                /* in a row that end a count */                         \
+    field(double, not_stiff)               /* h |lambda| up to which explicit steps would do */    \
+    field(int, power_iterations)                                                                   \
+    field(double, difference)              /* by a coordinate, over its size */                    \
+    field(double, time_difference)         /* by time, over the step */                            \
+    field(double, shortest_difference)     /* by time (roundings of t) */                          \
     /* Step-size control: control/step_size.py. */                                                 \
     field(double, safety)                                                                          \
     field(double, min_factor)                                                                      \

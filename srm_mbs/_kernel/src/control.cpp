@@ -39,7 +39,8 @@ Proposal until(double t, double h, double end) {
 
 }  // namespace
 
-Proposal PIControl::propose(double t, double limit, IntegratorState&) {
+Proposal PIControl::propose(double t, double limit, IntegratorState& memory) {
+    order_ = orders_[memory.stiff];
     return until(t, std::min(h_, limit), t_end_);
 }
 
@@ -113,24 +114,30 @@ bool Gaps::ends_on(double distance, double h) const {
 
 double Gaps::step_over(double distance) const { return distance / wide_ends_.back(); }
 
+StagePlaces::StagePlaces(const ButcherTableau& scheme, double clearance)
+    : gaps(scheme, clearance),
+      abscissae(with_end(scheme)),
+      middle(0),
+      explicit_scheme(scheme.implicit.empty()) {
+    for (std::size_t k = 1; k < abscissae.size(); ++k)
+        if (std::abs(abscissae[k] - 0.5) < std::abs(abscissae[middle] - 0.5))
+            middle = static_cast<int>(k);
+}
+
 SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner,
-                                           const ButcherTableau& scheme, double t_end,
+                                           const ButcherTableau& scheme,
+                                           const ButcherTableau& stiff, double t_end,
                                            const Constants& constants, bool arrivals)
     : ControlWrapper(std::move(inner)),
       constants_(constants),
       t_end_(t_end),
       first_arrival_(arrivals && inner_->adaptive ? Arrival::watched : Arrival::none),
       arrival_(first_arrival_),
-      gaps_(scheme, constants.clearance),
-      abscissae_(with_end(scheme)),
-      zero_(nan) {
-    middle_ = 0;
-    for (std::size_t k = 1; k < abscissae_.size(); ++k)
-        if (std::abs(abscissae_[k] - 0.5) < std::abs(abscissae_[middle_] - 0.5))
-            middle_ = static_cast<int>(k);
-}
+      members_{{scheme, constants.clearance}, {stiff, constants.clearance}},
+      zero_(nan) {}
 
 Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& memory) {
+    places_ = &members_[memory.stiff];
     if (redo_ > 0.0) limit = std::min(limit, redo_);
     if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.max_sigma_change / slope_);
     memory.sigma_slope = slope_;
@@ -157,8 +164,8 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
 // Whether stages next to a singular configuration are to be solved by nodes of the branch: the
 // motion turns back there, or is slow.
 bool SingularityPlacement::lingers(const Proposal& proposal, const IntegratorState& memory) const {
-    if (lost_branch_ || !memory.history || memory.history->known_until >= proposal.t_new)
-        return false;
+    if (!places_->explicit_scheme || lost_branch_ || !memory.history) return false;
+    if (memory.history->known_until >= proposal.t_new) return false;
     if (!adaptive) return !memory.history->away.empty();
     if (!(memory.sigma < constants_.monitored_below)) return false;
     return turning_ || !memory.history->away.empty();
@@ -175,11 +182,12 @@ bool SingularityPlacement::arrives(double t, const Proposal& proposal) const {
 
 double SingularityPlacement::placed_step(double distance, double h, double t) const {
     // The run, or its interval, ends there.
-    if (t + h >= t_end_ && gaps_.ends_on(distance, h)) return h;
-    if (adaptive) return gaps_.longest_step(distance, h);
+    const Gaps& gaps = places_->gaps;
+    if (t + h >= t_end_ && gaps.ends_on(distance, h)) return h;
+    if (adaptive) return gaps.longest_step(distance, h);
     // Where a grid point is singular, a fixed step may pass it: no shorter step could.
-    if (!gaps_.ends_on(distance, h)) return distance < h ? gaps_.longest_step(distance, h) : h;
-    const double over = gaps_.step_over(distance);
+    if (!gaps.ends_on(distance, h)) return distance < h ? gaps.longest_step(distance, h) : h;
+    const double over = gaps.step_over(distance);
     return t + over <= t_end_ ? over : h;
 }
 
@@ -191,25 +199,27 @@ double SingularityPlacement::better_step(double h, const std::vector<double>& si
     double lowest = inf, lowest_movable = inf;
     for (std::size_t j = 0; j < sigmas.size(); ++j) {
         lowest = std::min(lowest, sigmas[j]);
-        const double c = abscissae_[j];
+        const double c = places_->abscissae[j];
         if (c > 0.0 && (!last || c < 1.0)) lowest_movable = std::min(lowest_movable, sigmas[j]);
     }
     if (!(lowest < reach) || !(lowest_movable < reach)) return nan;
-    const double zero = zero_within(abscissae_, sigmas);
+    const double zero = zero_within(places_->abscissae, sigmas);
     if (!(zero > 0.0)) return nan;
-    return gaps_.longest_step(zero * h, 0.98 * h);
+    return places_->gaps.longest_step(zero * h, 0.98 * h);
 }
 
 StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepResult* result) {
     const double h = proposal.h;
+    const std::vector<double>& abscissae = places_->abscissae;
+    const int middle = places_->middle;
     double slope = 0.0;
     if (result && result->quiet) {
         const std::vector<double>& sigmas = result->sigmas;
-        const double start = sigmas[0], c = abscissae_[middle_];
+        const double start = sigmas[0], c = abscissae[middle];
         slope = std::max(std::abs(sigmas.back() - start),
-                         c > 0.0 ? std::abs(sigmas[middle_] - start) / c : 0.0) / h;
+                         c > 0.0 ? std::abs(sigmas[middle] - start) / c : 0.0) / h;
     } else if (result) {
-        slope = sigma_slope(abscissae_, result->sigmas, h);
+        slope = sigma_slope(abscissae, result->sigmas, h);
         if (lingering_ && result->lost_branch) {
             lost_branch_ = true;
             redo_ = h;
@@ -241,7 +251,7 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
         slope_ = std::max(slope, 0.5 * slope_);
         turning_ = !result->quiet && result->sigmas.back() < constants_.monitored_below &&
                    (slope_ * h < constants_.slow_sigma_change ||
-                    std::abs(extreme_sigma(abscissae_, middle_, result->sigmas,
+                    std::abs(extreme_sigma(abscissae, middle, result->sigmas,
                                            constants_.turning_misfit)) <
                         constants_.turning_sigma);
         lost_branch_ = lost_branch_ && !result->quiet;
@@ -249,7 +259,7 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
         const std::vector<double>& sigmas = result->sigmas;
         const double start = sigmas[0], end = sigmas.back();
         if (!result->quiet) {
-            const double ahead = zero_ahead(abscissae_[middle_], start, sigmas[middle_], end,
+            const double ahead = zero_ahead(abscissae[middle], start, sigmas[middle], end,
                                             constants_.zero_horizon);
             zero_ = result->t + h * ahead;
             if (ahead < 1.0 + constants_.expected_steps) expected_ = zero_;
@@ -260,10 +270,12 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
     return decision;
 }
 
-SlopeOfSigma::SlopeOfSigma(std::unique_ptr<Control> inner, const ButcherTableau& scheme)
-    : ControlWrapper(std::move(inner)), abscissae_(with_end(scheme)) {}
+SlopeOfSigma::SlopeOfSigma(std::unique_ptr<Control> inner, const ButcherTableau& scheme,
+                           const ButcherTableau& stiff)
+    : ControlWrapper(std::move(inner)), members_{with_end(scheme), with_end(stiff)} {}
 
 Proposal SlopeOfSigma::propose(double t, double limit, IntegratorState& memory) {
+    abscissae_ = &members_[memory.stiff];
     memory.sigma_slope = slope_;
     return inner_->propose(t, limit, memory);
 }
@@ -271,7 +283,7 @@ Proposal SlopeOfSigma::propose(double t, double limit, IntegratorState& memory) 
 StepDecision SlopeOfSigma::decide(const Proposal& proposal, const StepResult* result) {
     const StepDecision decision = inner_->decide(proposal, result);
     if (decision == StepDecision::accepted && result)
-        slope_ = std::max(sigma_slope(abscissae_, result->sigmas, proposal.h), 0.5 * slope_);
+        slope_ = std::max(sigma_slope(*abscissae_, result->sigmas, proposal.h), 0.5 * slope_);
     return decision;
 }
 

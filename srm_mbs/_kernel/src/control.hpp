@@ -68,8 +68,14 @@ public:
 
 class PIControl : public Control {
 public:
-    PIControl(double t_end, double first_step, int order, const Constants& constants)
-        : t_end_(t_end), h_(first_step), order_(order), constants_(constants) {}
+    // stiff_order: that of the steps where the problem is stiff.
+    PIControl(double t_end, double first_step, int order, int stiff_order,
+              const Constants& constants)
+        : t_end_(t_end),
+          h_(first_step),
+          orders_{order, stiff_order},
+          order_(order),
+          constants_(constants) {}
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void set_target_time(double end) override { t_end_ = end; }
@@ -88,7 +94,7 @@ public:
 
 private:
     double t_end_, h_;
-    int order_;
+    int orders_[2], order_;
     Constants constants_;
     double xi_old_ = 1.0;
     bool just_rejected_ = false;
@@ -148,10 +154,22 @@ protected:
     std::unique_ptr<Control> inner_;
 };
 
+// Where the stages of a scheme lie in a step.
+struct StagePlaces {
+    StagePlaces(const ButcherTableau& scheme, double clearance);
+
+    Gaps gaps;
+    std::vector<double> abscissae;
+    int middle;  // stage next to the middle of the step
+    bool explicit_scheme;
+};
+
+// `stiff`: the scheme where the problem is stiff.
 class SingularityPlacement : public ControlWrapper {
 public:
-    SingularityPlacement(std::unique_ptr<Control> inner, const ButcherTableau& scheme, double t_end,
-                         const Constants& constants, bool arrivals);
+    SingularityPlacement(std::unique_ptr<Control> inner, const ButcherTableau& scheme,
+                         const ButcherTableau& stiff, double t_end, const Constants& constants,
+                         bool arrivals);
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void set_target_time(double end) override {
@@ -204,9 +222,8 @@ private:
     // by nodes of the branch.
     bool known_ = false, lingering_ = false;
     bool turning_ = false, lost_branch_ = false;
-    Gaps gaps_;
-    std::vector<double> abscissae_;
-    int middle_;  // stage next to the middle of the step
+    StagePlaces members_[2];
+    const StagePlaces* places_ = &members_[0];
     double slope_ = 0.0, zero_, redo_ = 0.0;
     double expected_ = std::numeric_limits<double>::quiet_NaN();
     int redone_ = 0;
@@ -215,7 +232,8 @@ private:
 // Measures |d sigma / dt|, and places nothing.
 class SlopeOfSigma : public ControlWrapper {
 public:
-    SlopeOfSigma(std::unique_ptr<Control> inner, const ButcherTableau& scheme);
+    SlopeOfSigma(std::unique_ptr<Control> inner, const ButcherTableau& scheme,
+                 const ButcherTableau& stiff);
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void resume(const ControlState& s) override {
@@ -228,7 +246,8 @@ public:
     }
 
 private:
-    std::vector<double> abscissae_;
+    std::vector<double> members_[2];
+    const std::vector<double>* abscissae_ = &members_[0];
     double slope_ = 0.0;
 };
 

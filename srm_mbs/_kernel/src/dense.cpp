@@ -21,11 +21,9 @@ void DenseConstants::check() const {
     expect_within("nodes", nodes, 2, std::numeric_limits<int>::max());
 }
 
-DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double> abscissae,
+DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes,
                          DenseConstants constants, StepArrays steps)
-    : extension_(std::move(extension)),
-      abscissae_(std::move(abscissae)),
-      constants_(std::move(constants)),
+    : constants_(std::move(constants)),
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
@@ -33,22 +31,30 @@ DenseOutput::DenseOutput(int nq, int nv, Extension extension, std::vector<double
       polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
-      x_(nx_),
-      weights_(extension_.n_rates),
-      whole_(extension_.n_rates),
-      whole_count_(std::min<int>(extension_.n_rates, steps_.width)) {
+      x_(nx_) {
     if (steps_.count < 1) throw std::invalid_argument("there are no steps");
-    if (abscissae_.empty()) throw std::invalid_argument("there are no abscissae");
-    // Every step has its rates or as many as the extra stages complete.
-    if (steps_.width != extension_.n_rates &&
-        steps_.width != extension_.n_rates - extension_.extra_stages())
+    if (schemes.empty()) throw std::invalid_argument("there are no schemes");
+    for (const auto& [abscissae, extension] : schemes) {
+        if (abscissae.empty()) throw std::invalid_argument("there are no abscissae");
+        if (abscissae.size() != schemes[0].first.size())
+            throw std::invalid_argument("the schemes have other numbers of stages");
+        // Every step has its rates, or as many as the extra stages complete.
+        const int count = extension.n_rates, own = count - extension.extra_stages();
+        if (steps_.width != own && steps_.width < count)
+            throw std::invalid_argument("StepArrays.rates has another number of rates");
+        std::vector<double> whole(count);
+        extension.weights(1.0, whole.data());
+        whole.resize(std::min(count, steps_.width));
+        if (static_cast<int>(weights_.size()) < count) weights_.resize(count);
+        schemes_.push_back({abscissae, extension, std::move(whole)});
+    }
+    if (steps_.width > static_cast<int>(weights_.size()))
         throw std::invalid_argument("StepArrays.rates has another number of rates");
     long before = 0;
     for (const long step : steps_.breaks) {
         expect_within("StepArrays.breaks", step, before + 1, steps_.count);
         before = step;
     }
-    weights(1.0, whole_.data());
 }
 
 void DenseOutput::states(System& system, const double* t, long k, double* out) {
@@ -93,37 +99,40 @@ bool DenseOutput::close_to_singular(long step) const {
     const auto [first, last] = smooth_interval(step);
     if (last - first < 2) return false;  // without neighbours there is no polynomial
     if (steps_.in_zone[step]) return true;
-    const int width = static_cast<int>(abscissae_.size());
+    const std::vector<double>& abscissae = scheme_of(step).abscissae;
+    const int width = static_cast<int>(abscissae.size());
     const double* sigmas = steps_.sigmas + step * width;
     if (!finite(sigmas, width)) return false;
     double change = 0.0, lowest = sigmas[0];
     for (int j = 1; j < width; ++j) {
-        change = std::max(change, std::abs(sigmas[j] - sigmas[0]) / abscissae_[j]);
+        if (abscissae[j] > 0.0)
+            change = std::max(change, std::abs(sigmas[j] - sigmas[0]) / abscissae[j]);
         lowest = std::min(lowest, sigmas[j]);
     }
     return lowest < std::max(constants_.close * change, constants_.branch_below);
 }
 
-void DenseOutput::weights(double theta, double* out) const {
-    const int width = extension_.n_rates;
+void Extension::weights(double theta, double* out) const {
+    const int width = n_rates;
     std::fill(out, out + width, 0.0);
-    for (int k = extension_.degree() - 1; k >= 0; --k) {
+    for (int k = degree() - 1; k >= 0; --k) {
         const double factor = k % 2 ? 1.0 - theta : theta;
-        const double* row = &extension_.rows[k * width];
+        const double* row = &rows[k * width];
         for (int i = 0; i < width; ++i) out[i] = factor * (out[i] + row[i]);
     }
 }
 
 const std::vector<double>& DenseOutput::extra_rates(System& system, long step, double h) {
     std::vector<double>& kept = extra_[step];
-    if (!kept.empty() || steps_.width == extension_.n_rates) return kept;
+    const Extension& extension = scheme_of(step).extension;
+    if (!kept.empty() || steps_.width >= extension.n_rates) return kept;
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     std::vector<double> rate(n_);
     system.begin_step(steps_.times[step], steps_.states + step * nx_);
-    out.assign(static_cast<std::size_t>(extension_.extra_stages()) * n_, 0.0);
-    for (int i = 0; i < extension_.extra_stages(); ++i) {
-        const double* a = &extension_.extra_A[i * extension_.n_rates];
+    out.assign(static_cast<std::size_t>(extension.extra_stages()) * n_, 0.0);
+    for (int i = 0; i < extension.extra_stages(); ++i) {
+        const double* a = &extension.extra_A[i * extension.n_rates];
         std::fill(delta_.begin(), delta_.end(), 0.0);
         for (int k = 0; k < steps_.width + i; ++k) {
             if (a[k] == 0.0) continue;
@@ -132,7 +141,7 @@ const std::vector<double>& DenseOutput::extra_rates(System& system, long step, d
             add(h * a[k], from, delta_.data(), n_);
         }
         system.retract(steps_.states + step * nx_, delta_.data(), x_.data());
-        system.evaluate(steps_.times[step] + extension_.extra_c[i] * h, x_.data(),
+        system.evaluate(steps_.times[step] + extension.extra_c[i] * h, x_.data(),
                          System::ZoneView{});
         system.rate(rate.data());
         system.chart_rate(delta_.data(), rate.data(), &out[i * n_]);
@@ -146,9 +155,10 @@ void DenseOutput::extended(System& system, long step, double theta, double* out)
     const double h = steps_.times[step + 1] - steps_.times[step];
     const std::vector<double>& more = extra_rates(system, step, h);
     const double* rates = steps_.rates + step * steps_.width * n_;
-    weights(theta, weights_.data());
+    const Extension& extension = scheme_of(step).extension;
+    extension.weights(theta, weights_.data());
     std::fill(delta_.begin(), delta_.end(), 0.0);
-    for (int k = 0; k < extension_.n_rates; ++k)
+    for (int k = 0; k < extension.n_rates; ++k)
         add(h * weights_[k],
             k < steps_.width ? rates + k * n_ : &more[(k - steps_.width) * n_], delta_.data(), n_);
     system.retract(steps_.states + step * nx_, delta_.data(), out);
@@ -204,7 +214,9 @@ void DenseOutput::motion(long step, long node, double* out) const {
     for (long k = std::min(step, node); k < std::max(step, node); ++k) {
         const double h = sign * (steps_.times[k + 1] - steps_.times[k]);
         const double* rates = steps_.rates + k * steps_.width * n_;
-        for (int j = 0; j < whole_count_; ++j) add(h * whole_[j], rates + j * n_, out, nv);
+        const std::vector<double>& whole = scheme_of(k).whole;
+        const int count = static_cast<int>(whole.size());
+        for (int j = 0; j < count; ++j) add(h * whole[j], rates + j * n_, out, nv);
     }
 }
 

@@ -21,6 +21,7 @@ struct Extension {
 
     int degree() const { return static_cast<int>(rows.size()) / n_rates; }
     int extra_stages() const { return static_cast<int>(extra_c.size()); }
+    void weights(double theta, double* out) const;
     void check() const;
 };
 
@@ -47,14 +48,19 @@ struct StepArrays {
     const double *times, *states, *rates, *corrections, *sigmas, *end_rate;
     std::vector<char> in_zone;  // (count,)
     const double* layers = nullptr;  // (count, 2), time and width (s) of the layer; width 0: none
+    std::vector<char> stiff;    // (count,), of the scheme for stiff problems, if there is one
     std::vector<long> breaks;   // numbers of the steps that end on breakpoints, from 1
     const double* break_rates = nullptr;  // (breaks, n), tangent rates before them
 };
 
+// Abscissae and extension of a scheme.
+using SchemeDense = std::pair<std::vector<double>, Extension>;
+
 class DenseOutput {
 public:
-    DenseOutput(int nq, int nv, Extension extension, std::vector<double> abscissae,
-                DenseConstants constants, StepArrays steps);
+    // schemes: that of the run and, where it has one, that for stiff problems.
+    DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes, DenseConstants constants,
+                StepArrays steps);
     // States (k, nx) at the times t (k,); `system` is any workspace of the mechanism.  Throws
     // std::out_of_range for times outside the run.
     void states(System& system, const double* t, long k, double* out);
@@ -67,7 +73,6 @@ private:
     std::pair<long, long> smooth_interval(long step) const;
     const double* rate_at(long node, long last) const;
     bool close_to_singular(long step) const;
-    void weights(double theta, double* out) const;
     const std::vector<double>& extra_rates(System& system, long step, double h);
     void extended(System& system, long step, double theta, double* out);
     const Polynomial& best_polynomial(System& system, long step);
@@ -77,8 +82,18 @@ private:
     double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;
 
-    Extension extension_;
-    std::vector<double> abscissae_;
+    struct Scheme {
+        std::vector<double> abscissae;
+        Extension extension;
+        // Weights of the rates over a whole step, as far as the steps have them: those of extra
+        // stages are zero.
+        std::vector<double> whole;
+    };
+    const Scheme& scheme_of(long step) const {
+        return schemes_[steps_.stiff[step] ? schemes_.size() - 1 : 0];
+    }
+
+    std::vector<Scheme> schemes_;
     DenseConstants constants_;
     StepArrays steps_;
     const int n_, nx_;
@@ -88,8 +103,6 @@ private:
     enum class Place : char { unknown, regular, near_singular };
     std::vector<Place> places_;
     std::vector<double> delta_, x_, weights_;
-    std::vector<double> whole_;  // weights of the rates over a whole step,
-    const int whole_count_;      // as far as the steps have them: those of extra stages are zero
 };
 
 }  // namespace srm

@@ -45,7 +45,7 @@ void add_wrench(const ForceElement& e, const pinocchio::Data& data, const Vector
 }
 
 void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
-                   double* tau) {
+                   double* tau, ForceLaws* laws, int law) {
     const Vector3d at_a = placement(e.a, data).translation();
     const Vector3d at_b = placement(e.b, data).translation();
     const Vector3d apart = at_a - at_b;
@@ -62,6 +62,11 @@ void spring_damper(const ForceElement& e, double coincident, const pinocchio::Da
             length != 0.0 ? Vector3d(apart * ((apart / length).dot(rate) / length)) : rate;
         force -= e.damping * along;
     }
+    if (laws && law >= 0) {
+        const Vector3d line = apart / length;
+        const double own = force.dot(line), acting = laws->acting(law, own);
+        if (acting != own) force = acting * line;
+    }
     add_wrench(e, data, force, Vector3d::Zero(), at_a, tau);
 }
 
@@ -73,13 +78,18 @@ double over_time(const ForceElement& e, std::size_t k, double t) {
     return e.numbers[k] * s[0];
 }
 
-void limit_spring(const ForceElement& e, double position, double rate, double& tau) {
+// The force on its coordinate.
+double torsion_spring(const ForceElement& e, double position, double rate) {
+    return -(e.stiffness * (position - e.rest) + e.damping * rate);
+}
+
+double limit_spring(const ForceElement& e, double position, double rate) {
     const double lower = e.numbers[0], upper = e.numbers[1], depth = e.numbers[2];
     const double beyond = std::max(position - upper, 0.0) + std::min(position - lower, 0.0);
-    if (beyond == 0.0) return;
+    if (beyond == 0.0) return 0.0;
     const double x = std::min(std::abs(beyond) / depth, 1.0);
     const double contact = x * x * x * (10.0 + x * (6.0 * x - 15.0));
-    tau -= contact * (e.stiffness * beyond + e.damping * rate);
+    return -(contact * (e.stiffness * beyond + e.damping * rate));
 }
 
 void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double* tau) {
@@ -104,7 +114,8 @@ Vector3d rotation_vector(const ForceElement& e, const pinocchio::Data& data) {
     return pinocchio::log3(placement(e.b, data).actInv(placement(e.a, data)).rotation());
 }
 
-void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* step, double* tau) {
+void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* step, double* tau,
+             ForceLaws* laws, std::size_t number) {
     const SE3 Ta = placement(e.a, data), Tb = placement(e.b, data);
     const SE3 relative = Tb.actInv(Ta);
     Vector3d turn = pinocchio::log3(relative.rotation());
@@ -127,6 +138,11 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* st
         const Vector3d spin = L.transpose() * (Tb.rotation().transpose() * W.angular());
         force += d_shift.cwiseProduct(rate);
         moment += d_turn.cwiseProduct(spin);
+    }
+    for (int i = 0; laws && i < 6; ++i) {
+        double& value = i < 3 ? force[i] : moment[i - 3];
+        const int law = laws->of_element(number, i);
+        if (law >= 0) value = laws->acting(law, value);
     }
     const Vector3d world_force = Tb.rotation() * force;
     const Vector3d world_moment = Tb.rotation() * (L * moment);
@@ -196,30 +212,58 @@ double BushingStep::past_half_turn(const pinocchio_model::Workspace& work, doubl
     return std::abs(beyond) <= slack ? 0.0 : beyond / speed;
 }
 
+void ForceLaws::resolve(const std::vector<ForceElement>& elements,
+                        const std::vector<bool>& passive) {
+    int count = 0;
+    of_coordinate_.assign(passive.size(), -1);
+    of_element_.assign(6 * elements.size(), -1);
+    std::vector<bool> acted(passive);
+    for (const ForceElement& e : elements)
+        if (e.kind == ForceKind::torsion_spring || e.kind == ForceKind::limit_spring)
+            acted[e.in_v] = true;
+    for (std::size_t i = 0; i < acted.size(); ++i)
+        if (acted[i]) of_coordinate_[i] = count++;
+    for (std::size_t k = 0; k < elements.size(); ++k) {
+        const ForceElement& e = elements[k];
+        if (e.kind == ForceKind::spring_damper && e.rest > 0.0) of_element_[6 * k] = count++;
+        for (int i = 0; e.kind == ForceKind::bushing && i < 6; ++i)
+            if (e.numbers[i] > 0.0 || e.numbers[6 + i] > 0.0) of_element_[6 * k + i] = count++;
+    }
+    values.assign(count, 0.0);
+    applied = nullptr;
+}
+
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
-                const double* v, std::vector<BushingStep>& step, double* tau) {
+                const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws) {
     auto next = step.begin();
-    for (const ForceElement& e : elements) {
+    const auto on_joint = [&](const ForceElement& e, double force) {
+        if (laws) laws->values[laws->of_coordinate(e.in_v)] += force;
+        if (!laws || !laws->applied) tau[e.in_v] += force;
+    };
+    for (std::size_t number = 0; number < elements.size(); ++number) {
+        const ForceElement& e = elements[number];
         switch (e.kind) {
             case ForceKind::spring_damper:
-                spring_damper(e, coincident, work.data, tau);
+                spring_damper(e, coincident, work.data, tau, laws,
+                              laws ? laws->of_element(number, 0) : -1);
                 break;
             case ForceKind::joint_torque:
                 for (std::size_t k = 0; k < e.numbers.size(); ++k)
                     tau[e.in_v + static_cast<int>(k)] += over_time(e, k, t);
                 break;
             case ForceKind::torsion_spring:
-                tau[e.in_v] -= e.stiffness * (q[e.in_q] - e.rest) + e.damping * v[e.in_v];
+                on_joint(e, torsion_spring(e, q[e.in_q], v[e.in_v]));
                 break;
             case ForceKind::wrench:
                 wrench(e, t, work.data, tau);
                 break;
             case ForceKind::bushing:
-                bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr, tau);
+                bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr, tau,
+                        laws, number);
                 break;
             case ForceKind::limit_spring:
-                limit_spring(e, q[e.in_q], v[e.in_v], tau[e.in_v]);
+                on_joint(e, limit_spring(e, q[e.in_q], v[e.in_v]));
                 break;
         }
     }

@@ -74,11 +74,36 @@ private:
     bool passed_ = false;
 };
 
+// The laws of forces that damp or store energy: one for the coordinate of a joint, and those of the
+// elements between bodies, each along a direction of its own.
+class ForceLaws {
+public:
+    // `passive` (nv,): whether damping or friction acts on a coordinate.
+    void resolve(const std::vector<ForceElement>& elements, const std::vector<bool>& passive);
+    int count() const { return static_cast<int>(values.size()); }
+    // The value that acts as number `law`, which is `value` by itself.
+    double acting(int law, double value) {
+        values[law] = value;
+        return applied ? applied[law] : value;
+    }
+    // Number of the law of a coordinate, or -1; first one of an element, with the numbers (6) of
+    // those of a bushing.
+    int of_coordinate(int i) const { return of_coordinate_[i]; }
+    int of_element(std::size_t e, int component) const { return of_element_[6 * e + component]; }
+
+    std::vector<double> values;       // at the evaluation made last
+    const double* applied = nullptr;  // in their place; null: themselves
+
+private:
+    std::vector<int> of_coordinate_, of_element_;
+};
+
 // Adds the generalised forces at t, q, v to tau (nv,).  The workspace holds the placements, the
-// velocities and the world Jacobian there.  `step`: the bushings that have a moment in the step of
-// the stage, in their order, or none.  Throws EvaluationError.
+// velocities and the world Jacobian there.  With `laws`, their values are found, and of the forces
+// along coordinates the rest is added only if none are applied.  `step`: the bushings that have a
+// moment in the step of the stage, in their order, or none.  Throws EvaluationError.
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
-                const double* v, std::vector<BushingStep>& step, double* tau);
+                const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws);
 
 }  // namespace srm

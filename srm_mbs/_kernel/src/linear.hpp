@@ -53,4 +53,37 @@ inline void cross(const double* a, const double* b, double* out) {
     out[2] = z;
 }
 
+// A = P L U in place; pivots (n,) has the row that each was exchanged with.  False if A is singular
+// or not finite.
+inline bool lu_factor(double* A, int n, int* pivots) {
+    for (int k = 0; k < n; ++k) {
+        double* const column = A + k * n;
+        int pivot = k;
+        for (int i = k + 1; i < n; ++i)
+            if (std::abs(column[i]) > std::abs(column[pivot])) pivot = i;
+        pivots[k] = pivot;
+        if (!(std::abs(column[pivot]) > 0.0) || !std::isfinite(column[pivot])) return false;
+        if (pivot != k)
+            for (int j = 0; j < n; ++j) std::swap(A[j * n + k], A[j * n + pivot]);
+        const double inverse = 1.0 / column[k];
+        for (int i = k + 1; i < n; ++i) column[i] *= inverse;
+        for (int j = k + 1; j < n; ++j) {
+            double* const other = A + j * n;
+            if (other[k] != 0.0) add(-other[k], column + k + 1, other + k + 1, n - k - 1);
+        }
+    }
+    return true;
+}
+
+// x = A^-1 x, from the factors of A.
+inline void lu_solve(const double* A, int n, const int* pivots, double* x) {
+    for (int k = 0; k < n; ++k)
+        if (pivots[k] != k) std::swap(x[k], x[pivots[k]]);
+    for (int k = 0; k < n; ++k) add(-x[k], A + k * n + k + 1, x + k + 1, n - k - 1);
+    for (int k = n - 1; k >= 0; --k) {
+        x[k] /= A[k * n + k];
+        add(-x[k], A + k * n, x, k);
+    }
+}
+
 }  // namespace srm

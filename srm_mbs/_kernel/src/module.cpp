@@ -8,6 +8,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -292,8 +293,7 @@ struct PyStepDense {
     std::size_t nx;
 
     PyStepDense(System& system_, const StepResult& r, double t_new, std::vector<double> start,
-                const std::vector<double>& abscissae, const Extension& extension,
-                const DenseConstants& constants)
+                const SchemeDense& scheme, const DenseConstants& constants)
         : system(system_),
           times{r.t, t_new},
           states(std::move(start)),
@@ -301,7 +301,7 @@ struct PyStepDense {
           corrections(r.correction),
           sigmas(r.sigmas),
           end_rate(r.end_rate),
-          dense(system.nq, system.nv, extension, abscissae, constants, arrays(r)),
+          dense(system.nq, system.nv, {scheme}, constants, arrays(r)),
           nx(r.state.size()) {}
 
     nb::object at(const Array& t) {
@@ -326,6 +326,7 @@ private:
         out.sigmas = sigmas.data();
         out.end_rate = end_rate.data();
         out.in_zone.assign(1, 0);
+        out.stiff.assign(1, 0);
         return out;
     }
 };
@@ -343,19 +344,30 @@ struct PyRun {
     std::unique_ptr<Run> run;
     const BranchGuard* guard = nullptr;
 
-    PyRun(nb::object system_, const ButcherTableau& scheme, const Constants& constants,
+    // stiff: the scheme where the problem is stiff, if it is another.
+    PyRun(nb::object system_, const ButcherTableau& scheme,
+          const std::optional<ButcherTableau>& stiff, const Constants& constants,
           const ErrorNorm& norm, const IntegratorState& memory, const Array& state,
           const SmoothIntervals& intervals, const RunOptions& options)
         : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
         check_size("ErrorNorm.atol", norm.atol.size());
         check(memory);
         std::vector<double> start = checked_state(state);
-        auto control = make_control(scheme, constants, norm, memory, start, intervals, options);
-        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), std::move(control),
-                                    memory, std::move(start), intervals, options);
+        auto control = make_control(scheme, stiff ? *stiff : scheme, constants, norm, memory,
+                                    start, intervals, options);
+        std::unique_ptr<SplitStep> other;
+        if (stiff) {
+            if (stiff->stages() != scheme.stages())
+                throw nb::value_error("the schemes have other numbers of stages");
+            other = std::make_unique<SplitStep>(s, *stiff, constants, norm);
+        }
+        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), std::move(other),
+                                    std::move(control), memory, std::move(start), intervals,
+                                    options);
     }
 
-    std::unique_ptr<Control> make_control(const ButcherTableau& scheme, const Constants& constants,
+    std::unique_ptr<Control> make_control(const ButcherTableau& scheme,
+                                          const ButcherTableau& stiff, const Constants& constants,
                                           const ErrorNorm& norm, const IntegratorState& memory,
                                           const std::vector<double>& start,
                                           const SmoothIntervals& intervals,
@@ -370,13 +382,13 @@ struct PyRun {
                 first = initial_step(s, norm, options.t0, start.data(), memory.rate.data(),
                                      memory.state_scale.data(), t_end - options.t0,
                                      scheme.controller_order, constants);
-            control =
-                std::make_unique<PIControl>(t_end, first, scheme.controller_order, constants);
+            control = std::make_unique<PIControl>(t_end, first, scheme.controller_order,
+                                                  stiff.controller_order, constants);
         }
         if (!s.constrained()) return control;
         if (options.placement != "automatic")
-            return std::make_unique<SlopeOfSigma>(std::move(control), scheme);
-        control = std::make_unique<SingularityPlacement>(std::move(control), scheme, t_end,
+            return std::make_unique<SlopeOfSigma>(std::move(control), scheme, stiff);
+        control = std::make_unique<SingularityPlacement>(std::move(control), scheme, stiff, t_end,
                                                          constants, options.arrivals);
         auto outer = std::make_unique<BranchGuard>(std::move(control), s, constants);
         guard = outer.get();
@@ -461,10 +473,9 @@ struct PyRun {
     }
 
     // Dense output of the step made last, which began at `start` and used no zone.
-    PyStepDense* step_dense(const Array& start, const std::vector<double>& abscissae,
-                            const Extension& extension, const DenseConstants& constants) const {
-        return new PyStepDense(s, run->step.result, run->t(), checked_state(start), abscissae,
-                               extension, constants);
+    PyStepDense* step_dense(const Array& start, const SchemeDense& scheme,
+                            const DenseConstants& constants) const {
+        return new PyStepDense(s, run->last(), run->t(), checked_state(start), scheme, constants);
     }
 
     // The records since the start `state` at `t0`; the run has none any more.
@@ -485,7 +496,7 @@ struct PyRun {
 
     // The history of the zone of the step made last; None without one.
     std::optional<MultiplierHistory> last_history() const {
-        if (!run->step.result.in_zone) return {};
+        if (!run->last().in_zone) return {};
         // Of an accepted step it is in the records; that of another one is still the memory's.
         const auto& zones = run->records.zones;
         const bool recorded = !zones.empty() && zones.back().step == run->records.count() - 1;
@@ -513,6 +524,7 @@ void bind_run(nb::module_& m) {
         .def_ro("rank", &StepResult::rank)
         .def_ro("quiet", &StepResult::quiet)
         .def_ro("held", &StepResult::held)
+        .def_ro("stiff", &StepResult::stiff)
         .def_ro("in_zone", &StepResult::in_zone)
         .def_ro("critical", &StepResult::critical)
         .def_ro("zone_threshold", &StepResult::zone_threshold)
@@ -561,6 +573,7 @@ void bind_run(nb::module_& m) {
     array("error_ratios", &StepRecords::error_ratios, flat);
     array("placements", &StepRecords::placements, flat);
     array("held", &StepRecords::held, flat);
+    array("stiff", &StepRecords::stiff, flat);
     array("breaks", &StepRecords::breaks, flat);
     array("break_rates", &StepRecords::break_rates,
           [](const PyRecords& r, const std::vector<double>& values, nb::handle self) {
@@ -572,10 +585,10 @@ void bind_run(nb::module_& m) {
     nb::class_<PyStepDense>(m, "StepDense").def("__call__", &PyStepDense::at);
 
     nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
-        .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&,
-                      const IntegratorState&, const Array&, const SmoothIntervals&,
-                      const RunOptions&>(),
-             nb::arg("system"), nb::arg("scheme"), nb::arg("constants"), nb::arg("norm"),
+        .def(nb::init<nb::object, const ButcherTableau&, const std::optional<ButcherTableau>&,
+                      const Constants&, const ErrorNorm&, const IntegratorState&, const Array&,
+                      const SmoothIntervals&, const RunOptions&>(),
+             nb::arg("system"), nb::arg("scheme"), nb::arg("stiff").none(), nb::arg("constants"), nb::arg("norm"),
              nb::arg("memory"), nb::arg("state"), nb::arg("intervals"), nb::arg("options"))
         .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
         .def("attempt_from", &PyRun::attempt_from)
@@ -586,7 +599,7 @@ void bind_run(nb::module_& m) {
         .def("restore", &PyRun::restore)
         .def("memory", [](const PyRun& r) { return r.run->memory; })
         .def("remember", &PyRun::remember)
-        .def("last", [](PyRun& r) -> StepResult& { return r.run->step.result; },
+        .def("last", [](PyRun& r) -> StepResult& { return r.run->last(); },
              nb::rv_policy::reference_internal)
         .def("last_history", &PyRun::last_history)
         .def("step_dense", &PyRun::step_dense, nb::rv_policy::take_ownership,
@@ -617,6 +630,7 @@ void bind_run(nb::module_& m) {
     field(Array, rates)             /* (k, rates per step, n) */                      \
     field(Array, corrections)       /* (k, n), or (k, 0) without closures */          \
     field(Array, sigmas)            /* (k, stages + 1) */                             \
+    field(Array, stiff)             /* (k,), not 0: of the scheme for stiff problems */ \
     field(Array, end_rate)          /* (n,) */                                        \
     field(Array, break_rates)       /* (breaks, n) */                                 \
     field(std::vector<long>, breaks)                                                  \
@@ -636,6 +650,7 @@ struct PySteps {
         expect("rates", rates, {k, rates.ndim() == 3 ? rates.shape(1) : 0, n});
         expect("corrections", corrections, {k, corrected ? n : 0});
         expect("sigmas", sigmas, {k, abscissae});
+        expect("stiff", stiff, {k});
         expect("end_rate", end_rate, {n});
         expect("break_rates", break_rates, {breaks.size(), n});
         StepArrays out;
@@ -653,6 +668,8 @@ struct PySteps {
         out.break_rates = break_rates.data();
         expect("layers", layers, {k, 2});
         out.layers = layers.data();
+        out.stiff.resize(k);
+        for (std::size_t i = 0; i < k; ++i) out.stiff[i] = stiff.data()[i] != 0.0;
         out.in_zone.assign(k, 0);
         for (long step : zones) {
             if (step < 0 || step >= out.count)
@@ -677,10 +694,11 @@ struct PyDense {
     DenseOutput dense;
     std::size_t nx;
 
-    PyDense(int nq, int nv, const std::vector<double>& abscissae, const Extension& extension,
+    PyDense(int nq, int nv, const std::vector<SchemeDense>& schemes,
             const DenseConstants& constants, const PySteps& steps_)
         : steps(steps_),
-          dense(nq, nv, extension, abscissae, constants, steps.arrays(nq, nv, abscissae.size())),
+          dense(nq, nv, schemes, constants,
+                steps.arrays(nq, nv, schemes.empty() ? 0 : schemes[0].first.size())),
           nx(static_cast<std::size_t>(nq + nv)) {}
 
     nb::object states(PySystem& owner, const Array& t) {
@@ -695,10 +713,10 @@ struct PyDense {
 void bind_dense_output(nb::module_& m) {
     bind_struct<PySteps>(m, "StepArrays");
     nb::class_<PyDense>(m, "DenseOutput")
-        .def(nb::init<int, int, const std::vector<double>&, const Extension&,
-                      const DenseConstants&, const PySteps&>(),
-             nb::arg("nq"), nb::arg("nv"), nb::arg("abscissae"), nb::arg("extension"),
-             nb::arg("constants"), nb::arg("steps"))
+        .def(nb::init<int, int, const std::vector<SchemeDense>&, const DenseConstants&,
+                      const PySteps&>(),
+             nb::arg("nq"), nb::arg("nv"), nb::arg("schemes"), nb::arg("constants"),
+             nb::arg("steps"))
         .def("states", &PyDense::states);
 }
 

@@ -39,25 +39,27 @@ void StepRecords::append(const StepResult& r, double t_new, int placement) {
     ranks.push_back(r.rank);
     error_ratios.push_back(r.error_ratio);
     placements.push_back(placement);
+    stiff.push_back(r.stiff ? 1.0 : 0.0);
     held.push_back(r.held ? 1.0 : 0.0);
 }
 
 void StepRecords::clear() {
     for (auto* values : {&times, &states, &rates, &corrections, &sigmas, &ranks, &error_ratios,
-                         &placements, &held, &breaks, &break_rates})
+                         &placements, &stiff, &held, &breaks, &break_rates})
         values->clear();
     zones.clear();
 }
 
-Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
-         IntegratorState memory_, std::vector<double> state_, SmoothIntervals intervals,
-         const RunOptions& options)
+Run::Run(System& system, SplitStep step_, std::unique_ptr<SplitStep> stiff_step,
+         std::unique_ptr<Control> control_, IntegratorState memory_, std::vector<double> state_,
+         SmoothIntervals intervals, const RunOptions& options)
     : system(system),
       step(std::move(step_)),
       control(std::move(control_)),
       memory(std::move(memory_)),
       state(std::move(state_)),
       end_rate(2 * system.nv),
+      stiff_step_(std::move(stiff_step)),
       intervals_(std::move(intervals)),
       eps_factor_(options.eps_factor),
       eps_power_(options.eps_power),
@@ -68,11 +70,9 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<Control> control_,
       open_residual_(constants().open_residual),
       search_below_(constants().search_below),
       examines_(options.examines),
-      abscissae_(step.scheme.c),
       singular_tolerance_(options.singular_tolerance),
       collocation_(options.collocation),
       one_freedom_(system.nv + (system.driven() ? 1 : 0) - system.structural_rank() == 1) {
-    abscissae_.push_back(1.0);
     enter_interval();
 }
 
@@ -121,6 +121,7 @@ bool Run::restart_interval() {
         return false;
     }
     system.rate(memory.rate.data());
+    memory.laws.clear();
     memory.sigma = system.sigma();
     system.state_scale(state.data(), memory.state_scale.data());
     if (!memory.history) return true;
@@ -207,7 +208,8 @@ Stop Run::attempt(StepDecision& decision) {
     try {
         const double theta =
             eps_factor_ > 0.0 ? -std::expm1(-h / (eps_factor_ * std::pow(h, eps_power_))) : 1.0;
-        result = &step.make(t_, h, state.data(), memory, theta);
+        made_by_ = &stepper();
+        result = &made_by_->make(t_, h, state.data(), memory, theta);
     } catch (const EvaluationError&) {
         evaluation_failed = true;
     }
@@ -260,9 +262,11 @@ std::optional<double> Run::crossing(const StepResult& r) const {
     if (known_ || r.quiet) return {};
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
     if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return {};
-    const double zero = zero_within(abscissae_, r.sigmas);
+    std::vector<double> abscissae(made_by_->scheme.c);
+    abscissae.push_back(1.0);
+    const double zero = zero_within(abscissae, r.sigmas);
     const bool inside = 0.0 < zero && zero <= 1.0;
-    return r.t + (inside ? zero : abscissae_[low - r.sigmas.begin()]) * r.h;
+    return r.t + (inside ? zero : abscissae[low - r.sigmas.begin()]) * r.h;
 }
 
 // Examines the passage expected at `zero`, and prepares the steps along the curve if ordinary steps
@@ -295,6 +299,8 @@ bool Run::examine(double zero) {
 void Run::follow(const std::vector<PassagePoint>& points) {
     const int nv = system.nv, n = 2 * nv, stages = step.scheme.stages();
     const double first = step.scheme.b.front();
+    std::vector<double> abscissae(step.scheme.c);
+    abscissae.push_back(1.0);
     for (std::size_t i = points.size(); i-- > 1;) {
         const PassagePoint &from = points[i - 1], &to = points[i];
         StepResult r;
@@ -315,7 +321,7 @@ void Run::follow(const std::vector<PassagePoint>& points) {
         for (int k = 1; k < stages; ++k)
             r.rates.insert(r.rates.end(), between.begin(), between.end());
         r.rates.insert(r.rates.end(), to.rate.begin(), to.rate.end());
-        for (double c : abscissae_) r.sigmas.push_back(from.sigma + c * (to.sigma - from.sigma));
+        for (double c : abscissae) r.sigmas.push_back(from.sigma + c * (to.sigma - from.sigma));
         r.multiplier.assign(nv, 0.0);
         r.rank = system.structural_rank();
         r.critical = true;
@@ -326,6 +332,7 @@ void Run::follow(const std::vector<PassagePoint>& points) {
 // Makes the next of the prepared steps.
 Stop Run::make_prepared() {
     constexpr int critical = 3;  // STEP_PLACEMENTS of dense_output.py
+    made_by_ = &step;
     step.result = std::move(prepared_.back().first);
     const double t = prepared_.back().second;
     prepared_.pop_back();
@@ -344,7 +351,7 @@ void Run::record(const StepResult& result, double t, int placement) {
     records.append(result, t, placement);
     end_rate = result.end_rate;
     std::copy(result.state.begin(), result.state.end(), state.begin());
-    step.accept(memory);
+    made_by_->accept(memory);
     t_ = t;
     if (made_++ % constants().standstill_steps == 0) watched_time_ = t_;
 }

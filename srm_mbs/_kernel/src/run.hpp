@@ -79,6 +79,7 @@ struct ZoneRecord {
 struct StepRecords {
     std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios;
     std::vector<double> placements;  // 0: none, 1: placed, 2: redone
+    std::vector<double> stiff;       // 1: the problem had been found to be stiff
     std::vector<double> held;        // 1: a stage kept the normals of the last node
     std::vector<double> breaks;      // numbers of the steps before breakpoints
     std::vector<double> break_rates; // (breaks, n), tangent rates there
@@ -105,8 +106,10 @@ struct RunSnapshot {
 
 class Run {
 public:
-    Run(System& system, SplitStep step, std::unique_ptr<Control> control, IntegratorState memory,
-        std::vector<double> state, SmoothIntervals intervals, const RunOptions& options);
+    // stiff_step: makes the steps where the problem is stiff; may be null.
+    Run(System& system, SplitStep step, std::unique_ptr<SplitStep> stiff_step,
+        std::unique_ptr<Control> control, IntegratorState memory, std::vector<double> state,
+        SmoothIntervals intervals, const RunOptions& options);
 
     // Makes up to `steps` accepted steps, or as many as take `seconds`.
     Stop advance(long steps, double seconds);
@@ -137,6 +140,10 @@ public:
     double interval_end() const { return intervals_.ends[interval_]; }
     long interval() const { return static_cast<long>(interval_); }
 
+    // The step made last.
+    StepResult& last() { return made_by_->result; }
+    const StepResult& last() const { return made_by_->result; }
+
     System& system;
     SplitStep step;
     std::unique_ptr<Control> control;
@@ -166,6 +173,10 @@ private:
     double direct_from() const;
 
     const Constants& constants() const { return step.constants; }
+    SplitStep& stepper() { return memory.stiff && stiff_step_ ? *stiff_step_ : step; }
+
+    std::unique_ptr<SplitStep> stiff_step_;
+    SplitStep* made_by_ = &step;
 
     SmoothIntervals intervals_;
     std::size_t interval_ = 0;
@@ -184,7 +195,6 @@ private:
     bool on_jump_ = false;
     bool inaccurate_ = false;  // the first stage after a jump: Python has to look at it
     bool examines_;
-    std::vector<double> abscissae_;
     double singular_tolerance_;
     Collocation collocation_;
     const bool one_freedom_;  // the closed configurations are curves, which may be followed

@@ -1,5 +1,6 @@
 #include "step.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -16,9 +17,14 @@ void ButcherTableau::check() const {
     expect_size("c", c.size(), s);
     if (!error.empty()) expect_size("error", error.size(), s + 1);
     expect_size("gap_half_widths", gap_half_widths.size(), gap_centres.size());
+    expect_within("lead", lead, 0, static_cast<long>(s) - 1);
+    if (!implicit.empty()) expect_size("implicit", implicit.size(), s * s);
 }
 
-void ErrorNorm::check() const { expect_size("one", one.size(), atol.size()); }
+void ErrorNorm::check() const {
+    expect_size("one", one.size(), atol.size());
+    expect_size("unit", unit.size(), atol.size());
+}
 
 void IntegratorState::check() const {
     expect_size("state_scale", state_scale.size(), rate.size());
@@ -93,6 +99,101 @@ SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& co
     result.sigmas.resize(s + 1);
     result.multiplier.resize(nv_);
     deficient_stages_.reserve(s + 1);
+    apart_.resize(n_);
+    if (scheme.implicit.empty()) return;
+    const double gamma = scheme.implicit[scheme.lead * (s + 1)];
+    linear_ = std::make_unique<LinearStages>(system, gamma, norm.unit, constants);
+    linear_weights_.resize(s * s);
+    time_shares_.resize(s);
+    law_rates_.resize(s * linear_->count());
+    law_shares_.resize(linear_->count());
+    for (int i = 0; i < s; ++i)
+        for (int j = 0; j <= i; ++j) {
+            time_shares_[i] += scheme.implicit[i * s + j];
+            if (j < i) linear_weights_[i * s + j] = scheme.implicit[i * s + j] / gamma;
+        }
+}
+
+// The laws of the forces that act in the stage j, or at the end those of the end state itself.
+void SplitStep::apply_laws(int j) {
+    const int s = scheme.stages(), m = linear_->count();
+    applied_ = linear_->applied();
+    const double* a = j < s ? &scheme.A[j * s] : scheme.b.data();
+    for (int k = scheme.lead; k < j; ++k)
+        if (a[k] != 0.0) add(h_ * a[k], &law_rates_[k * m], applied_.data(), m);
+    system_.apply_laws(j < s && m ? applied_.data() : nullptr);
+}
+
+// The rate of the stage j of a linearly implicit scheme, from the chart rate in its place and the
+// laws there.
+void SplitStep::linear_rate(int j, const std::vector<double>& laws) {
+    const int s = scheme.stages(), n = n_, m = linear_->count();
+    double *const rate = &result.rates[j * n], *const law_rate = &law_rates_[j * m];
+    const double* by_time = linear_->by_time().data();
+    std::fill(error_.begin(), error_.end(), 0.0);
+    std::fill(law_shares_.begin(), law_shares_.end(), 0.0);
+    for (int k = scheme.lead; k < j; ++k) {
+        const double weight = linear_weights_[j * s + k];
+        add(weight, &result.rates[k * n], error_.data(), n);
+        add(weight, &law_rates_[k * m], law_shares_.data(), m);
+    }
+    const double share = h_ * time_shares_[j];
+    for (int i = 0; i < n; ++i) rate[i] += error_[i] + share * by_time[i];
+    linear_->solve(rate, laws.data(), applied_.data(), law_rate);
+    for (int i = 0; i < n; ++i) rate[i] -= error_[i];
+    for (int k = 0; k < m; ++k) law_rate[k] -= law_shares_[k];
+}
+
+// h |lambda|, seen from the last two stages of an explicit step; NaN if they do not differ.
+double SplitStep::stiffness() const {
+    const int s = scheme.stages(), n = n_;
+    const double *last = &result.rates[s * n], *other = last - n;
+    double* const change = scratch_.data();
+    for (int i = nv_; i < n; ++i) change[i] = last[i] - other[i];
+    const double dq = system_.position_norm(apart_.data());
+    const double dv = system_.position_norm(&apart_[nv_]);
+    if (!(dq > 0.0 && dv > 0.0)) return std::numeric_limits<double>::quiet_NaN();
+    const double da = system_.position_norm(change + nv_);
+    return h_ * std::min(da / dv, std::sqrt(da / dq));
+}
+
+// Whether the acceleration of a coordinate with friction varies over the step by more than what
+// would stop it within the step, and by more than the tolerance: stages take its sign at random.
+bool SplitStep::chatters(const IntegratorState& memory) const {
+    const int s = scheme.stages(), n = n_;
+    if (!system_.has_friction()) return false;
+    for (int i = nv_; i < n; ++i) {
+        if (!std::isfinite(system_.friction_tolerance(i - nv_, 0.0))) continue;
+        const double before = std::abs(memory.rate[i - nv_]);
+        const double least = std::max({before, std::abs(result.end_rate[i - nv_]),
+                                       norm.weight(i, before)}) / h_;
+        double low = result.rates[i], high = low;
+        for (int j = 1; j <= s; ++j) {
+            low = std::min(low, result.rates[j * n + i]);
+            high = std::max(high, result.rates[j * n + i]);
+        }
+        if (high - low > least) return true;
+    }
+    return false;
+}
+
+// Takes the step into account, which was accepted: methods/stiffness.py.
+void SplitStep::count_stiffness(IntegratorState& memory) {
+    if (!linear_) {
+        if (memory.stiff || !(scheme.stable_to > 0.0) || norm.negligible == 0.0) return;
+        if (!monitored_ && (stiffness() > scheme.stable_to || chatters(memory))) {
+            ++memory.stiff_steps;
+            memory.other_steps = 0;
+        } else if (memory.stiff_steps && ++memory.other_steps == constants.other_steps) {
+            memory.stiff_steps = memory.other_steps = 0;
+        }
+    } else if (memory.stiff) {
+        const bool stiff = !(linear_->stiffness(h_) < constants.not_stiff) || chatters(memory);
+        memory.stiff_steps = stiff ? 0 : memory.stiff_steps + 1;
+    }
+    if (memory.stiff_steps < constants.stiff_steps) return;
+    memory.stiff = !memory.stiff;
+    memory.stiff_steps = memory.other_steps = 0;
 }
 
 // Error of h times the tangent rate at a stage that lies off the closures by `error` (n,).
@@ -264,7 +365,8 @@ const StepResult& SplitStep::make(double t, double h, const double* state,
     h_ = h;
     monitored_ = constrained && memory.sigma < constants.monitored_below +
                                                    constants.far_steps * sigma_change;
-    lingers_ = monitored_ && memory.lingering && theta == 1.0;
+    lingers_ = monitored_ && memory.lingering && theta == 1.0 && !linear_;
+    r.stiff = memory.stiff;
     if (monitored_) {
         for (int i = 0; i < n_; ++i) weights_[i] = norm.weight(i, memory.state_scale[i]);
         prepare_branch(memory, t + h, sigma_change);
@@ -298,19 +400,44 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     const System::ZoneView none;
     std::copy(memory.rate.begin(), memory.rate.end(), r.rates.begin());
     r.sigmas[0] = memory.sigma;
+    // While it lives, the system finds the laws of forces.
+    struct Tracking {
+        System* system;
+        explicit Tracking(System* tracked) : system(tracked) {
+            if (system) system->track_laws(true);
+        }
+        ~Tracking() {
+            if (system) system->track_laws(false);
+        }
+    };
+    const Tracking tracking(linear_ ? &system_ : nullptr);
+    if (linear_) {
+        linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws,
+                         monitored_ ? branch_.zone : none);
+        for (int j = 0; j <= scheme.lead; ++j) {
+            std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
+            r.sigmas[j] = memory.sigma;
+        }
+        applied_ = linear_->applied();
+        linear_rate(scheme.lead, linear_->laws());
+    }
     deficient_stages_.clear();
     r.rank = std::numeric_limits<int>::max();
     r.held = false;
     moved_end_ = false;
     noded_ = noded_end_ = r.lost_branch = false;
     if (lingers_) away_.clear();
-    for (int j = 1; j <= s; ++j) {
+    for (int j = scheme.lead + 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
         std::fill(delta_.begin(), delta_.end(), 0.0);
         for (int k = 0; k < j; ++k)
             if (a[k] != 0.0) add(h_ * a[k], &r.rates[k * n], delta_.data(), n);
+        if (j == s - 1) apart_ = delta_;
+        if (end)
+            for (int i = 0; i < n; ++i) apart_[i] = delta_[i] - apart_[i];
         system_.retract(state, delta_.data(), x_.data());
+        if (linear_) apply_laws(j);
         const double fraction = end ? 1.0 : scheme.c[j];
         const double time = t + fraction * h_;
         system_.evaluate(time, x_.data(), monitored_ && !lingers_ ? branch_.zone : none);
@@ -335,6 +462,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         }
         system_.rate(rate_.data());
         system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
+        if (linear_ && !end) linear_rate(j, system_.law_values());
         if (system_.rank_deficient()) {
             r.rank = std::min(r.rank, system_.rank());
             deficient_stages_.push_back(j);
@@ -396,6 +524,9 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
         error_[i] = h_ * std::abs(error_[i]);
         weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));
     }
+    for (int i = 0; linear_ && i < nv_; ++i)
+        weights_[nv_ + i] =
+            std::min(weights_[nv_ + i], system_.friction_tolerance(i, r.end_rate[i]));
     if (monitored_) {
         // Counted always, the uncertainty of the predicted multiplier would shorten the steps next
         // to the singular configuration for ever.
@@ -416,6 +547,11 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
 void SplitStep::accept(IntegratorState& memory) {
     const StepResult& r = result;
     ++memory.steps;
+    count_stiffness(memory);
+    if (linear_)
+        memory.laws = applied_;
+    else
+        memory.laws.clear();
     memory.rate.swap(result.end_rate);
     result.end_rate = memory.rate;  // equal sizes: copies without allocating
     memory.sigma = r.sigmas[scheme.stages()];

@@ -1,12 +1,14 @@
 // One step of the split PSRM: methods/split_step.py and methods/near_singular.py.
 #pragma once
 
+#include <memory>
 #include <optional>
 #include <vector>
 
 #include "branch_nodes.hpp"
 #include "constants.hpp"
 #include "history.hpp"
+#include "linear_stages.hpp"
 #include "struct_fields.hpp"
 #include "system.hpp"
 
@@ -18,6 +20,9 @@ namespace srm {
     field(std::vector<double>, c)               /* (s,) */                            \
     field(std::vector<double>, error)           /* (s + 1,); empty: no embedded pair */ \
     field(int, controller_order)                                                      \
+    field(std::vector<double>, implicit)        /* (s, s); empty: an explicit scheme */ \
+    field(int, lead)                            /* last stage with the rate at the start */ \
+    field(double, stable_to)                    /* h |lambda|; 0: not tested */        \
     /* Intervals between the abscissae, the widest first. */                          \
     field(std::vector<double>, gap_centres)                                           \
     field(std::vector<double>, gap_half_widths)
@@ -32,6 +37,7 @@ struct ButcherTableau {
 #define SRM_ERROR_NORM(field)                                                     \
     field(std::vector<double>, atol) /* (n,) */                                   \
     field(std::vector<double>, one)  /* (n,), a unit of each component */         \
+    field(std::vector<double>, unit) /* (n,), its usual size */                   \
     field(double, rtol)                                                           \
     field(double, negligible)        /* part of the tolerance; 0: fixed steps */
 
@@ -56,6 +62,10 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     field(double, sigma_slope)              /* |d sigma / dt| of the last steps (1/s) */  \
     field(bool, lingering)                  /* turns, or is slow, at small sigma */        \
     field(long, steps)                                                                    \
+    field(bool, stiff)                      /* the problem was found to be stiff */       \
+    field(int, stiff_steps)                 /* that speak for a change of that, */        \
+    field(std::vector<double>, laws)        /* (m,), of forces, in linearly implicit steps */ \
+    field(int, other_steps)                 /* and those after the last of them that do not */ \
     field(std::optional<MultiplierHistory>, history) /* none without closures */
 
 // The values that a method carries from one accepted step to the next.
@@ -83,6 +93,7 @@ struct StepResult {
     bool in_zone = false;  // a stage was in the zone
     bool quiet = false;    // the whole step is far from singular configurations
     bool held = false;     // a stage kept the normals of the last node
+    bool stiff = false;        // the problem had been found to be stiff before the step
     bool lost_branch = false;  // nodes of the branch were wanted and not found
     bool critical = false;     // along the curve past a critical configuration
     double zone_threshold = 0.0;
@@ -117,6 +128,11 @@ private:
     bool solve_on_branch(double t, double start, const double* state,
                          const IntegratorState& memory);
     bool project_stage(double t, double c, const IntegratorState& memory, double sigma_change);
+    void linear_rate(int j, const std::vector<double>& laws);
+    void apply_laws(int j);
+    double stiffness() const;
+    bool chatters(const IntegratorState& memory) const;
+    void count_stiffness(IntegratorState& memory);
     void evaluate_stages(double t, const double* state, const IntegratorState& memory,
                          double sigma_change);
     void finish(double theta, bool constrained);
@@ -138,6 +154,12 @@ private:
     // branch; one of them was; the end was.
     bool lingers_ = false, noded_ = false, noded_end_ = false;
     BranchNodes nodes_;
+    // Of a linearly implicit scheme; with the weights (s, s) of the rates in its linear terms, over
+    // gamma, and the sums of its rows (s,).
+    std::unique_ptr<LinearStages> linear_;
+    std::vector<double> linear_weights_, time_shares_;
+    std::vector<double> law_rates_, applied_, law_shares_;  // (s, m); (m,) of a stage
+    std::vector<double> apart_;  // (n,), the arguments of the last two stages, one from the other
     std::vector<double> away_;
     Branch branch_;
     std::vector<double> x_, delta_, rate_, weights_, error_, moved_, uncertainty_;

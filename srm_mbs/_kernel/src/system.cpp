@@ -23,6 +23,9 @@ using pinocchio_model::Argument;
 namespace {
 
 constexpr double overflow = 1e100;
+constexpr double friction_part = 0.01;  // FRICTION_PART of dynamics/multibody.py
+// Coordinates of an open mechanism up to which its mass matrix is factorised in stiff steps.
+constexpr int one_pass_size = 12;
 constexpr double two_pi = 6.283185307179586;
 
 // The placement of a joint in the world; its velocity and bias acceleration (with -gravity), in its
@@ -356,11 +359,47 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
+    track_laws(false);
     held_from_.clear();
     held_.clear();
     between(-std::numeric_limits<double>::infinity(), std::numeric_limits<double>::infinity());
     evaluations = 0;
     if (closed_) projection_->factorisations = 0;
+}
+
+int System::resolve_laws() {
+    std::vector<bool> passive(nv, false);
+    for (const auto* factors : {&data_.damping, &data_.friction})
+        for (std::size_t i = 0; i < factors->size(); ++i)
+            if ((*factors)[i] != 0.0) passive[i] = true;
+    laws_.resolve(data_.forces, passive);
+    return laws_.count();
+}
+
+// The laws of coordinates, as far as they are damping and friction; applied ones act.
+void System::passive_forces() {
+    for (int i = 0; i < nv; ++i) {
+        const int law = laws_.of_coordinate(i);
+        if (law < 0) continue;
+        double force = 0.0;
+        if (!data_.damping.empty()) force -= data_.damping[i] * v_[i];
+        if (!data_.friction.empty())
+            force -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+        laws_.values[law] = force;
+        if (laws_.applied) f_[i] += laws_.applied[law];
+    }
+}
+
+double System::friction_tolerance(int i, double v) const {
+    if (data_.friction.empty() || data_.friction[i] == 0.0)
+        return std::numeric_limits<double>::infinity();
+    return data_.friction_speed + friction_part * std::abs(v);
+}
+
+bool System::time_dependent() const {
+    return controller_ || driven() ||
+           std::any_of(data_.forces.begin(), data_.forces.end(),
+                       [](const ForceElement& force) { return !force.curves.empty(); });
 }
 
 bool System::holds(const double* force) const {
@@ -421,7 +460,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     std::copy(state + nq, state + nq + nv, w.v.data());
     std::copy(state + nq, state + nq + nv, v_.begin());
     std::fill(f_.begin(), f_.end(), 0.0);
-    if (!data_.damping.empty())
+    if (!data_.damping.empty() && !laws_.applied)
         for (int i = 0; i < nv; ++i) f_[i] = -data_.damping[i] * v_[i];
     if (controller_) {
         controller_(t, state, state + nq, acted_.data());
@@ -429,13 +468,32 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     if (const double* force = held_force(t))
         for (int i = 0; i < nv; ++i) f_[i] += force[i];
-    for (std::size_t i = 0; i < data_.friction.size(); ++i)
-        f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    if (!laws_.applied)
+        for (std::size_t i = 0; i < data_.friction.size(); ++i)
+            f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
+    if (laws) passive_forces();
+    if (!closed_ && laws && nv <= one_pass_size) {
+        // The one pass over the tree that closures have costs less than three.
+        pinocchio_model::compute_terms(w);
+        for (int i = 0; i < nv; ++i) rate_[i] = f_[i] - w.data.nle[i];
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, rate_.data(),
+                       laws);
+        double M[one_pass_size * one_pass_size];
+        int pivots[one_pass_size];
+        for (int j = 0; j < nv; ++j)
+            for (int i = 0; i <= j; ++i) M[j * nv + i] = M[i * nv + j] = w.data.M(i, j);
+        if (!lu_factor(M, nv, pivots)) throw EvaluationError{Failure::acceleration};
+        lu_solve(M, nv, pivots, rate_.data());
+        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
+        return;
+    }
     if (!closed_) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
             pinocchio::computeJointJacobians(w.model, w.data);
-            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data());
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                       laws);
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
@@ -446,7 +504,8 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
     if (!data_.forces.empty())
-        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data());
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                   laws);
     update_closures(state, true);
     update_drives(t, true);
     Projection& p = *projection_;

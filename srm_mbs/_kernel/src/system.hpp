@@ -208,6 +208,21 @@ public:
     bool commutes() const { return data_.groups.empty(); }
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
+    // The laws of forces in linearly implicit steps: their number; their values, which evaluations
+    // find while they are tracked; what acts in their place, or, if null, they themselves.
+    int resolve_laws();
+    void track_laws(bool tracked) {
+        tracks_laws_ = tracked;
+        laws_.applied = nullptr;
+    }
+    void apply_laws(const double* values) { laws_.applied = values; }
+    const std::vector<double>& law_values() const { return laws_.values; }
+    bool has_friction() const { return !data_.friction.empty(); }
+    // Error of the rate v of a coordinate from which its friction is another; infinite without.
+    double friction_tolerance(int i, double v) const;
+    // Whether rates may depend on time itself: held forces do not.
+    bool time_dependent() const;
+    const std::vector<GroupJoint>& groups() const { return data_.groups; }
     double unit(int j) const { return data_.unit[j]; }
     double residual_scale(int row) const { return data_.residual_scale[row]; }
 
@@ -228,6 +243,9 @@ private:
 
     double first_ = -std::numeric_limits<double>::infinity();
     double last_ = std::numeric_limits<double>::infinity();
+    void passive_forces();
+    ForceLaws laws_;
+    bool tracks_laws_ = false;
     std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;
     Controller controller_;

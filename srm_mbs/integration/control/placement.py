@@ -250,6 +250,19 @@ class Gaps:
         return distance / self._wide[-1][1]
 
 
+class StagePlaces:
+    """Where the stages of a ``scheme`` lie in a step."""
+
+    def __init__(self, scheme: ButcherTableau) -> None:
+        self.gaps = Gaps(scheme)
+        self.explicit = scheme.implicit is None
+        self.abscissae = scheme.abscissae
+        self.inverse = inverse_abscissae(scheme)
+        self.later_stages = np.flatnonzero(self.abscissae > 0.0).tolist()
+        self.inner_stages = [j for j in self.later_stages if self.abscissae[j] < 1.0]
+        self.middle = scheme.middle
+
+
 class SingularityPlacement(ControlWrapper):
     """Wraps ``inner`` step-size control around singular configurations.
 
@@ -273,12 +286,8 @@ class SingularityPlacement(ControlWrapper):
         arrivals: bool = False,
     ) -> None:
         super().__init__(inner, t_end)
-        self._gaps = Gaps(scheme)
-        self._abscissae = scheme.abscissae
-        self._inverse = inverse_abscissae(scheme)
-        self._later_stages = np.flatnonzero(self._abscissae > 0.0).tolist()
-        self._inner_stages = [j for j in self._later_stages if self._abscissae[j] < 1.0]
-        self._middle = scheme.middle
+        self._members = tuple(StagePlaces(scheme.member(stiff)) for stiff in (False, True))
+        self._places = self._members[False]
         self._slope = 0.0
         self._zero: float | None = None
         self._expected: float | None = None
@@ -293,6 +302,7 @@ class SingularityPlacement(ControlWrapper):
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where a stage would come too close."""
+        self._places = self._members[memory.stiff]
         if self._redo is not None:
             limit = min(limit, self._redo)
         slope = memory.sigma_slope = self._slope
@@ -337,6 +347,8 @@ class SingularityPlacement(ControlWrapper):
         """Whether stages next to a singular configuration are to be solved by nodes of the branch:
         the motion turns back there, or is slow."""
         history = memory.history
+        if not self._places.explicit:
+            return False
         if self._lost_branch or history is None or history.known_until >= proposal.t_new:
             return False
         if not self.adaptive:
@@ -359,14 +371,15 @@ class SingularityPlacement(ControlWrapper):
         )
 
     def _placed(self, distance: float, h: float, t: float) -> float:
-        if t + h >= self._t_end and self._gaps.ends_on(distance, h):
+        gaps = self._places.gaps
+        if t + h >= self._t_end and gaps.ends_on(distance, h):
             return h  # the run, or its smooth interval, ends there
         if self.adaptive:
-            return self._gaps.longest_step(distance, h)
+            return gaps.longest_step(distance, h)
         # A fixed step may cross its grid point where that is singular: it could only creep up.
-        if not self._gaps.ends_on(distance, h):
-            return self._gaps.longest_step(distance, h) if distance < h else h
-        over = self._gaps.step_over(distance)
+        if not gaps.ends_on(distance, h):
+            return gaps.longest_step(distance, h) if distance < h else h
+        over = gaps.step_over(distance)
         return over if t + over <= self._t_end else h
 
     def _better_step(self, h: float, sigmas: FloatArray, slope: float, last: bool) -> float | None:
@@ -375,27 +388,28 @@ class SingularityPlacement(ControlWrapper):
         ``last``: the run, or its smooth interval, ends with this step, wherever that is.
         """
         values: list[float] = sigmas.tolist()
+        places = self._places
         reach = TOO_CLOSE * max(self._slope, slope) * h
         if not min(values) < min(reach, 0.5 * values[0]):
             return None
-        movable = self._inner_stages if last else self._later_stages
+        movable = places.inner_stages if last else places.later_stages
         if not min((values[i] for i in movable), default=np.inf) < min(reach, 0.5 * values[0]):
             return None
-        zero = zero_within(self._abscissae, sigmas)
+        zero = zero_within(places.abscissae, sigmas)
         if zero is None or not zero > 0.0:
             return None
-        return self._gaps.longest_step(zero * h, 0.98 * h)
+        return places.gaps.longest_step(zero * h, 0.98 * h)
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Redo a badly placed step; otherwise the inner decision."""
-        slope = 0.0
+        slope, places = 0.0, self._places
         if result is None:
             pass
         elif result.quiet:  # no zero is near: only the slope is kept
             slope = result.slope
         else:
             h = proposal.h
-            slope = sigma_slope(self._inverse, result.sigmas, h)
+            slope = sigma_slope(self._places.inverse, result.sigmas, h)
             if self._lingering and result.lost_branch:
                 self._lost_branch, self._redo = True, h
                 self.replaced += 1
@@ -425,10 +439,10 @@ class SingularityPlacement(ControlWrapper):
             ahead = None
             if not result.quiet:
                 if result.sigmas[-1] < WATCHED_SIGMA:
-                    extreme = extreme_sigma(self._abscissae, self._middle[0], result.sigmas)
+                    extreme = extreme_sigma(places.abscissae, places.middle[0], result.sigmas)
                     slow = self._slope * proposal.h < SLOW_SIGMA_CHANGE
                     self._turning = slow or abs(extreme) < TURNING_SIGMA
-                ahead = zero_ahead(*self._middle, result.sigmas)
+                ahead = zero_ahead(*places.middle, result.sigmas)
                 self._zero = None if ahead is None else result.t + proposal.h * ahead
             expected = expected_zero(result.sigmas, ahead)
             self._expected = None if expected is None else result.t + proposal.h * expected
@@ -445,11 +459,13 @@ class SlopeOfSigma(ControlWrapper):
         self, inner: StepSizeControl, scheme: ButcherTableau, t_end: float = np.inf
     ) -> None:
         super().__init__(inner, t_end)
-        self._inverse = inverse_abscissae(scheme)
+        self._members = tuple(inverse_abscissae(scheme.member(stiff)) for stiff in (False, True))
+        self._inverse = self._members[False]
         self._slope = 0.0
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal."""
+        self._inverse = self._members[memory.stiff]
         memory.sigma_slope = self._slope
         return self._inner.propose(t, limit, memory)
 

@@ -29,6 +29,12 @@ CLEARANCE_AHEAD = 0.15
 the next step could pass a nearer one only by being very short."""
 
 
+def _clear_places(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
+    """The abscissae of a ``scheme`` that are to be clear, and the centres of its wide gaps."""
+    abscissae = np.unique(scheme.abscissae[scheme.abscissae > 0.0])
+    return abscissae, [centre for centre, half in scheme.gaps if half > 1.5 * STAGE_CLEARANCE]
+
+
 class AvoidTimes(ControlWrapper):
     """Wraps ``inner`` step-size control: no stage or end of a step lies on a given time.
 
@@ -63,11 +69,12 @@ class AvoidTimes(ControlWrapper):
         super().__init__(inner, t_end)
         self._step = step
         self._times = np.sort(times)
-        self._abscissae = np.unique(scheme.abscissae[scheme.abscissae > 0.0])
-        self._centres = [centre for centre, half in scheme.gaps if half > 1.5 * STAGE_CLEARANCE]
+        self._members = tuple(_clear_places(scheme.member(stiff)) for stiff in (False, True))
+        self._abscissae, self._centres = self._members[False]
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The inner proposal, shortened where it would come too close to a given time."""
+        self._abscissae, self._centres = self._members[memory.stiff]
         proposal = self._inner.propose(t, limit, memory)
         distances = self._times[self._times > t] - t
         if proposal.singular_arrival or not len(distances) or self._clear(proposal.h, distances):

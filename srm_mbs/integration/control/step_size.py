@@ -163,19 +163,25 @@ class PIControl:
         Length of the first step (s).
     order
         k: 3 for tvd32, 5 for dopr54, 8 for dop853.
+    stiff_order
+        k of the steps where the problem is stiff; None for ``order``.
     """
 
     adaptive = True
 
-    def __init__(self, t_end: float, first_step: float, order: int) -> None:
+    def __init__(
+        self, t_end: float, first_step: float, order: int, stiff_order: int | None = None
+    ) -> None:
         self._t_end = t_end
         self._h = first_step
+        self._orders = order, order if stiff_order is None else stiff_order
         self._order = order
         self._xi_old = 1.0
         self._just_rejected = False
 
     def propose(self, t: float, limit: float, memory: IntegratorState) -> Proposal:
         """The step that the error allows."""
+        self._order = self._orders[memory.stiff]
         return _until(t, min(self._h, limit), self._t_end)
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:

@@ -55,7 +55,6 @@ class CompiledDenseOutput(DenseOutput):
     ) -> None:
         super().__init__(system, scheme, steps, end_state)
         self._mechanism_system = system
-        self._scheme = scheme
         self.kernel_system = kernel_system
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -90,7 +89,7 @@ class CompiledDenseOutput(DenseOutput):
     @cached_property
     def _by_reference(self) -> bool:
         """Whether only the reference can evaluate it."""
-        steps, extension = self._steps, self._extension
+        steps, extension = self._steps, self._scheme.dense
         if not steps.count:
             return True
         if len(extension.extra_c) and steps.rates.shape[1] == extension.n_rates:
@@ -106,8 +105,7 @@ class CompiledDenseOutput(DenseOutput):
         return core.DenseOutput(  # type: ignore[union-attr]
             system.nq,
             system.nv,
-            self._abscissae,
-            marshalling.extension_struct(self._extension),
+            marshalling.scheme_denses(self._scheme),
             marshalling.dense_constants(),
             marshalling.steps_struct(self._steps),
         )

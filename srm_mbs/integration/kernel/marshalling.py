@@ -27,7 +27,13 @@ from srm_mbs.integration.breakpoints import SmoothIntervals
 from srm_mbs.integration.control import branch_guard, placement, step_size
 from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.dense_output import StepData
-from srm_mbs.integration.methods import branch_nodes, near_singular, split_step
+from srm_mbs.integration.methods import (
+    branch_nodes,
+    linear_split_step,
+    near_singular,
+    split_step,
+    stiffness,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
@@ -74,6 +80,14 @@ def constants() -> Any:
         node_misfit=branch_nodes.LARGEST_MISFIT,
         branch_below=branch_nodes.BRANCH_SIGMA,
         residual_interval=split_step.RESIDUAL_EVERY,
+        # Stiffness.
+        stiff_steps=stiffness.STIFF_STEPS,
+        other_steps=stiffness.OTHER_STEPS,
+        not_stiff=stiffness.NOT_STIFF,
+        power_iterations=stiffness.POWER_ITERATIONS,
+        difference=linear_split_step.DIFFERENCE,
+        time_difference=linear_split_step.TIME_DIFFERENCE,
+        shortest_difference=linear_split_step.SHORTEST_DIFFERENCE,
         # Step-size control.
         safety=step_size.SAFETY,
         min_factor=step_size.MIN_FACTOR,
@@ -157,6 +171,9 @@ def tableau_struct(scheme: ButcherTableau) -> Any:
         c=scheme.c,
         error=_NO_NUMBERS if scheme.error is None else scheme.error,
         controller_order=scheme.controller_order or 1,
+        implicit=_NO_NUMBERS if scheme.implicit is None else scheme.implicit,
+        lead=scheme.lead,
+        stable_to=scheme.stable_to or 0.0,
         gap_centres=gaps[:, 0],
         gap_half_widths=gaps[:, 1],
     )
@@ -164,7 +181,13 @@ def tableau_struct(scheme: ButcherTableau) -> Any:
 
 def norm_struct(norm: ErrorNorm) -> Any:
     """``ErrorNorm`` of step.hpp."""
-    return _core.ErrorNorm(atol=norm.atol, one=norm.one, rtol=norm.rtol, negligible=norm.negligible)
+    return _core.ErrorNorm(
+        atol=norm.atol,
+        one=norm.one,
+        unit=norm.one if norm.unit is None else norm.unit,
+        rtol=norm.rtol,
+        negligible=norm.negligible,
+    )
 
 
 def history_struct(history: MultiplierHistory) -> Any:
@@ -205,6 +228,10 @@ def state_struct(memory: IntegratorState) -> Any:
         sigma_slope=memory.sigma_slope,
         steps=memory.steps,
         lingering=memory.lingering,
+        stiff=memory.stiff,
+        stiff_steps=memory.stiff_steps,
+        other_steps=memory.other_steps,
+        laws=_NO_NUMBERS if memory.laws is None else memory.laws,
         history=None if history is None else history_struct(history),
     )
 
@@ -220,6 +247,10 @@ def state_from(struct: Any) -> IntegratorState:
         struct.sigma_slope,
         struct.steps,
         struct.lingering,
+        struct.stiff,
+        struct.stiff_steps,
+        struct.other_steps,
+        struct.laws if len(struct.laws) else None,
     )
 
 
@@ -312,13 +343,27 @@ def dense_constants() -> Any:
     )
 
 
+SchemeDense = tuple[list[float], Any]
+"""Abscissae and ``Extension`` of a scheme: ``SchemeDense`` of dense.hpp."""
+
+
+def scheme_dense(scheme: ButcherTableau) -> SchemeDense:
+    """Abscissae and extension of ``scheme``."""
+    return scheme.abscissae.tolist(), extension_struct(scheme.dense)
+
+
 @lru_cache(maxsize=64)
-def dense_structs(scheme: ButcherTableau) -> tuple[list[float], Any, Any]:
-    """Abscissae, ``Extension`` and ``DenseConstants`` for the dense output of one step."""
-    return scheme.abscissae.tolist(), extension_struct(scheme.dense), dense_constants()
+def dense_structs(scheme: ButcherTableau) -> tuple[SchemeDense, Any]:
+    """``SchemeDense`` and ``DenseConstants`` for the dense output of one step."""
+    return scheme_dense(scheme), dense_constants()
 
 
-_STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate")
+def scheme_denses(scheme: ButcherTableau) -> list[SchemeDense]:
+    """Those of a run: of ``scheme`` and, where it has one, of its scheme for stiff problems."""
+    return [scheme_dense(one) for one in (scheme, scheme.stiff) if one is not None]
+
+
+_STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate", "stiff")
 _STEP_NUMBERS = ("ranks", "error_ratios", "placements", "held")
 
 

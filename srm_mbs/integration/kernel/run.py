@@ -22,7 +22,7 @@ CHUNK = 0.1
 """Time (s) after which the kernel returns, so that Ctrl-C interrupts a run."""
 _STEP_RESULT = (
     *("t", "h", "state", "rates", "end_rate", "correction", "error_ratio", "sigmas", "rank"),
-    *("state_scale", "quiet", "held"),
+    *("state_scale", "quiet", "held", "stiff"),
 )
 """Fields that a :class:`StepResult` and the ``StepResult`` of the kernel have in common."""
 
@@ -97,6 +97,7 @@ class CompiledRun:
         self.kernel_system, self.method, self.norm = kernel_system, method, norm
         self.start, self.t0, self.t_end = state.copy(), t0, float(intervals.ends[-1])
         self.adaptive = step is None
+        stiff = method.scheme.stiff
         options = marshalling.options_struct(
             t0=t0,
             step=step,
@@ -111,6 +112,7 @@ class CompiledRun:
         self._run = core.Run(  # type: ignore[union-attr]
             kernel_system,
             marshalling.tableau_struct(method.scheme),
+            None if stiff is None else marshalling.tableau_struct(stiff),
             CONSTANTS,
             marshalling.norm_struct(norm),
             marshalling.state_struct(memory),
@@ -170,7 +172,8 @@ class CompiledRun:
         last = self._run.last()
         if last.in_zone or last.critical:
             return by_reference()
-        compiled = self._run.step_dense(start, *marshalling.dense_structs(scheme))
+        own = scheme.member(self._run.last().stiff)
+        compiled = self._run.step_dense(start, *marshalling.dense_structs(own))
 
         def states(times: FloatArray) -> FloatArray:
             try:

@@ -38,11 +38,14 @@ class ErrorNorm:
     negligible
         Fraction of the tolerance below which an effect is not worth an evaluation; 0 for fixed
         steps, which have no tolerance.
+    unit : (n,) or None
+        Usual sizes of the tangent components; None for :attr:`one`.
     """
 
     atol: FloatArray
     rtol: float
     negligible: float = NEGLIGIBLE
+    unit: FloatArray | None = None
 
     @property
     def one(self) -> FloatArray:
@@ -57,6 +60,35 @@ class ErrorNorm:
         """The norm of ``error`` (n,) for ``weights`` (n,)."""
         scaled = error / weights
         return float(np.sqrt(scaled @ scaled / scaled.size))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """A system linearised at the start of a step, in the chart there.
+
+    Attributes
+    ----------
+    rate : (n,)
+        The tangent rate there.
+    J : (n, n)
+        Derivatives of the chart rates by the chart coordinates.
+    by_time : (n,)
+        Their derivatives by time.
+    applied, laws : (m,)
+        What acts in place of the laws of forces there, and what they are.
+    by_coordinates : (m, n)
+        Derivatives of the laws by the chart coordinates.
+    by_laws : (n, m)
+        Derivatives of the chart rates by what acts in place of the laws.
+    """
+
+    rate: FloatArray
+    J: FloatArray
+    by_time: FloatArray
+    applied: FloatArray
+    laws: FloatArray
+    by_coordinates: FloatArray
+    by_laws: FloatArray
 
 
 @dataclass
@@ -80,6 +112,15 @@ class IntegratorState:
     lingering
         Whether the motion turns back next to a singular configuration, or is slow there, so that
         its stages are solved by nodes of the branch.
+    stiff
+        Whether the problem was found to be stiff.
+    stiff_steps, other_steps
+        Steps that speak for a change of ``stiff``, and those after the last of them that do not
+        (:mod:`srm_mbs.integration.methods.stiffness`).
+    laws : (m,) or None
+        Values of the laws of forces that linearly implicit steps carry; None after other steps.
+    linearisation
+        The equations linearised at the current state, once a step has needed them.
     """
 
     rate: FloatArray
@@ -89,6 +130,11 @@ class IntegratorState:
     sigma_slope: float = 0.0
     steps: int = 0
     lingering: bool = False
+    stiff: bool = False
+    stiff_steps: int = 0
+    other_steps: int = 0
+    laws: FloatArray | None = None
+    linearisation: Linearisation | None = None
 
     def set_first_stage(
         self, rate: FloatArray, multiplier: FloatArray, history: MultiplierHistory
@@ -149,6 +195,13 @@ class StepResult:
         Direction of the branch at an end point that its nodes solved.
     lost_branch
         Whether nodes of the branch were wanted and not found.
+    stiff
+        Whether the problem had been found to be stiff before the step.
+    laws : (m,) or None
+        The laws of forces at the end of a linearly implicit step.
+    stiffness
+        Estimate of h |lambda|, lambda the largest eigenvalue of the linearised equations; NaN if
+        the step does not show it.
     """
 
     t: float
@@ -172,6 +225,9 @@ class StepResult:
     normals: FloatArray | None = None
     away: FloatArray | None = None
     lost_branch: bool = False
+    stiff: bool = False
+    laws: FloatArray | None = None
+    stiffness: float = np.nan
 
 
 class Method(Protocol):

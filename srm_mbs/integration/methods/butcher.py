@@ -1,11 +1,22 @@
-"""Explicit Runge-Kutta schemes: validated, read-only data with their extensions.
+r"""Runge-Kutta schemes, explicit and linearly implicit: validated, read-only data with their
+extensions.
 
 A step of an s-stage scheme forms the rates K_0 ... K_{s-1} and the end state
 
     x_{n+1} = x_n (+) h sum_i b_i K_i,    K_i = f(t_n + c_i h, x_n (+) h sum_{j<i} a_ij K_j),
 
 and evaluates K_s, the rate at the end state, which is the first stage of the next step.  Tableaus
-are stored without that repeated stage, so that a step costs ``n_stages`` evaluations.
+are stored without that repeated stage, so that a step of an explicit scheme costs ``n_stages``
+evaluations.
+
+In a linearly implicit (Rosenbrock) scheme, with J = df/dx and f_t = df/dt at the start of the step,
+
+    K_i = f(t_n + c_i h, x_n (+) h sum_{j<i} a_ij K_j) + h J sum_{j<=i} g_ij K_j
+          + h (sum_j g_ij) f_t,
+
+g_ii = gamma (E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, 2nd edition,
+Springer 1996, IV.7).  Its first stages have no weight: they are the rate at the start of the step,
+so that K_0 is the same in every scheme.
 
 The schemes themselves are in :mod:`srm_mbs.integration.methods.tableaus`.
 """
@@ -147,7 +158,7 @@ class ExactTableau(_Record):
 
 @dataclass(frozen=True, eq=False)
 class ButcherTableau(_Record):
-    """An explicit Runge-Kutta scheme.
+    """A Runge-Kutta scheme, explicit or linearly implicit.
 
     Attributes
     ----------
@@ -171,6 +182,12 @@ class ButcherTableau(_Record):
         All continuous extensions by name.
     exact
         The same data in fractions; None if the scheme is not rational.
+    implicit : (s, s) or None
+        The g_ij of a linearly implicit scheme, lower triangular; None for explicit ones.
+    stable_to
+        h |lambda| up to which an explicit scheme is stable, about; None where it is not tested.
+    stiff
+        The scheme that takes over where the problem is stiff; None without one.
 
     Raises
     ------
@@ -190,6 +207,9 @@ class ButcherTableau(_Record):
     dense: DenseExtension
     extensions: Mapping[str, DenseExtension]
     exact: ExactTableau | None
+    implicit: FloatArray | None = None
+    stable_to: float | None = None
+    stiff: ButcherTableau | None = None
 
     def __post_init__(self) -> None:
         owner = f"tableau {self.name!r}"
@@ -211,6 +231,21 @@ class ButcherTableau(_Record):
             raise ValueError(f"{owner}: dense ({self.dense.name!r}) is not one of its extensions")
         for name, extension in self.extensions.items():
             self._check_extension(extension, f"{owner}: extension {name!r}")
+        if self.implicit is not None:
+            _freeze(self, owner, implicit=(s, s))
+            self._check_implicit(self.implicit, owner)
+        if self.stiff is not None and self.stiff.n_stages != s:
+            raise ValueError(f"{owner}: {self.stiff.name!r} has another number of stages")
+
+    def _check_implicit(self, implicit: FloatArray, owner: str) -> None:
+        lead = self.lead
+        diagonal = np.diagonal(implicit)
+        if np.triu(implicit, 1).any() or implicit[:, :lead].any() or implicit[:lead].any():
+            raise ValueError(f"{owner}: implicit is not that of the stages after the first")
+        if not (lead < self.n_stages and diagonal[lead] > 0.0) or np.ptp(diagonal[lead:]) > 0.0:
+            raise ValueError(f"{owner}: the diagonal of implicit is not one positive number")
+        if self.A[:, :lead].any() or self.b[:lead].any() or self.c[: lead + 1].any():
+            raise ValueError(f"{owner}: its first stages are not the rate at the start")
 
     def _check_extension(self, extension: DenseExtension, what: str) -> None:
         s, width, end = self.n_stages, extension.n_rates, extension.rows[0]
@@ -226,8 +261,20 @@ class ButcherTableau(_Record):
 
     @property
     def n_stages(self) -> int:
-        """Number of stages s, also the evaluations per step."""
+        """Number of stages s, those without weight included."""
         return int(self.b.shape[0])
+
+    @cached_property
+    def lead(self) -> int:
+        """Index of the last stage that takes the rate at the start of the step: 0 in explicit
+        schemes, in linearly implicit ones that of the first with a weight."""
+        if self.implicit is None:
+            return 0
+        return int(np.argmax(np.diagonal(self.implicit) != 0.0))
+
+    def member(self, stiff: bool) -> ButcherTableau:
+        """The scheme of a step: ``stiff`` if there is one for stiff problems, else this one."""
+        return self.stiff if stiff and self.stiff is not None else self
 
     @cached_property
     def abscissae(self) -> FloatArray:

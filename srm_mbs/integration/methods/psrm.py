@@ -13,8 +13,9 @@ from typing import cast
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
+from srm_mbs.integration.methods.linear_split_step import LinearSplitStep, SwitchingStep
 from srm_mbs.integration.methods.split_step import SplitStep
-from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.tableaus import check_explicit, get_tableau
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
 from srm_mbs.integration.methods.thesis.sweep import (
@@ -51,7 +52,8 @@ class PSRM(DelegatingMethod):
     Parameters
     ----------
     tableau
-        Name in :data:`srm_mbs.TABLEAUS`, or a :class:`ButcherTableau`.
+        Name in :data:`srm_mbs.TABLEAUS`, or a :class:`ButcherTableau`.  The sweeps are explicit:
+        their default is ``"dop853"``.
     prediction
         ``"exact"``: the multiplier of every stage from the acceleration-level equations;
         ``"simple"``: that of the step before.
@@ -80,7 +82,7 @@ class PSRM(DelegatingMethod):
         For an unknown tableau or option, a combination that does not exist, or eps <= 0.
     """
 
-    tableau: str | ButcherTableau = "dop853"
+    tableau: str | ButcherTableau = "auto"
     prediction: str = "exact"
     correction: str | None = None
     eps: float | str | None = None
@@ -101,6 +103,10 @@ class PSRM(DelegatingMethod):
                 'prediction="simple" with correction="sweep"',
             )
         checked_regulariser(self.T)
+        if self.correction != "split":
+            if self.tableau == "auto":
+                object.__setattr__(self, "tableau", "dop853")
+            check_explicit(self.scheme)
         self._interpolant()
         self.regularisation  # noqa: B018 - bad eps is refused now
 
@@ -122,7 +128,9 @@ class PSRM(DelegatingMethod):
     def stepper(self) -> Method:
         """The split form, or the sweeps of the others."""
         if self.correction == "split" or self.regularisation is None:
-            return SplitStep(self.scheme, self.regularisation)
+            scheme = self.scheme
+            linear = LinearSplitStep if scheme.implicit is not None else SplitStep
+            return (linear if scheme.stiff is None else SwitchingStep)(scheme, self.regularisation)
         fused = self.correction == "fused"
         exact = First.FUSED if fused else First.EXACT
         first = First.HELD if self.prediction == "simple" else exact

@@ -25,7 +25,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem
-from srm_mbs.dynamics.system import System
+from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA, StageNodes
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -36,15 +36,39 @@ from srm_mbs.integration.methods.near_singular import (
     WATCHED_SIGMA,
     BranchStages,
 )
+from srm_mbs.integration.methods.stiffness import chatters, count_stiffness, stiffness_of
 
 RESIDUAL_EVERY = 16
 """Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
 
 
+class Stages:
+    """How the rates of a scheme follow from the chart rates of its stages: they are the same.
+
+    Attributes
+    ----------
+    stiffness
+        As far as it is known before the step.
+    laws : (m,) or None
+        Laws of forces at the stage begun last, if the scheme carries them.
+    """
+
+    stiffness: float = np.nan
+    laws: FloatArray | None = None
+
+    def begin(self, j: int) -> None:
+        """Prepare the system for the stage ``j``."""
+
+    def rate(self, j: int, rate: FloatArray) -> FloatArray:
+        """The rate (n,) of the stage ``j`` in the scheme, from the chart rate."""
+        return rate
+
+
 @lru_cache(maxsize=64)
 def later_stages(scheme: ButcherTableau) -> tuple[FloatArray, list[float]]:
-    """Weights (s, s) and abscissae (s,) of the stages after the first, and of the end."""
-    return np.vstack([scheme.A[1:], scheme.b]), [*scheme.c[1:].tolist(), 1.0]
+    """Weights (k, s) and abscissae (k,) of the stages after the first, and of the end."""
+    first = scheme.lead + 1
+    return np.vstack([scheme.A[first:], scheme.b]), [*scheme.c[first:].tolist(), 1.0]
 
 
 @dataclass(frozen=True)
@@ -61,6 +85,26 @@ class SplitStep:
 
     scheme: ButcherTableau
     eps: Callable[[float], float] | None = None
+
+    @property
+    def uses_nodes(self) -> bool:
+        """Whether stages of lingering motions are solved by nodes of the branch."""
+        return self.eps is None
+
+    def stage_rates(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+        zone: Zone | None,
+        rates: FloatArray,
+    ) -> Stages:
+        """The stages of one step; ``rates`` (s + 1, n) receives the rates of those at its start."""
+        rates[0] = memory.rate
+        return Stages()
 
     def start(
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm
@@ -92,7 +136,7 @@ class SplitStep:
         zone = None
         if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
             weights = norm.weights(memory.state_scale)
-            if memory.lingering and theta == 1.0 and isinstance(system, ClosedSystem):
+            if memory.lingering and self.uses_nodes and isinstance(system, ClosedSystem):
                 nodes = StageNodes(system, t, state, history.away)
             lingers = nodes is not None
             branch = BranchStages(
@@ -103,12 +147,15 @@ class SplitStep:
         # Stages.  Zeros, because each stage weighs all s rates: those still to come with 0.
         rates = np.zeros((s + 1, system.tangent_size))
         weighed = rates[:s]
-        rates[0] = memory.rate
-        all_sigmas = [start]
+        first = scheme.lead + 1
+        stages = self.stage_rates(system, t, h, state, memory, norm, zone, rates)
+        all_sigmas = [start] * first
         deficient: list[tuple[int, int, bool]] = []
-        for j, stage_weights, fraction in zip(range(1, s + 1), h * all_weights, fractions):
-            delta = stage_weights.dot(weighed)
+        delta = np.zeros(system.tangent_size)
+        for j, stage_weights, fraction in zip(range(first, s + 1), h * all_weights, fractions):
+            before, delta = delta, stage_weights.dot(weighed)
             x = system.retract(state, delta)
+            stages.begin(j)
             time = t + fraction * h
             terms = system.evaluate(time, x, zone if nodes is None else None)
             all_sigmas.append(terms.sigma)
@@ -123,7 +170,8 @@ class SplitStep:
             if branch is not None:
                 terms, x, moved = branch(terms, time, fraction, x)
             rate = terms.rate()
-            rates[j] = system.chart_rate(delta, rate)
+            chart_rate = system.chart_rate(delta, rate)
+            rates[j] = chart_rate if j == s else stages.rate(j, chart_rate)
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
         sigma = all_sigmas[-1]
@@ -160,6 +208,9 @@ class SplitStep:
         if scheme.error is not None:
             error = h * (scheme.error @ rates)
             weights = norm.weights(np.maximum(memory.state_scale, state_scale))
+            if scheme.implicit is not None:
+                k = system.multiplier_part.start
+                weights = np.minimum(weights, system.friction_tolerance(end_rate[:k]))
             if branch is not None and history is not None:
                 if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:
                     error = np.abs(error)
@@ -183,7 +234,20 @@ class SplitStep:
             rank=terms.rank,
             state_scale=state_scale,
             multiplier=multiplier,
+            stiff=memory.stiff,
+            stiffness=stages.stiffness,
+            laws=stages.laws,
         )
+        explicit = scheme.stable_to is not None and branch is None and norm.negligible > 0.0
+        if explicit:
+            change_of_rate = rates[s] - rates[s - 1]
+            result.stiffness = stiffness_of(system, h, delta - before, change_of_rate)
+        if explicit or scheme.implicit is not None:
+            k = system.multiplier_part.start
+            v = np.array([memory.rate[:k], end_rate[:k]])
+            rubs = np.isfinite(system.friction_tolerance(end_rate[:k])[k:])
+            if chatters(h, v, rates[:, k:], norm.weights(memory.state_scale)[k:], rubs):
+                result.stiffness = np.inf
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
         if due and history is not None and theta == 1.0 and away is None:
             result.constraint_residual = terms.constraint_residual()
@@ -207,8 +271,10 @@ class SplitStep:
         memory.rate = result.end_rate
         memory.sigma = float(result.sigmas[-1])
         memory.state_scale = result.state_scale
+        memory.linearisation, memory.laws = None, result.laws
         if memory.history is not None:
             memory.history = history_after(memory.history, result)
+        count_stiffness(memory, result.stiffness, self.scheme)
 
     def resume(
         self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
@@ -216,6 +282,8 @@ class SplitStep:
         """``memory`` after a breakpoint; see :class:`~srm_mbs.integration.methods.base.Method`."""
         fresh = self.start(system, t, state, norm)
         fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
+        fresh.stiff, fresh.stiff_steps = memory.stiff, memory.stiff_steps
+        fresh.other_steps = memory.other_steps
         return fresh
 
 

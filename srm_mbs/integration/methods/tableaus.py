@@ -3,12 +3,13 @@
 Sources: C. B. Macdonald, *The Predicted Sequential Regularization Method for DAEs*, Acadia
 University 2001, appendix C (with a_62 = -355/33 and a_64 = 49/176 of dopr54 corrected); E. Hairer,
 S. P. Norsett, G. Wanner, *Solving Ordinary Differential Equations I*, 2nd edition, Springer 1993
-(HNW below).
+(HNW below); G. Steinebach, BIT Numer. Math. 63 (2023) 27.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from types import MappingProxyType
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, safe_repr
-from srm_mbs.integration.methods import dop853_coefficients
+from srm_mbs.integration.methods import dop853_coefficients, rodas5p_coefficients
 from srm_mbs.integration.methods.butcher import (
     ButcherTableau,
     DenseExtension,
@@ -45,6 +46,23 @@ def get_tableau(name: str | ButcherTableau) -> ButcherTableau:
             remedy=f"Known: {', '.join(TABLEAUS)}",
         )
     return tableau
+
+
+def check_explicit(scheme: ButcherTableau) -> None:
+    """Refuse a scheme that is not explicit, or not always, for sweeps.
+
+    Raises
+    ------
+    InputError
+        If it is linearly implicit, or one for stiff problems takes over from it.
+    """
+    if scheme.implicit is not None or scheme.stiff is not None:
+        explicit = [name for name, known in TABLEAUS.items() if known.member(True).implicit is None]
+        raise InputError(
+            f"sweeps are explicit, the tableau {scheme.name!r} is not",
+            element="tableau",
+            remedy=f"Use one of {', '.join(explicit)}",
+        )
 
 
 def _fractions(text: str) -> ExactRow:
@@ -82,6 +100,7 @@ def _rational(
     c: str,
     pair: tuple[str, int, int] | None = None,
     extensions: Mapping[str, tuple[int, int, ExactMatrix]] | None = None,
+    stable_to: float | None = None,
 ) -> ButcherTableau:
     """Build a tableau from fractions in text.
 
@@ -123,6 +142,7 @@ def _rational(
         dense=next(iter(dense.values())),
         extensions=dense,
         exact=exact,
+        stable_to=stable_to,
     )
 
 
@@ -166,6 +186,7 @@ def _dopr54() -> ButcherTableau:
             "C1": (4, 1, (*_hermite(_fractions(b)), d)),
             "thesis": (4, 0, tuple(zip(*columns, strict=True))),
         },
+        stable_to=3.25,
     )
 
 
@@ -195,6 +216,42 @@ def _dop853() -> ButcherTableau:
         dense=dense,
         extensions={dense.name: dense},
         exact=None,
+        stable_to=6.1,
+    )
+
+
+def _rodas5p() -> ButcherTableau:
+    own = rodas5p_coefficients
+    count = len(own.B)
+    s = len(dop853_coefficients.B)  # as many, so that both schemes can alternate in one run
+    lead = s - count
+
+    def square(rows: Sequence[Sequence[float]]) -> FloatArray:
+        out = np.zeros((s, s))
+        for i, row in enumerate(rows, lead):
+            out[i, lead : lead + len(row)] = row
+        return out
+
+    def weights(values: Sequence[float]) -> list[float]:
+        return [*[0.0] * lead, *values, 0.0]
+
+    rows = np.array([weights(row) for row in (own.B, *own.D)])
+    dense = DenseExtension("rodas5p", 4, 0, rows, np.zeros((0, s + 1)), np.zeros(0))
+    return ButcherTableau(
+        name="rodas5p",
+        order=5,
+        citation="Rodas5P, linearly implicit and stiffly accurate, with a pair of order 4: "
+        "G. Steinebach, BIT Numer. Math. 63 (2023) 27",
+        A=square(own.A),
+        b=np.array(weights(own.B)[:-1]),
+        c=np.array([*[0.0] * lead, *own.C]),
+        error=np.array(weights(own.E)),
+        embedded_order=4,
+        controller_order=5,
+        dense=dense,
+        extensions={dense.name: dense},
+        exact=None,
+        implicit=square(own.G),
     )
 
 
@@ -222,10 +279,13 @@ _ALL = (
     ),
     _dopr54(),
     _dop853(),
+    _rodas5p(),
+    replace(_dop853(), name="auto", stiff=_rodas5p()),
 )
 
 TABLEAUS: Mapping[str, ButcherTableau] = MappingProxyType({t.name: t for t in _ALL})
-"""Every scheme by name, read-only: fe, trap, heun, tvd32, erk4, dopr54, dop853.
+"""Every scheme by name, read-only: fe, trap, heun, tvd32, erk4, dopr54, dop853, the linearly
+implicit rodas5p, and auto, which is dop853 and, where the problem is stiff, rodas5p.
 
 The names are the thesis': its heun is the explicit midpoint rule, c = (0, 1/2), b = (0, 1), and its
 trap, c = (0, 1), b = (1/2, 1/2), is what is often called Heun's method elsewhere.

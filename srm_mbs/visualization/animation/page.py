@@ -128,8 +128,7 @@ def sigma_at(solution: SimulationResult, times: FloatArray) -> FloatArray:
     and zero at the singular passages, which lie between stages.
     """
     steps, passages = solution.steps, [crossing.time for crossing in solution.crossings]
-    abscissae = np.append(solution.scheme.c, 1.0)
-    stages = steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]
+    stages = steps.stage_times(solution.scheme)
     known, sigmas = np.append(stages, passages), np.append(steps.sigmas, np.zeros(len(passages)))
     order = np.argsort(known, kind="stable")
     return np.interp(times, known[order], sigmas[order])

@@ -110,8 +110,7 @@ def _sigma(axes: Axes, solution: Run, log: bool) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=not log)
     # A line through every stage: stages show the dip of sigma at a passage that steps jump over.
-    abscissae = np.append(solution.scheme.c, 1.0)
-    times = (steps.times[:-1, None] + abscissae * np.diff(steps.times)[:, None]).ravel()
+    times = steps.stage_times(solution.scheme).ravel()
     sigmas, note = finite(steps.sigmas), ""
     if log:
         sigmas, note = above_zero(steps.sigmas, SMALLEST_SIGMA)

@@ -92,7 +92,9 @@ def test_steps_of_another_shape_are_refused() -> None:
     solution = srm.simulate(load("four_bar"), 1.0, backend="kernel")
     steps, extension = solution.steps, solution.scheme.dense
     given = fields(marshalling.steps_struct(steps))
-    abscissae = np.append(solution.scheme.c, 1.0)
+    schemes = [
+        (np.append(solution.scheme.c, 1.0).tolist(), marshalling.extension_struct(extension))
+    ]
     for name in ("states", "rates", "sigmas", "corrections", "end_rate"):
         array = getattr(steps, name)
         wrong = core.StepArrays(**given | {name: np.ascontiguousarray(array[..., 1:])})
@@ -100,8 +102,7 @@ def test_steps_of_another_shape_are_refused() -> None:
             core.DenseOutput(
                 3,
                 3,
-                abscissae,
-                marshalling.extension_struct(extension),
+                schemes,
                 marshalling.dense_constants(),
                 wrong,
             )
@@ -112,7 +113,8 @@ def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) ->
     values = np.arange(12.0).reshape(4, 3)
     away = None if normals is None else np.arange(3.0)
     history = MultiplierHistory(np.arange(4.0), values, 2.5, 1e-3, normals, away)
-    given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7, True)
+    given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7, True, True, 3, 2)
+    given.laws = np.arange(2.0)
     found = marshalling.state_from(marshalling.state_struct(given))
     assert found.history is not None
     for name in ("times", "values", "normals", "away"):
@@ -120,6 +122,9 @@ def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) ->
     assert (found.history.known_until, found.history.known_below) == (2.5, 1e-3)
     assert (found.sigma, found.sigma_slope, found.steps) == (0.5, 0.25, 7)
     assert found.lingering
+    assert (found.stiff, found.stiff_steps, found.other_steps) == (True, 3, 2)
+    assert found.laws is not None
+    np.testing.assert_array_equal(found.laws, given.laws)
     np.testing.assert_array_equal(found.rate, given.rate)
 
 

@@ -28,10 +28,15 @@ from tests.support.convergence import fitted_order
 Tree = tuple["Tree", ...]  # the subtrees that hang on the root
 Array = np.ndarray[Any, np.dtype[Any]]  # of fractions (objects) or floats
 
+EXPLICIT = {
+    name: tableau
+    for name, tableau in TABLEAUS.items()
+    if tableau.implicit is None and tableau.stiff is None
+}
 RATIONAL = [name for name, tableau in TABLEAUS.items() if tableau.exact is not None]
-PAIRS = [name for name, tableau in TABLEAUS.items() if tableau.error is not None]
+PAIRS = [name for name, tableau in EXPLICIT.items() if tableau.error is not None]
 RATIONAL_PAIRS = [name for name in PAIRS if name in RATIONAL]
-EXTENSIONS = [(name, key) for name, t in TABLEAUS.items() for key in t.extensions]
+EXTENSIONS = [(name, key) for name, t in EXPLICIT.items() for key in t.extensions]
 RATIONAL_EXTENSIONS = [(name, key) for name, key in EXTENSIONS if name in RATIONAL]
 WHOLE_STEP = Fraction(1)
 TIGHT = 3e-13  # rounding leaves 7e-14; a relative change of 1e-10 in any number of dop853 shows
@@ -188,8 +193,56 @@ def test_the_floats_of_a_rational_scheme_are_its_fractions_rounded_once(name: st
 
 
 def test_a_step_costs_as_many_evaluations_as_published() -> None:
-    assert list(TABLEAUS) == ["fe", "trap", "heun", "tvd32", "erk4", "dopr54", "dop853"]
-    assert [tableau.n_stages for tableau in TABLEAUS.values()] == [1, 2, 2, 3, 4, 6, 12]
+    assert list(EXPLICIT) == ["fe", "trap", "heun", "tvd32", "erk4", "dopr54", "dop853"]
+    assert [tableau.n_stages for tableau in EXPLICIT.values()] == [1, 2, 2, 3, 4, 6, 12]
+    rodas5p = TABLEAUS["rodas5p"]
+    assert rodas5p.n_stages - rodas5p.lead == 8
+
+
+class LinearStages(Stages):
+    """Elementary weights of a linearly implicit scheme (Hairer and Wanner II, IV.7): a node with
+    one child weighs it by alpha + gamma, one with several by alpha."""
+
+    def __init__(self, tableau: ButcherTableau) -> None:
+        assert tableau.implicit is not None
+        super().__init__(tableau.A)
+        self.B = tableau.A + tableau.implicit
+
+    def phi(self, tree: Tree) -> Array:
+        if tree not in self.known:
+            weights = self.B if len(tree) == 1 else self.A
+            self.known[tree] = np.multiply.reduce([weights @ self.phi(child) for child in tree])
+        return self.known[tree]
+
+
+def test_rodas5p_satisfies_all_conditions_of_order_five_but_not_order_six() -> None:
+    tableau = TABLEAUS["rodas5p"]
+    assert tableau.implicit is not None
+    assert tableau.error is not None
+    stages = LinearStages(tableau)
+    assert sum(len(stages.residuals(tableau.b, p)) for p in range(1, 6)) == 17
+    assert stages.holds_to(5, tableau.b, tolerance=TIGHT)
+    assert not stages.holds_to(6, tableau.b, tolerance=1e-4)
+    embedded = tableau.b - tableau.error[:-1]
+    assert stages.holds_to(4, embedded, tolerance=TIGHT)
+    assert not stages.holds_to(5, embedded, tolerance=1e-4)
+    for theta in THETAS:
+        weights = tableau.dense.weights(float(theta))[0][:-1]
+        assert stages.holds_to(4, weights, theta, tolerance=1e-12)
+    # Stiffly accurate: the last stage is the step.
+    whole = tableau.A + tableau.implicit
+    np.testing.assert_allclose(whole[-1], tableau.b, rtol=0.0, atol=1e-14)
+
+
+def test_auto_is_dop853_with_rodas5p_for_stiff_problems() -> None:
+    auto, dop853 = TABLEAUS["auto"], TABLEAUS["dop853"]
+    assert auto.stiff is not None
+    assert auto.stiff.name == "rodas5p"
+    assert np.array_equal(auto.A, dop853.A)
+    assert np.array_equal(auto.b, dop853.b)
+    assert auto.member(True) is auto.stiff
+    assert auto.member(False) is auto
+    assert dop853.member(True) is dop853
 
 
 def test_heun_is_the_explicit_midpoint_rule_of_the_thesis() -> None:
@@ -295,11 +348,11 @@ def test_theta_may_be_a_scalar_or_a_vector_but_no_matrix() -> None:
 
 
 def test_the_default_extension_is_smooth_and_dopr54_also_has_that_of_the_thesis() -> None:
-    defaults = {name: tableau.dense.name for name, tableau in TABLEAUS.items()}
+    defaults = {name: tableau.dense.name for name, tableau in EXPLICIT.items()}
     hermite = dict.fromkeys(["fe", "trap", "heun", "tvd32", "erk4"], "hermite")
     assert defaults == {**hermite, "dopr54": "C1", "dop853": "dop853"}
     assert list(TABLEAUS["dopr54"].extensions) == ["C1", "thesis"]
-    assert all(tableau.dense.continuity == 1 for tableau in TABLEAUS.values())
+    assert all(tableau.dense.continuity == 1 for tableau in EXPLICIT.values())
 
 
 # Behaviour on x' = cos t + sin^2 t - x^2, x = sin t

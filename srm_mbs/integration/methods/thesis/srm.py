@@ -18,6 +18,7 @@ import numpy as np
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.tableaus import check_explicit
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
 from srm_mbs.integration.methods.thesis.sweep import checked_regulariser, interpolant
@@ -92,6 +93,7 @@ class SRM(DelegatingMethod):
     interpolation: str = "auto"
 
     def __post_init__(self) -> None:
+        check_explicit(self.scheme)
         order, m = self.scheme.order, self.iterations
         if m is None:
             m = min(order, LARGEST_CARRIED) if self.carry else order

@@ -1,0 +1,219 @@
+#include "linear_stages.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "errors.hpp"
+#include "linear.hpp"
+
+namespace srm {
+
+namespace {
+
+// The power of 2 up to `size`: a step that a sum with a coordinate does not round.
+double rounded_down(double size) {
+    int exponent = 0;
+    std::frexp(size, &exponent);
+    return std::ldexp(0.5, exponent);
+}
+
+}  // namespace
+
+LinearStages::LinearStages(System& system, double gamma, std::vector<double> unit,
+                           const Constants& constants)
+    : system_(system),
+      nv_(system.nv),
+      n_(2 * system.nv),
+      count_(system.resolve_laws()),
+      gamma_(gamma),
+      unit_(std::move(unit)),
+      constants_(constants),
+      known_state_(system.nq + system.nv),
+      known_rate_(n_),
+      rate_(n_),
+      by_time_(n_),
+      applied_(count_),
+      laws_(count_),
+      B_(nv_ * nv_),
+      C_(nv_ * nv_),
+      D_(nv_ * nv_),
+      L_(count_ * n_),
+      W_(count_ * nv_),
+      S_(nv_ * nv_),
+      CS_(nv_ * nv_),
+      factors_(nv_ * nv_),
+      pivots_(nv_),
+      x_(system.nq + system.nv),
+      delta_(n_),
+      probe_(n_),
+      other_(n_),
+      work_(n_) {}
+
+void LinearStages::prepare(double t, double h, const double* state,
+                           const std::vector<double>& rate,
+                           const std::vector<double>& state_scale,
+                           const std::vector<double>& laws, const System::ZoneView& zone) {
+    const bool same = known_ && known_time_ == t && known_rate_ == rate && known_laws_ == laws &&
+                      std::equal(known_state_.begin(), known_state_.end(), state);
+    if (!same) {
+        known_ = false;
+        linearise(t, h, state, state_scale, laws, zone);
+        known_time_ = t;
+        known_rate_ = rate;
+        known_laws_ = laws;
+        std::copy_n(state, known_state_.size(), known_state_.begin());
+        known_ = true;
+    }
+    factorise(h * gamma_);
+}
+
+void LinearStages::linearise(double t, double h, const double* state,
+                             const std::vector<double>& state_scale,
+                             const std::vector<double>& laws, const System::ZoneView& zone) {
+    const int nv = nv_, n = n_, m = count_;
+    if (!laws.empty()) expect_size("laws", laws.size(), static_cast<std::size_t>(m));
+    const auto rate_at = [&](double time, const double* x, double* out) {
+        system_.evaluate(time, x, zone);
+        system_.rate(out);
+    };
+    // The rate of the memory is the one before the last correction, which stiff forces notice.
+    system_.apply_laws(laws.empty() ? nullptr : laws.data());
+    rate_at(t, state, rate_.data());
+    laws_ = system_.law_values();
+    applied_ = laws.empty() ? laws_ : laws;
+    system_.apply_laws(m ? applied_.data() : nullptr);
+    std::fill(delta_.begin(), delta_.end(), 0.0);
+    for (int j = 0; j < n; ++j) {
+        const double step =
+            rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
+        delta_[j] = step;
+        system_.retract(state, delta_.data(), x_.data());
+        rate_at(t, x_.data(), probe_.data());
+        const bool position = j < nv;
+        if (position) {
+            system_.chart_rate(delta_.data(), probe_.data(), other_.data());
+            for (int i = 0; i < nv; ++i) B_[j * nv + i] = (other_[i] - rate_[i]) / step;
+        }
+        double* const column = position ? &C_[j * nv] : &D_[(j - nv) * nv];
+        for (int i = 0; i < nv; ++i) column[i] = (probe_[nv + i] - rate_[nv + i]) / step;
+        for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / step;
+        delta_[j] = 0.0;
+    }
+    std::fill(by_time_.begin(), by_time_.end(), 0.0);
+    if (system_.time_dependent()) {
+        const double spacing =
+            std::nextafter(std::abs(t), std::numeric_limits<double>::infinity()) - std::abs(t);
+        const double tau = rounded_down(
+            std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
+        rate_at(t + tau, state, probe_.data());
+        rate_at(t + 2.0 * tau, state, other_.data());
+        for (int i = 0; i < n; ++i)
+            by_time_[i] =
+                (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
+    }
+    // Accelerations are linear in the laws that act.
+    const double change = std::max(1.0, largest(applied_.data(), m));
+    for (int k = 0; k < m; ++k) {
+        const double before = applied_[k];
+        applied_[k] += change;
+        rate_at(t, state, probe_.data());
+        applied_[k] = before;
+        for (int i = 0; i < nv; ++i)
+            W_[k * nv + i] = (probe_[nv + i] - rate_[nv + i]) / change;
+    }
+    for (int j = 0; j < n; ++j) {
+        double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
+        for (int k = 0; k < m; ++k)
+            if (L_[j * m + k] != 0.0) add(L_[j * m + k], &W_[k * nv], column, nv);
+    }
+}
+
+void LinearStages::factorise(double k) {
+    const int nv = nv_;
+    k_ = k;
+    CS_ = C_;
+    for (const GroupJoint& joint : system_.groups()) {
+        // The inverse of one block, and its product with the columns of C.
+        const int size = joint.size, first = joint.start;
+        double block[36], inverse[36];
+        int pivots[6];
+        for (int j = 0; j < size; ++j)
+            for (int i = 0; i < size; ++i) {
+                block[j * size + i] = (i == j ? 1.0 : 0.0) - k * B_[(first + j) * nv + first + i];
+                inverse[j * size + i] = i == j ? 1.0 : 0.0;
+            }
+        if (!lu_factor(block, size, pivots)) throw EvaluationError{Failure::acceleration};
+        for (int j = 0; j < size; ++j) {
+            lu_solve(block, size, pivots, &inverse[j * size]);
+            std::copy_n(&inverse[j * size], size, &S_[(first + j) * nv + first]);
+            double* const column = &CS_[(first + j) * nv];
+            std::fill_n(column, nv, 0.0);
+            for (int i = 0; i < size; ++i)
+                add(inverse[j * size + i], &C_[(first + i) * nv], column, nv);
+        }
+    }
+    for (int j = 0; j < nv; ++j) {
+        double* const column = &factors_[j * nv];
+        for (int i = 0; i < nv; ++i)
+            column[i] = -k * (D_[j * nv + i] + k * CS_[j * nv + i]);
+        column[j] += 1.0;
+    }
+    if (!lu_factor(factors_.data(), nv, pivots_.data()))
+        throw EvaluationError{Failure::acceleration};
+}
+
+void LinearStages::solve(double* x, const double* laws, const double* applied,
+                         double* law_rates) {
+    const int nv = nv_, m = count_;
+    double* const y = x + nv;
+    for (int k = 0; k < m; ++k) add(laws[k] - applied[k], &W_[k * nv], y, nv);
+    for (int j = 0; j < nv; ++j)
+        if (x[j] != 0.0) add(k_ * x[j], &CS_[j * nv], y, nv);
+    lu_solve(factors_.data(), nv, pivots_.data(), y);
+    for (int i = 0; i < nv; ++i) x[i] += k_ * y[i];
+    for (const GroupJoint& joint : system_.groups()) {
+        double out[6] = {};
+        for (int j = 0; j < joint.size; ++j)
+            add(x[joint.start + j], &S_[(joint.start + j) * nv + joint.start], out, joint.size);
+        std::copy_n(out, joint.size, x + joint.start);
+    }
+    for (int k = 0; k < m; ++k) law_rates[k] = (laws[k] - applied[k]) / k_;
+    for (int j = 0; j < n_; ++j) add(x[j], &L_[j * m], law_rates, m);
+}
+
+void LinearStages::multiply(const std::vector<double>& x, std::vector<double>& out) const {
+    const int nv = nv_;
+    for (int i = 0; i < nv; ++i) {
+        out[i] = x[nv + i];
+        out[nv + i] = 0.0;
+    }
+    for (int j = 0; j < nv; ++j) {
+        add(x[j], &B_[j * nv], out.data(), nv);
+        add(x[j], &C_[j * nv], &out[nv], nv);
+        add(x[nv + j], &D_[j * nv], &out[nv], nv);
+    }
+}
+
+double LinearStages::stiffness(double h) {
+    const int nv = nv_, n = n_, count = constants_.power_iterations;
+    const auto scale = [&](int i) { return i < nv ? unit_[i] : unit_[i - nv] / h; };
+    const auto size = [&](const std::vector<double>& x) {
+        double out = 0.0;
+        for (int i = 0; i < n; ++i) out = std::max(out, std::abs(x[i]) / scale(i));
+        return out;
+    };
+    for (int i = 0; i < n; ++i) work_[i] = i % 2 ? -scale(i) : scale(i);
+    for (int iteration = 0; iteration < count; ++iteration) {
+        if (iteration == count - 2) {
+            const double last = size(work_);
+            if (!(last > 0.0)) return 0.0;
+            for (double& value : work_) value /= last;
+        }
+        multiply(work_, other_);
+        for (int i = 0; i < n; ++i) work_[i] = h * other_[i];
+    }
+    return std::sqrt(size(work_));
+}
+
+}  // namespace srm

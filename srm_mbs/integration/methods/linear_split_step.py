@@ -1,0 +1,236 @@
+r"""The linearly implicit step of the split PSRM, for stiff problems.
+
+The stages integrate the equations of :mod:`srm_mbs.integration.methods.split_step`, in the chart
+at the start of the step, where x = x_n (+) delta and delta' = D(t, delta).  With
+J = dD/d delta and D_t there, the rate of the stage i is
+
+    (1 - h gamma J) (K_i + w_i) = D(t_i, h sum_{j<i} a_ij K_j) + w_i + h (sum_j g_ij) D_t,
+    w_i = sum_{j<i} g_ij K_j / gamma
+
+(G. Steinebach, BIT Numer. Math. 63 (2023) 27; E. Hairer, G. Wanner, *Solving Ordinary Differential
+Equations II*, 2nd edition, Springer 1996, IV.7).  The order depends on J: it is found anew at every
+accepted state, by one-sided differences.
+
+**Laws of forces.**  Dampers, springs, bushings and friction act along directions N(q) that turn
+with the configuration: f = f_0(q, v, t) + N(q) y, y = F(q, v).  Evaluated at stages, a law of a
+large constant c errs by c h^2, and steps would shrink like c^(-1/4).  So its value y is a variable
+of its own: 0 = F(q, v) - y is linearised like the other equations (the same reference, VI.3), the
+stages evaluate the forces with their own y, and what is nonlinear no longer contains c.  With
+L = dF/d delta and W = dD/dy the full J is that with y held, plus W L; what a stage's law lacks,
+r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) + L (K + w) - w_y.
+
+Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
+only stages of motions that linger next to a singular configuration are not solved by nodes of the
+branch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.system import System, Zone
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
+from srm_mbs.integration.methods.split_step import SplitStep, Stages
+from srm_mbs.integration.methods.stiffness import largest_eigenvalue
+
+DIFFERENCE = 2.0**-26
+"""Step of a difference by a coordinate, over its size: the root of the rounding."""
+TIME_DIFFERENCE = 2.0**-17
+"""Step of a difference by time, over that of the integration: the third root of the rounding,
+because that difference is of second order."""
+SHORTEST_DIFFERENCE = 64.0
+"""Shortest step of a difference by time, in units of rounding of the time."""
+
+
+def rounded_down(sizes: FloatArray) -> FloatArray:
+    """The powers of 2 up to ``sizes``: steps that a sum with a coordinate does not round."""
+    return np.ldexp(0.5, np.frexp(sizes)[1])
+
+
+def linearised(
+    system: System,
+    t: float,
+    h: float,
+    state: FloatArray,
+    memory: IntegratorState,
+    norm: ErrorNorm,
+    zone: Zone | None,
+) -> Linearisation:
+    """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s)."""
+    n, k = system.tangent_size, system.multiplier_part.start
+    unit = norm.one if norm.unit is None else norm.unit
+
+    def rate_at(time: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rate = system.evaluate(time, x, zone).rate().copy()
+        return rate, system.laws
+
+    # The rate of the memory is the one before the last correction, which stiff forces notice.
+    system.apply_laws(memory.laws)
+    rate, laws = rate_at(t, state)
+    applied = laws if memory.laws is None else memory.laws
+    m = len(applied)
+    system.apply_laws(applied if m else None)
+    steps = rounded_down(DIFFERENCE * np.maximum(unit, memory.state_scale))
+    J, by_coordinates = np.empty((n, n)), np.empty((m, n))
+    for j, step in enumerate(steps.tolist()):
+        delta = np.zeros(n)
+        delta[j] = step
+        there, own = rate_at(t, system.retract(state, delta))
+        J[:, j] = (system.chart_rate(delta, there) - rate) / step
+        by_coordinates[:, j] = (own - laws) / step
+    by_time = np.zeros(n)
+    if system.time_dependent:
+        shortest = SHORTEST_DIFFERENCE * np.spacing(abs(t))
+        tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
+        first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
+        by_time = (4.0 * first - second) / (2.0 * tau)
+    # Accelerations are linear in what acts in place of the laws.
+    change = max(1.0, float(np.abs(applied).max(initial=0.0)))
+    by_laws = np.zeros((n, m))
+    for i in range(m):
+        system.apply_laws(applied + change * (np.arange(m) == i))
+        by_laws[k:, i] = (rate_at(t, state)[0] - rate)[k:] / change
+    J += by_laws @ by_coordinates
+    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws)
+
+
+class LinearStages(Stages):
+    """The stages of one linearly implicit step.
+
+    Parameters
+    ----------
+    rate_of
+        (stage, its chart rate (n,), the laws there (m,)) -> its rate (n,) in the scheme.
+    apply
+        Lets the laws of a stage act, which it returns (m,).
+    """
+
+    def __init__(
+        self,
+        system: System,
+        rate_of: Callable[[int, FloatArray, FloatArray], FloatArray],
+        apply: Callable[[int], FloatArray],
+        stiffness: float,
+    ) -> None:
+        self._system, self._rate_of, self._apply = system, rate_of, apply
+        self.stiffness = stiffness
+
+    def begin(self, j: int) -> None:
+        """See :class:`Stages`."""
+        self.laws = self._apply(j)
+
+    def rate(self, j: int, rate: FloatArray) -> FloatArray:
+        """See :class:`Stages`."""
+        return self._rate_of(j, rate, self._system.laws)
+
+
+@dataclass(frozen=True)
+class LinearSplitStep(SplitStep):
+    """Steps of a linearly implicit ``scheme``; see :class:`SplitStep`."""
+
+    @property
+    def uses_nodes(self) -> bool:
+        """No: see the module."""
+        return False
+
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        try:
+            return super().step(system, t, h, state, memory, norm)
+        finally:
+            system.apply_laws(None)
+
+    @property
+    def _implicit(self) -> FloatArray:
+        """The g_ij of the scheme."""
+        if self.scheme.implicit is None:
+            raise ValueError(f"the tableau {self.scheme.name!r} is explicit")
+        return self.scheme.implicit
+
+    def stage_rates(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+        zone: Zone | None,
+        rates: FloatArray,
+    ) -> Stages:
+        """See :class:`SplitStep`; the equations are linearised here."""
+        from scipy.linalg import lu_factor, lu_solve
+
+        scheme, n, implicit = self.scheme, system.tangent_size, self._implicit
+        lead, end = scheme.lead, scheme.n_stages
+        known = memory.linearisation
+        if known is None:
+            known = linearised(system, t, h, state, memory, norm, zone)
+            memory.linearisation = known
+        gamma = float(implicit[lead, lead])
+        factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)
+        before = np.tril(implicit, -1) / gamma
+        time_shares = h * implicit.sum(axis=1)
+        law_rates = np.zeros((end, len(known.laws)))
+
+        def apply(j: int) -> FloatArray:
+            """Let the laws of the stage ``j`` act, or at the end those of the end state itself."""
+            weights = scheme.A[j] if j < end else scheme.b
+            applied = known.applied + h * weights @ law_rates
+            system.apply_laws(applied if j < end and len(applied) else None)
+            return applied
+
+        def rate_of(j: int, rate: FloatArray, laws: FloatArray) -> FloatArray:
+            w, law_w = before[j] @ rates[:end], before[j] @ law_rates
+            missing = laws - (known.applied + h * scheme.A[j] @ law_rates)
+            given = rate + w + time_shares[j] * known.by_time + known.by_laws @ missing
+            solved = np.asarray(lu_solve(factors, given, check_finite=False), dtype=np.float64)
+            law_rates[j] = missing / (h * gamma) + known.by_coordinates @ solved - law_w
+            return np.asarray(solved - w)
+
+        rates[:lead] = known.rate
+        rates[lead] = rate_of(lead, known.rate, known.laws)
+        unit = norm.one if norm.unit is None else norm.unit
+        k = system.multiplier_part.start
+        stiffness = largest_eigenvalue(known.J, h, unit, k)
+        return LinearStages(system, rate_of, apply, stiffness)
+
+
+@dataclass(frozen=True)
+class SwitchingStep(SplitStep):
+    """Steps of ``scheme``, and where the problem is stiff those of its scheme for that."""
+
+    def _stepper(self, stiff: bool) -> SplitStep:
+        return LinearSplitStep(self.scheme.member(True), self.eps) if stiff else self._explicit
+
+    @property
+    def _explicit(self) -> SplitStep:
+        return SplitStep(self.scheme, self.eps)
+
+    def step(
+        self,
+        system: System,
+        t: float,
+        h: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+    ) -> StepResult:
+        """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
+        return self._stepper(memory.stiff).step(system, t, h, state, memory, norm)
+
+    def accept(self, memory: IntegratorState, result: StepResult) -> None:
+        """Move ``memory`` to the end of an accepted step."""
+        self._stepper(result.stiff).accept(memory, result)

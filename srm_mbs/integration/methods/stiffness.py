@@ -1,0 +1,109 @@
+r"""Whether a problem is stiff: seen from its explicit steps, and from its linearised equations.
+
+The last two stages of an explicit step, the end point among them, lie at the same time.  In a
+stiff problem their arguments differ along the fastest mode, by (dq, dv), and their rates by
+(dv, da).  With lambda the eigenvalue of the mode, |da| = |lambda| |dv| = |lambda|^2 |dq|.  Both
+ratios have to show it: a vibration that steps follow has every ratio |da| / |dv|, depending on its
+phase.
+Counted are steps with h |lambda| beyond the bound of stability (E. Hairer, G. Wanner, *Solving
+Ordinary Differential Equations II*, 2nd edition, Springer 1996, IV.2).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.methods.base import IntegratorState
+from srm_mbs.integration.methods.butcher import ButcherTableau
+
+STIFF_STEPS = 15
+"""Steps that show that a problem is stiff, or that it no longer is."""
+OTHER_STEPS = 6
+"""Steps in a row that show no stiffness, after which those before count no more."""
+NOT_STIFF = 2.0
+"""h |lambda| of a linearly implicit step up to which an explicit one would do: it is stable for
+three times as long a step."""
+POWER_ITERATIONS = 6
+"""Products with the linearised equations that estimate their largest eigenvalue."""
+
+
+def stiffness_of(system: System, h: float, difference: FloatArray, change: FloatArray) -> float:
+    """h |lambda| from the ``difference`` (n,) of two arguments at the same time and the ``change``
+    (n,) of their rates; NaN where they do not differ."""
+    k = system.multiplier_part.start
+    size = system.position_norm
+    if not k:
+        apart = size(difference)
+        return h * size(change) / apart if apart > 0.0 else math.nan
+    dq, dv, da = size(difference[:k]), size(difference[k:]), size(change[k:])
+    if not (dq > 0.0 and dv > 0.0):
+        return math.nan
+    return h * min(da / dv, math.sqrt(da / dq))
+
+
+def chatters(
+    h: float, v: FloatArray, accelerations: FloatArray, weights: FloatArray, rubs: BoolArray
+) -> bool:
+    """Whether the acceleration of a coordinate with friction varies over a step of ``h`` (s) by
+    more than what would stop it within the step, and by more than the tolerance: stages take its
+    sign at random.
+
+    Parameters
+    ----------
+    v : (2, k), accelerations : (j, k)
+        Rates at the ends of the step, and their derivatives at its stages.
+    weights : (k,)
+        Tolerances of the rates.
+    rubs : (k,)
+        Which coordinates have friction.
+    """
+    if not rubs.any():
+        return False
+    change = h * np.ptp(accelerations, axis=0)
+    return bool((change > np.maximum(np.abs(v).max(axis=0), weights))[rubs].any())
+
+
+def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:
+    """Take an accepted step of ``scheme`` with that ``stiffness`` into account."""
+    if scheme.implicit is None:
+        if memory.stiff or scheme.stable_to is None:
+            return
+        if stiffness > scheme.stable_to:
+            memory.stiff_steps += 1
+            memory.other_steps = 0
+        elif memory.stiff_steps:
+            memory.other_steps += 1
+            if memory.other_steps == OTHER_STEPS:
+                memory.stiff_steps = memory.other_steps = 0
+    elif memory.stiff:
+        memory.stiff_steps = memory.stiff_steps + 1 if stiffness < NOT_STIFF else 0
+    if memory.stiff_steps == STIFF_STEPS:
+        memory.stiff = not memory.stiff
+        memory.stiff_steps = memory.other_steps = 0
+
+
+def largest_eigenvalue(J: FloatArray, h: float, unit: FloatArray, k: int) -> float:
+    """Estimate of h |lambda| for the largest eigenvalue lambda of ``J`` (n, n).
+
+    Parameters
+    ----------
+    unit : (n,)
+        Units of the components.
+    k
+        Number of positions among them: rates are measured in units of positions over ``h``.
+    """
+    scale = np.concatenate([unit[:k], unit[:k] / h]) if k else unit
+    x = scale * np.where(np.arange(len(unit)) % 2, -1.0, 1.0)
+    last = 1.0
+    for iteration in range(POWER_ITERATIONS):
+        if iteration == POWER_ITERATIONS - 2:
+            last = float(np.abs(x / scale).max())
+            if not last > 0.0:
+                return 0.0
+            x, last = x / last, 1.0
+        x = h * (J @ x)
+    return math.sqrt(float(np.abs(x / scale).max()))

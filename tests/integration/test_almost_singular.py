@@ -96,6 +96,7 @@ def check(d: float, rtol: float, backend: str = "auto") -> srm.Solution:
     )
     assert solution.success, solution.message
     assert Reference(d).error(solution) < 1000.0 * rtol + 1e-9
+    assert not solution.settings.stiff
     return solution
 
 

@@ -24,7 +24,7 @@ def test_defaults_are_sensible_without_any_option(four_bar: srm.Mechanism) -> No
     solution = srm.simulate(four_bar, 1.0)
     assert solution.success
     assert solution.status == "finished"
-    assert solution.settings.tableau == "dop853"
+    assert solution.settings.tableau == "auto"
     assert solution.settings.rtol == 1e-6
     assert solution.t[0] == 0.0
     assert solution.t[-1] == 1.0

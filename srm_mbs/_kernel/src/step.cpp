@@ -181,7 +181,9 @@ bool SplitStep::chatters(const IntegratorState& memory) const {
 void SplitStep::count_stiffness(IntegratorState& memory) {
     if (!linear_) {
         if (memory.stiff || !(scheme.stable_to > 0.0) || norm.negligible == 0.0) return;
-        if (!monitored_ && (stiffness() > scheme.stable_to || chatters(memory))) {
+        // Steps along the curve of closed configurations have no stages.
+        const bool shows = !monitored_ && !result.critical;
+        if (shows && (stiffness() > scheme.stable_to || chatters(memory))) {
             ++memory.stiff_steps;
             memory.other_steps = 0;
         } else if (memory.stiff_steps && ++memory.other_steps == constants.other_steps) {

@@ -551,7 +551,7 @@ def test_small_values_have_their_power_of_ten_in_the_label() -> None:
 def test_the_run_of_a_dae_has_drift_sigma_and_steps(dae: srm.DaeSolution) -> None:
     figure = dae.plot()
     drift, sigma, steps = figure.axes
-    assert figure.get_suptitle() == "index-2 DAE, PSRM, dop853, rtol = 1e-06"
+    assert figure.get_suptitle() == "index-2 DAE, PSRM, auto, rtol = 1e-06"
     assert steps.get_xlabel() == "time"
     g = [abs(problem_two().g(t, x)) for t, x in zip(dae.t, dae.x)]
     np.testing.assert_allclose(drawn(drift)[1], np.maximum(g, 1e-17))

@@ -72,7 +72,7 @@ def test_drift_energy_sigma_and_steps_share_one_time_axis_with_units(
 
 
 def test_title_names_mechanism_method_tableau_and_tolerance(slider_crank: Solution) -> None:
-    assert slider_crank.plot().get_suptitle() == "slider_crank, PSRM, dop853, rtol = 1e-08"
+    assert slider_crank.plot().get_suptitle() == "slider_crank, PSRM, auto, rtol = 1e-08"
 
 
 def test_title_of_a_run_with_fixed_steps_gives_the_step() -> None:

@@ -196,6 +196,7 @@ def test_without_playwright_it_says_what_to_install(
         run().export_image(tmp_path / "a.png")
 
 
+@pytest.mark.usefixtures("without_browser")
 def test_a_folder_that_is_not_there_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(srm.InputError, match="cannot be written"):
         run().export_image(tmp_path / "nowhere" / "a.png", size=(60, 40))
@@ -254,22 +255,6 @@ def test_a_chromium_that_does_not_start_is_an_input_error(monkeypatch: pytest.Mo
         pass
 
 
-@pytest.mark.browser
-@pytest.mark.parametrize("name", ["-y.mp4", "-version.mp4", "http:x.mp4", "-y.gif", "-.png"])
-def test_a_name_is_neither_an_option_nor_an_address(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    if name.endswith(".png"):
-        run().export_image(name, size=(60, 40))
-    else:
-        run().export_video(name, fps=2.0, size=(60, 40))
-    (written,) = tmp_path.iterdir()
-    assert written.name == name
-    start = written.read_bytes()[:8]
-    assert start[4:8] == b"ftyp" or start[:4] in (b"GIF8", b"\x89PNG")
-
-
 @cache
 def photograph() -> bytes:
     """A PNG."""
@@ -285,6 +270,22 @@ def without_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every photograph is the same."""
     taken = nullcontext(lambda t: photograph())
     monkeypatch.setattr(rendering, "photographer", lambda *_, **__: taken)
+
+
+@pytest.mark.usefixtures("without_browser")
+@pytest.mark.parametrize("name", ["-y.mp4", "-version.mp4", "http:x.mp4", "-y.gif", "-.png"])
+def test_a_name_is_neither_an_option_nor_an_address(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name.endswith(".png"):
+        run().export_image(name, size=(60, 40))
+    else:
+        run().export_video(name, fps=2.0, size=(60, 40))
+    (written,) = tmp_path.iterdir()
+    assert written.name == name
+    start = written.read_bytes()[:8]
+    assert start[4:8] == b"ftyp" or start[:4] in (b"GIF8", b"\x89PNG")
 
 
 @contextmanager

@@ -22,7 +22,10 @@ from tests.support.daes import (
 from tests.support.snapshots import check_messages, refused
 
 
-@pytest.mark.parametrize(("tableau", "m"), [("fe", 1), ("trap", 2), ("erk4", 4), ("dopr54", 5)])
+@pytest.mark.parametrize(
+    ("tableau", "m"),
+    [("fe", 1), ("trap", 2), ("erk4", 4), pytest.param("dopr54", 5, marks=pytest.mark.stress)],
+)
 def test_table_5_1_of_the_thesis_is_reproduced_to_all_printed_digits(
     tableau: str, m: int, exact: dict[str, Any]
 ) -> None:

@@ -337,7 +337,9 @@ def test_open_chains_run_with_any_method() -> None:
     ],
     ids=["SRM", "SRM dopr54", "simple", "exact", "fused", "own histories"],
 )
-@pytest.mark.parametrize("name", ["slider_crank", "n_four_bar_2"])
+@pytest.mark.parametrize(
+    "name", ["slider_crank", pytest.param("n_four_bar_2", marks=pytest.mark.stress)]
+)
 def test_passages_that_rounding_closes_to_sweeps_are_made_by_the_split_form(
     method: Any, rtol: float, bound: float, name: str
 ) -> None:

@@ -163,6 +163,12 @@ class ClosedTerms:
         """M^-1 f (nv,)."""
         return self._p.unwhiten(self._p.white_force)
 
+    def momentum(self, v: FloatArray) -> FloatArray:
+        """M v (nv,)."""
+        p = self._p
+        momentum: FloatArray = p.U.T @ (p.U @ v)
+        return momentum
+
     def multiplier_of(self, a: FloatArray) -> FloatArray:
         """E (G a + Gdot v - s'') (nv,) of the free acceleration ``a`` (nv,)."""
         p = self._p

@@ -145,12 +145,13 @@ class ConstraintMonitor:
         found = self.critical(t)
         return found is not None and abs(found.residual) > self._tolerance
 
-    def minimum(self, t: FloatArray, values: FloatArray) -> tuple[float, float]:
+    def minimum(self, t: FloatArray, values: FloatArray, power: int = 2) -> tuple[float, float]:
         """Time and value of the minimum bracketed by t (3,), values (3,) there.
 
-        The square of the value is a parabola where the motion passes.
+        The square of the value is a parabola where the motion passes, the value itself, of
+        ``power`` 1, where branches touch.
         """
-        times, squares = t.tolist(), (values**2).tolist()
+        times, squares = t.tolist(), (values**power).tolist()
         shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
         for _ in range(MAX_REFINEMENTS):
             a, b, c = times
@@ -162,7 +163,7 @@ class ConstraintMonitor:
             new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
             if not a < new < c or abs(new - b) <= shortest:
                 break
-            value = float(self.smallest(np.array([new]))[0]) ** 2
+            value = float(self.smallest(np.array([new]))[0]) ** power
             left = new < b
             if value < fb:
                 times = [a, new, b] if left else [b, new, c]
@@ -170,7 +171,7 @@ class ConstraintMonitor:
             else:
                 times = [new, b, c] if left else [a, b, new]
                 squares = [value, fb, fc] if left else [fa, fb, value]
-        return times[1], float(np.sqrt(squares[1]))
+        return times[1], float(squares[1] ** (1.0 / power))
 
 
 @dataclass(frozen=True)
@@ -594,8 +595,12 @@ def _crossings_at(
             kind = "avoided"
         else:
             cosine = _rank_loss_cosine(monitor, time, certain, before, after)
-            if cosine is None or (cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale):
+            if cosine is None:
                 continue
+            if cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale:
+                time, value = monitor.minimum(times[near], values[near], power=1)
+                if value > TOUCHING_VALUE * scale:
+                    continue
         slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
         found.append(crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind))
     return found

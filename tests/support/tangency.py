@@ -44,6 +44,18 @@ def _angles(psi: float, reach: float) -> tuple[float, float]:
     return float(np.arctan2(to[1], to[0])), float(crank)
 
 
+def _rod(crank: float, longer: float) -> tuple[float, float]:
+    """Absolute angle of the rod and its rate over that of the crank; a longer rod keeps its side,
+    with the tip behind the crank."""
+    if not longer:
+        return -crank, -1.0
+    length = BAR + longer
+    # Without the difference of 1 and a number next to it.
+    cosine = -np.sqrt(longer * (BAR + length) + (BAR * np.cos(crank)) ** 2) / length
+    angle = np.arctan2(-BAR * np.sin(crank) / length, cosine)
+    return float(angle), float(-BAR * np.cos(crank) / (length * cosine))
+
+
 def _rates(psi: float, reach: float) -> np.ndarray:
     """Rates of coupler and crank over that of the input."""
     coupler, crank = _angles(psi, reach)
@@ -51,8 +63,9 @@ def _rates(psi: float, reach: float) -> np.ndarray:
     return np.linalg.solve(closure, -INPUT * _across(psi))
 
 
-def mechanism(reach: float) -> srm.Mechanism:
-    """It moves with ``RATE`` from ``FIRST``, rod = -crank, all bars uniform with 1 kg."""
+def mechanism(reach: float, longer: float = 0.0) -> srm.Mechanism:
+    """It moves with ``RATE`` from ``FIRST``, rod = -crank but for a rod that is ``longer`` (m), all
+    bars uniform with 1 kg."""
     model = pin.Model()
     model.name = "tangency"
     model.gravity.linear = np.array([0.0, -G, 0.0])
@@ -62,7 +75,7 @@ def mechanism(reach: float) -> srm.Mechanism:
         ("input", 0, pivot, INPUT),
         ("coupler", 1, along_x(INPUT), COUPLER),
         ("crank", 0, ground, BAR),
-        ("rod", 3, along_x(BAR), BAR),
+        ("rod", 3, along_x(BAR), BAR + longer),
     )
     for name, parent, placement, length in bars:
         add_link(model, parent, pin.JointModelRZ(), name, rod(1.0, length), placement)
@@ -75,7 +88,7 @@ def mechanism(reach: float) -> srm.Mechanism:
         ),
         srm.LoopClosure(
             "point_on_plane",
-            srm.Anchor("rod", xyz=(BAR, 0.0, 0.0)),
+            srm.Anchor("rod", xyz=(BAR + longer, 0.0, 0.0)),
             srm.Anchor("world"),
             (0.0, 1.0, 0.0),
             "slide",
@@ -83,22 +96,26 @@ def mechanism(reach: float) -> srm.Mechanism:
     )
     coupler, crank = _angles(FIRST, reach)
     dcoupler, dcrank = _rates(FIRST, reach)
-    q = np.array([FIRST, coupler - FIRST, crank, -2.0 * crank])
-    v = RATE * np.array([1.0, dcoupler - 1.0, dcrank, -2.0 * dcrank])
+    rod_angle, slope = _rod(crank, longer)
+    q = np.array([FIRST, coupler - FIRST, crank, rod_angle - crank])
+    v = RATE * np.array([1.0, dcoupler - 1.0, dcrank, (slope - 1.0) * dcrank])
     return srm.Mechanism(model, loops, q0=q, v0=v)
 
 
-def inputs(reach: float, times: np.ndarray) -> np.ndarray:
+def inputs(reach: float, times: np.ndarray, longer: float = 0.0) -> np.ndarray:
     """The input angle at ``times``, by SciPy from the conservation of energy; it does not stop."""
 
     def energies(psi: float) -> tuple[float, float]:
         """Twice the kinetic energy over the square of the input's rate, and the potential."""
         (coupler, crank), (dcoupler, dcrank) = _angles(psi, reach), _rates(psi, reach)
         centre = INPUT * _across(psi) + 0.5 * COUPLER * dcoupler * _across(coupler)
-        rod_centre = dcrank * (BAR * _across(crank) - 0.5 * BAR * _across(-crank))
+        (angle, slope), length = _rod(crank, longer), BAR + longer
+        rod_centre = dcrank * (BAR * _across(crank) + 0.5 * length * slope * _across(angle))
         square = INPUT**2 / 3.0 + centre @ centre + (COUPLER * dcoupler) ** 2 / 12.0
-        square += (BAR * dcrank) ** 2 * (1.0 / 3.0 + 1.0 / 12.0) + rod_centre @ rod_centre
-        height = 1.5 * INPUT * np.sin(psi) + 0.5 * COUPLER * np.sin(coupler) + BAR * np.sin(crank)
+        square += dcrank**2 * (BAR**2 / 3.0 + (length * slope) ** 2 / 12.0)
+        square += rod_centre @ rod_centre
+        height = 1.5 * INPUT * np.sin(psi) + 0.5 * COUPLER * np.sin(coupler)
+        height += 1.5 * BAR * np.sin(crank) + 0.5 * length * np.sin(angle)
         return float(square), G * float(height)
 
     square, potential = energies(FIRST)

@@ -24,12 +24,7 @@ constexpr std::array<double, 8> slope = {-0.8,          0.8,          0.2,      
 }  // namespace
 
 BranchNodes::BranchNodes(System& system, const Constants& constants)
-    : state(system.nq + system.nv),
-      rate(2 * system.nv),
-      multiplier(system.nv),
-      moved(2 * system.nv),
-      away(system.nv),
-      system_(system),
+    : system_(system),
       constants_(constants),
       nv_(system.nv),
       nx_(system.nq + system.nv),
@@ -40,7 +35,13 @@ BranchNodes::BranchNodes(System& system, const Constants& constants)
       point_(nx_),
       step_(2 * nv_),
       closing_(nv_),
-      change_(2 * nv_) {}
+      change_(2 * nv_) {
+    state.resize(nx_);
+    rate.resize(2 * nv_);
+    multiplier.resize(nv_);
+    moved.resize(2 * nv_);
+    away.resize(nv_);
+}
 
 double BranchNodes::sigma_at(double t, const double* from, const double* direction,
                              double length) {
@@ -80,6 +81,9 @@ void BranchNodes::find_direction(double t, const double* from, std::vector<doubl
         for (double& x : out) x *= spacing;
         return;
     }
+    if (tangents > 1 || system_.driven()) return;
+    out = w;
+    for (double& x : out) x *= constants_.touching;
 }
 
 // Node k: the point of the branch that is nearest, in the mass metric, to the state moved along

@@ -6,22 +6,21 @@
 
 #include "constants.hpp"
 #include "system.hpp"
+#include "touching_branch.hpp"
 
 namespace srm {
 
-class BranchNodes {
+// Results of solve() are those of StageOnBranch.
+class BranchNodes : public StageOnBranch {
 public:
     BranchNodes(System& system, const Constants& constants);
 
     // A direction (nv,) of the branch that leads away from the singular configuration, as long as
-    // nodes are apart; empty if the state (nx,) does not determine it.
+    // nodes are apart, or `touching` where branches touch; empty if the state (nx,) does not
+    // determine it.
     void find_direction(double t, const double* state, std::vector<double>& away);
     // Moves the state (nx,) onto its branch, and solves for its multiplier; whether it could.
     bool solve(double t, const double* state, const std::vector<double>& away);
-
-    // Results of solve(): the state on the branch, the tangent rate there, the multiplier, what was
-    // subtracted from the state, and the direction of the branch there.
-    std::vector<double> state, rate, multiplier, moved, away;
 
 private:
     static constexpr int each_side = 4, count = 2 * each_side;

@@ -81,6 +81,7 @@ SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& co
       n_(2 * system.nv),
       nx_(system.nq + system.nv),
       nodes_(system, constants_),
+      touching_(system, constants_),
       x_(nx_),
       delta_(n_),
       rate_(n_),
@@ -293,15 +294,24 @@ void SplitStep::prepare_branch(const IntegratorState& memory, double end, double
 bool SplitStep::solve_on_branch(double t, double start, const double* state,
                                 const IntegratorState& memory) {
     if (result.lost_branch) return false;
+    bool found = true;
     if (away_.empty()) {
         away_ = memory.history->away;
-        if (away_.empty()) {
-            nodes_.find_direction(start, state, away_);
-            system_.evaluate(t, x_.data(), System::ZoneView{});
-        }
+        const bool known = !away_.empty();
+        if (!known) nodes_.find_direction(start, state, away_);
+        touches_ = !away_.empty() &&
+                   system_.position_norm(away_.data()) > constants.longest_node_spacing;
+        if (touches_) found = touching_.prepare(start, state, memory.rate.data(), away_);
+        if (touches_ || !known) system_.evaluate(t, x_.data(), System::ZoneView{});
     }
-    result.lost_branch = away_.empty() || !nodes_.solve(t, x_.data(), away_);
-    return !result.lost_branch;
+    if (away_.empty() || !found)
+        found = false;
+    else if (touches_)
+        found = touching_.solve(t, x_.data(), nodes_);
+    else
+        found = nodes_.solve(t, x_.data(), away_);
+    result.lost_branch = !found;
+    return found;
 }
 
 // Evaluates the stage x_ at its projection on its branch, by Newton steps that are taken as long as

@@ -153,7 +153,9 @@ private:
     // The motion lingers, its stages next to the singular configuration are solved by nodes of the
     // branch; one of them was; the end was.
     bool lingers_ = false, noded_ = false, noded_end_ = false;
+    bool touches_ = false;  // branches touch there
     BranchNodes nodes_;
+    TouchingBranch touching_;
     // Of a linearly implicit scheme; with the weights (s, s) of the rates in its linear terms, over
     // gamma, and the sums of its rows (s,).
     std::unique_ptr<LinearStages> linear_;

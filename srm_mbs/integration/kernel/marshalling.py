@@ -33,6 +33,7 @@ from srm_mbs.integration.methods import (
     near_singular,
     split_step,
     stiffness,
+    touching_branches,
 )
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
@@ -78,6 +79,17 @@ def constants() -> Any:
         node_closing=branch_nodes.LARGEST_CLOSING,
         node_accuracy=branch_nodes.CLOSING_ACCURACY,
         node_misfit=branch_nodes.LARGEST_MISFIT,
+        longest_node_spacing=branch_nodes.LONGEST_SPACING,
+        touching=touching_branches.TOUCHING,
+        touching_farthest=touching_branches.FARTHEST,
+        touching_spacing=touching_branches.NODE_SPACING,
+        touching_nodes=touching_branches.EACH_SIDE,
+        touching_samples=touching_branches.SAMPLES,
+        touching_least=touching_branches.LEAST_SIGMA,
+        touching_sigma=touching_branches.FIRST_NODE_SIGMA,
+        touching_accuracy=touching_branches.CLOSING_ACCURACY,
+        touching_misfit=touching_branches.LARGEST_MISFIT,
+        touching_residual=touching_branches.LARGEST_RESIDUAL,
         branch_below=branch_nodes.BRANCH_SIGMA,
         residual_interval=split_step.RESIDUAL_EVERY,
         # Stiffness.

@@ -27,6 +27,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.integration.methods.touching_branches import TOUCHING, TouchingBranch
 
 BRANCH_SIGMA = 3e-3
 """sigma below which stages of a motion that lingers are solved by nodes."""
@@ -38,6 +39,8 @@ NODE_SPACING = 0.02
 """Distance between nodes (rad, scene diagonals)."""
 SPACING_DOUBLINGS = 2
 """Times that it is doubled, at most, until it suffices."""
+LONGEST_SPACING = 0.09
+"""A longer direction says that branches touch."""
 FIRST_NODE_SIGMA = 0.01
 """sigma of the first nodes for which the spacing suffices.  Where branches touch, sigma grows with
 the square of the distance, and none does.  Every node needs half of it: where another loop is next
@@ -89,13 +92,14 @@ class BranchNodes:
 
     def find_direction(self, t: float, state: FloatArray) -> FloatArray | None:
         """A direction (nv,) of the branch that leads away from the singular configuration, as long
-        as nodes are apart; None if the ``state`` (nx,) does not determine it."""
+        as nodes are apart, or TOUCHING where branches touch; None if the ``state`` (nx,) does not
+        determine it."""
         system = self._system
         terms = system.evaluate(t, state)
         sigma = terms.sigma
         if terms.rank_deficient or not sigma > KNOWN_DIRECTION_SIGMA:
             return None
-        tangents = terms.branch_tangents().T
+        tangents, driven = terms.branch_tangents().T, len(terms.driven_residuals()) > 0
         if not len(tangents):
             return None
         w = np.zeros(system.nv)
@@ -106,7 +110,10 @@ class BranchNodes:
                 ahead, behind = (self._sigma_at(t, state, side * f) for side in (length, -length))
                 steepness = (ahead - behind) / length
             w += steepness * f
-        return self.spaced(t, state, w)
+        away = self.spaced(t, state, w)
+        if away is None and len(tangents) == 1 and not driven:
+            return TOUCHING / system.position_norm(w) * w
+        return away
 
     def spaced(self, t: float, state: FloatArray, w: FloatArray) -> FloatArray | None:
         """The direction w (nv,), as long as nodes are apart; None if no spacing
@@ -189,8 +196,8 @@ class StageNodes(BranchNodes):
     ----------
     system
         The mechanism.
-    t, state
-        Start of the step (s), and the state there (nx,).
+    t, state, rate
+        Start of the step (s), the state there (nx,) and its tangent rate (2 nv,).
     direction : (nv,) or None
         Direction of the branch there; None to find it when a stage needs it.
 
@@ -203,10 +210,16 @@ class StageNodes(BranchNodes):
     """
 
     def __init__(
-        self, system: ClosedSystem, t: float, state: FloatArray, direction: FloatArray | None
+        self,
+        system: ClosedSystem,
+        t: float,
+        state: FloatArray,
+        rate: FloatArray,
+        direction: FloatArray | None,
     ) -> None:
         super().__init__(system)
-        self._start, self._direction = (t, state), direction
+        self._start, self._rate, self._direction = (t, state), rate, direction
+        self._touching: TouchingBranch | None = None
         self.used = self.lost = False
 
     def solve_stage(self, t: float, state: FloatArray) -> bool:
@@ -215,6 +228,23 @@ class StageNodes(BranchNodes):
             return False
         if self._direction is None:
             self._direction = self.find_direction(*self._start)
-        solved = self._direction is not None and self.solve(t, state, self._direction)
+        if self._direction is None:
+            solved = False
+        elif self._system.position_norm(self._direction) > LONGEST_SPACING:
+            solved = self._solve_touching(t, state, self._direction)
+        else:
+            solved = self.solve(t, state, self._direction)
         self.used, self.lost = self.used or solved, not solved
+        return solved
+
+    def _solve_touching(self, t: float, state: FloatArray, direction: FloatArray) -> bool:
+        if self._touching is None:
+            self._touching = TouchingBranch(self._system)
+            if not self._touching.prepare(*self._start, self._rate, direction):
+                return False
+        solved = self._touching.solve(t, state)
+        if solved:
+            own = self._touching
+            self.state, self.rate, self.multiplier = own.state, own.rate, own.multiplier
+            self.moved, self.away = own.moved, own.away
         return solved

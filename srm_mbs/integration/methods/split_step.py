@@ -137,7 +137,7 @@ class SplitStep:
         if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
             weights = norm.weights(memory.state_scale)
             if memory.lingering and self.uses_nodes and isinstance(system, ClosedSystem):
-                nodes = StageNodes(system, t, state, history.away)
+                nodes = StageNodes(system, t, state, memory.rate, history.away)
             lingers = nodes is not None
             branch = BranchStages(
                 system, memory, norm, weights, h, sigma_change, history, t + h, lingering=lingers

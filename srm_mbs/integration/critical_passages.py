@@ -48,7 +48,8 @@ again."""
 ROUNDED_RESIDUAL = 1e-13
 """Residual (row units) below which the configuration is singular to rounding."""
 DISTURBING = 1e-3
-"""Residual that counts as zero, over rtol, up to which steps pass as if it were."""
+"""Residual that counts as zero, over rtol, up to which steps pass as if it were, unless they are
+to end beside the passage."""
 LARGEST = 64
 """Coordinates of a mechanism whose passages are examined, at most: the search is dense algebra."""
 LAYER = 1.5
@@ -296,7 +297,8 @@ class PassageAlongCurve:
         else:
             curve, self._start, beta = begun.curve, begun.start, begun.beta
             self._curve = curve
-        here = self._evaluated(place, beta, rates, self.t, self._closes(beta))
+        known = begun is not None and self._rounded(beta)
+        here = self._evaluated(place, beta, rates, self.t, self._closes(beta), known)
         if begun is None and not float(rates @ here.tangent) * beta < 0.0:
             raise ValueError("the motion leads away from the critical configuration")
         self._heading = -float(np.sign(self._start))
@@ -334,6 +336,11 @@ class PassageAlongCurve:
         turned = self.rtol * beta**2 > self._curve.layer**2
         return turned or not abs(beta) < abs(self._start)
 
+    def _rounded(self, beta: float) -> bool:
+        """Whether rounding turns the normals at ``beta``, on a curve that leads straight through
+        the critical configuration, by more than the tolerance."""
+        return self.exact and PLACE_ROUNDING > self.rtol * beta**2
+
     def _predicted(
         self, beta: float, energy: float, mass: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
@@ -367,10 +374,16 @@ class PassageAlongCurve:
         return away - self._curve.hyperbola(node.beta)[0]
 
     def _evaluated(
-        self, place: FloatArray, beta: float, rates: FloatArray, t: float, closed: bool = False
+        self,
+        place: FloatArray,
+        beta: float,
+        rates: FloatArray,
+        t: float,
+        closed: bool = False,
+        known: bool = False,
     ) -> Node:
-        """The node next to ``place``, from one evaluation there with the ``rates`` (n,), in
-        units."""
+        """The node next to ``place``, from one evaluation there with the ``rates`` (n,), in units;
+        ``known``: it is there, and the rates are along the curve."""
         system, geometry, nv = self.system, self.critical.geometry, self._nv
         unit = geometry.coordinate_unit
         q, v = place[:-1] if self._driven else place, rates[:nv] * unit
@@ -379,10 +392,15 @@ class PassageAlongCurve:
         sigma = system.evaluate(t, np.concatenate([q, v])).sigma
         force = system.working_force(t, q, v) * unit
         inertial = system.inertial_force(q, v) * unit
-        step, tangent, matrix = self._curve.linearised(place, beta, closed)
+        if known:
+            geometry.closure(place)
+            step = turned = np.zeros(len(rates))
+            tangent = rates / float(self._curve.along @ rates)
+        else:
+            step, tangent, matrix = self._curve.linearised(place, beta, closed)
+            turned = self._curve.bend(place, rates, matrix)
         tangent = tangent / self._growth(place, tangent)
         M, own = geometry.mass(), tangent[:nv]
-        turned = self._curve.bend(place, rates, matrix)
         inertia = float(own @ M @ own)
         if self._driven:
             along = -turned[-1] / tangent[-1]
@@ -494,12 +512,45 @@ class PassageAlongCurve:
             at = bisected(own, clock, self.end)
             between = interpolated(own, np.concatenate([[energy_at_begin], energies]), at)
             beta = self._width * float(np.sinh(self._heading * (a + (b - a) * at)))
-            self._point(beta, between, self.end)
+            if self._rounded(beta):
+                self._found.append((self._between(nodes, at, beta), between, self.end))
+            else:
+                self._point(beta, between, self.end)
             if self._heading * beta < (1.0 - SMALLEST_REST) * abs(self._start):
                 self.rest = PlaceOnCurve(
                     self.critical, self.exact, self._curve, self._start, beta, between
                 )
         return b
+
+    def _between(self, nodes: list[Node], at: float, beta: float) -> Node:
+        """The node at ``beta``, a part ``at`` of the panel with the ``nodes``, by interpolation."""
+        x, critical, n = gauss_nodes(self._count)[0], self.critical, len(self._curve.along)
+        values = np.array(
+            [
+                [
+                    *critical.geometry.difference(critical.q, node.place),
+                    *node.tangent,
+                    *(node.inertia, node.power, node.sigma),
+                    *node.acceleration,
+                ]
+                for node in nodes
+            ]
+        )
+        found = np.array([interpolated(x, column, at) for column in values.T])
+        away, tangent, (inertia, power, sigma), acceleration = np.split(
+            found, [n, 2 * n, 2 * n + 3]
+        )
+        return Node(
+            place=critical.geometry.move(critical.q, away),
+            beta=beta,
+            tangent=tangent,
+            rates=tangent,
+            off=0.0,
+            inertia=float(inertia),
+            power=float(power),
+            acceleration=acceleration,
+            sigma=abs(float(sigma)),
+        )
 
     def _point(self, beta: float, energy: float, t: float) -> None:
         """Go on to ``beta``, where the motion has the kinetic ``energy`` (J) at ``t`` (s); a
@@ -656,7 +707,8 @@ class CriticalPassages:
         residual = critical.residual
         avoided = abs(residual) > self._tolerance
         steps: list[tuple[StepResult, float]] = []
-        if avoided or abs(residual) > DISTURBING * self._norm.rtol:
+        disturbs = abs(residual) > DISTURBING * self._norm.rtol
+        if avoided or disturbs or end < zero + ahead:
             try:
                 passage = PassageAlongCurve(
                     system, critical, t, state, end, not avoided, self._norm.rtol

@@ -78,7 +78,9 @@ def test_samples_in_the_layer_lie_on_the_curve(d: float, backend: str) -> None:
     reference = Reference(d)
     for t in times:
         simulator.step(t - simulator.t)
-        assert reference.error(state_of(simulator)) < 1e-8
+        # Rates in the layer turn with the rounding of the angles over its width.
+        assert reference.error(state_of(simulator)) < 5e-7
+    assert reference.error(state_of(simulator)) < 1e-9
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

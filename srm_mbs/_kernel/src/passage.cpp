@@ -236,7 +236,7 @@ public:
         const bool begun = motion.begun;
         const double beta = curve_.beta, start = begun ? motion.start : beta;
         motion.start = start;
-        Node here = evaluated(state, t, beta, rates, closes(beta));
+        Node here = evaluated(state, t, beta, rates, closes(beta), begun && rounded(beta));
         here.x = state;
         here.time = t;
         if (!begun && !(dot(rates.data(), here.tangent.data(), n_) * start < 0.0))
@@ -285,11 +285,25 @@ private:
                !(std::abs(beta) < std::abs(motion_.start));
     }
 
-    // The node next to a place, from one evaluation there with the rates (n,), in units.
-    Node evaluated(const Vector& x, double t, double beta, const Vector& rates, bool closed) {
+    // Whether rounding turns the normals at beta, on a curve that leads straight through the critical
+    // configuration, by more than the tolerance.
+    bool rounded(double beta) const {
+        return motion_.exact && constants_.place_rounding > rtol_ * beta * beta;
+    }
+
+    // The node next to a place, from one evaluation there with the rates (n,), in units; `known`: it
+    // is there, and the rates are along the curve.
+    Node evaluated(const Vector& x, double t, double beta, const Vector& rates, bool closed,
+                   bool known = false) {
         Node node;
-        Vector step;
-        curve_.linearise(x, t, beta, closed, step, node.tangent);
+        Vector step(n_, 0.0);
+        if (known) {
+            node.tangent = rates;
+            const double length = dot(curve_.along.data(), rates.data(), n_);
+            for (double& value : node.tangent) value /= length;
+        } else {
+            curve_.linearise(x, t, beta, closed, step, node.tangent);
+        }
         const double grown = growth(x, t, node.tangent);
         for (double& value : node.tangent) value /= grown;
         Vector state(x);
@@ -299,8 +313,9 @@ private:
         Vector bias(system_.bias());
         for (std::size_t i = 0; i < bias.size(); ++i)
             bias[i] *= system_.residual_scale(static_cast<int>(i));
-        Vector turned, own(nv_), mass(nv_), all(nv_), working(nv_), turning(nv_), inertial(nv_);
-        curve_.solve_bend(bias, turned);
+        Vector turned(n_, 0.0), own(nv_), mass(nv_), all(nv_), working(nv_), turning(nv_);
+        Vector inertial(nv_);
+        if (!known) curve_.solve_bend(bias, turned);
         for (int j = 0; j < nv_; ++j) {
             own[j] = node.tangent[j] * closures_.unit(j);
             turning[j] = turned[j] * closures_.unit(j);
@@ -487,19 +502,60 @@ private:
         const double begin = clock_, energy_before = energy_;
         energy_ = energies[count_];
         clock_ = times[count_];
+        // The end of the run, or of its smooth interval, may lie in the panel.
+        const bool ends = clock_ >= end_;
+        double at = 0.0;
+        Node last;
+        if (ends) {
+            at = bisected(own, with_start(begin, times), end_);
+            motion_.beta = width_ * std::sinh(heading_ * (a + (b - a) * at));
+            motion_.energy = interpolated(own, with_start(energy_before, energies), at);
+            motion_.begun = heading_ * motion_.beta <
+                            (1.0 - constants_.smallest_rest) * std::abs(motion_.start);
+            if (rounded(motion_.beta)) last = between(nodes, at, motion_.beta);
+        }
         for (int i = 0; i < count_; ++i) {
             const double time = driven_ ? nodes[i].time : times[i];
             if (time < end_) found_.push_back({std::move(nodes[i]), energies[i], time});
         }
-        if (!(clock_ >= end_)) return b;
-        // The end of the run, or of its smooth interval, lies in the panel.
-        const double at = bisected(own, with_start(begin, times), end_);
-        motion_.beta = width_ * std::sinh(heading_ * (a + (b - a) * at));
-        motion_.energy = interpolated(own, with_start(energy_before, energies), at);
-        motion_.begun = heading_ * motion_.beta <
-                        (1.0 - constants_.smallest_rest) * std::abs(motion_.start);
-        point(motion_.beta, motion_.energy, end_);
+        if (!ends) return b;
+        if (rounded(motion_.beta))
+            found_.push_back({std::move(last), motion_.energy, end_});
+        else
+            point(motion_.beta, motion_.energy, end_);
         return b;
+    }
+
+    // The node at beta, a part `at` of the panel with the nodes, by interpolation.
+    Node between(const std::vector<Node>& nodes, double at, double beta) {
+        const Vector& x = collocation_.nodes;
+        Vector values(count_), away(n_);
+        std::vector<Vector> places(count_, Vector(n_));
+        for (int i = 0; i < count_; ++i)
+            closures_.difference(critical_.x, critical_.t, nodes[i].x, nodes[i].time,
+                                 places[i].data());
+        const auto through = [&](auto value_of) {
+            for (int i = 0; i < count_; ++i) values[i] = value_of(i);
+            return interpolated(x, values, at);
+        };
+        Node out;
+        out.beta = beta;
+        out.tangent.resize(n_);
+        out.acceleration.resize(nv_);
+        for (int j = 0; j < n_; ++j) {
+            away[j] = through([&](int i) { return places[i][j]; });
+            out.tangent[j] = through([&](int i) { return nodes[i].tangent[j]; });
+        }
+        for (int j = 0; j < nv_; ++j)
+            out.acceleration[j] = through([&](int i) { return nodes[i].acceleration[j]; });
+        out.rates = out.tangent;
+        out.inertia = through([&](int i) { return nodes[i].inertia; });
+        out.power = through([&](int i) { return nodes[i].power; });
+        out.sigma = std::abs(through([&](int i) { return nodes[i].sigma; }));
+        out.x = critical_.x;
+        out.time = critical_.t;
+        closures_.move(away.data(), out.x, out.time);
+        return out;
     }
 
     // start + the integrals of `values` (k,) up to the nodes and to the end (k + 1,).

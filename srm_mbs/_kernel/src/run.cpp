@@ -298,7 +298,9 @@ bool Run::examine(double zero) {
     const double residual = std::abs(critical->residual);
     if (!(residual > constants().rounded_residual)) return false;
     const bool avoided = residual > singular_tolerance_;
-    if (avoided || residual > constants().disturbing * rtol)
+    // Steps may pass a residual that is far below the tolerance, but not end beside it.
+    const bool disturbs = residual > constants().disturbing * rtol;
+    if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_))
         follow({*critical, closures.time_unit, !avoided});
     known_ = known_ || !prepared_.empty();
     if (known_) examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});

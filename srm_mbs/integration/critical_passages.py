@@ -339,7 +339,7 @@ class PassageAlongCurve:
     def _rounded(self, beta: float) -> bool:
         """Whether rounding turns the normals at ``beta``, on a curve that leads straight through
         the critical configuration, by more than the tolerance."""
-        return self.exact and PLACE_ROUNDING > self.rtol * beta**2
+        return self.exact and self.rtol * beta**2 < PLACE_ROUNDING
 
     def _predicted(
         self, beta: float, energy: float, mass: FloatArray
@@ -720,9 +720,7 @@ class CriticalPassages:
             self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
         return steps
 
-    def steps_on(
-        self, t: float, state: FloatArray, end: float
-    ) -> list[tuple[StepResult, float]]:
+    def steps_on(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:
         """As :meth:`steps_past`, on from where the passage stopped, at ``t`` (s)."""
         begun, self._rest = self._rest, None
         if begun is None:

@@ -232,8 +232,11 @@ class BreakpointHandler:
             self._index = index
             self._evaluate_within(index)
 
-    def next(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
-        """Enter the next interval; ``memory`` with its first stage.
+    def next(
+        self, t: float, state: FloatArray, memory: IntegratorState, evaluated: bool = True
+    ) -> IntegratorState:
+        """Enter the next interval; ``memory``, with its first stage if that is to be
+        ``evaluated``.
 
         Raises
         ------
@@ -243,7 +246,7 @@ class BreakpointHandler:
             As :meth:`resolved`, or if the stage cannot be evaluated.
         """
         self.enter(self._index + 1, t, state)
-        return self.past_jump(t, state, memory)
+        return self.past_jump(t, state, memory) if evaluated else memory
 
     def past_jump(self, t: float, state: FloatArray, memory: IntegratorState) -> IntegratorState:
         """``memory`` with the first stage after a jump of forces at ``t`` (s).

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +48,8 @@ again."""
 ROUNDED_RESIDUAL = 1e-13
 """Residual (row units) below which the configuration is singular to rounding."""
 DISTURBING = 1e-3
-"""Residual that counts as zero, over rtol, up to which steps pass as if it were."""
+"""Residual that counts as zero, over rtol, up to which steps pass as if it were, unless they are
+to end beside the passage."""
 LARGEST = 64
 """Coordinates of a mechanism whose passages are examined, at most: the search is dense algebra."""
 LAYER = 1.5
@@ -82,6 +83,12 @@ configuration."""
 EXTRAPOLATED = 1e-4
 """|beta| (units) from which the distance of the curve from its hyperbola is known beyond
 rounding."""
+CUT, CUT_FROM = 1.1, 0.9
+"""Length of a panel in which the passage is to stop, over the one that is predicted to lead there,
+and the length, over that of the whole panel, below which it is cut so.  Interpolation to a time in
+it is then almost as accurate as its quadrature."""
+SMALLEST_REST = 1e-9
+"""Rest of a passage, over its whole, that is none."""
 
 
 @lru_cache(maxsize=16)
@@ -199,6 +206,32 @@ class Node:
     sigma: float
 
 
+@dataclass(frozen=True, eq=False)
+class PlaceOnCurve:
+    """Where a motion past a critical configuration stopped on its way.
+
+    Attributes
+    ----------
+    critical, exact, curve
+        The critical configuration, whether its residual counts as zero, and the curve beside it.
+    start
+        beta at which the passage began; it ends at -start.
+    beta, energy
+        beta and the kinetic energy (J) where it stopped.
+    """
+
+    critical: CriticalConfiguration
+    exact: bool
+    curve: CurveThroughSaddle
+    start: float
+    beta: float
+    energy: float
+
+    def __deepcopy__(self, memo: Any) -> PlaceOnCurve:
+        """Itself: nothing of it changes."""
+        return self
+
+
 @dataclass(eq=False)
 class PassageAlongCurve:
     """The motion past a critical configuration, along the curve of closed configurations.
@@ -220,9 +253,13 @@ class PassageAlongCurve:
         Whether the residual counts as zero, so that the motion goes straight on.
     rtol
         Relative tolerance of the run.
+    begun
+        Where the passage was stopped, if it was; ``state`` at ``t`` is the one there.
 
     Attributes
     ----------
+    rest
+        Where it stops at ``end``; None if it does not.
     times : (k,) s, states : (k, nq + nv), rates : (k, 2 nv), sigmas : (k,)
         The motion at the nodes: states, tangent rates and sigma.
 
@@ -240,6 +277,8 @@ class PassageAlongCurve:
     end: float
     exact: bool
     rtol: float
+    begun: PlaceOnCurve | None = None
+    rest: PlaceOnCurve | None = field(init=False, default=None)
     times: FloatArray = field(init=False)
     states: FloatArray = field(init=False)
     rates: FloatArray = field(init=False)
@@ -250,25 +289,37 @@ class PassageAlongCurve:
         q, v = self.system.split(self.state)
         self._nv = len(v)
         self._driven = len(geometry.unit) > self._nv
-        place = geometry.at(q, self.t)
-        curve = self._curve = CurveThroughSaddle(self.critical, place, self.exact)
-        rates = geometry.rates(v)
-        here = self._evaluated(place, curve.beta, rates, self.t, closed=True)
-        if not float(rates @ here.tangent) * curve.beta < 0.0:
+        place, rates = geometry.at(q, self.t), geometry.rates(v)
+        begun = self.begun
+        if begun is None:
+            curve = self._curve = CurveThroughSaddle(self.critical, place, self.exact)
+            self._start = beta = curve.beta
+        else:
+            curve, self._start, beta = begun.curve, begun.start, begun.beta
+            self._curve = curve
+        known = begun is not None and self._rounded(beta)
+        here = self._evaluated(place, beta, rates, self.t, self._closes(beta), known)
+        if begun is None and not float(rates @ here.tangent) * beta < 0.0:
             raise ValueError("the motion leads away from the critical configuration")
-        self._heading = -float(np.sign(curve.beta))
-        self._width = curve.width or abs(curve.beta)
-        self._energy = 0.5 * here.inertia * float(curve.along @ rates) ** 2
+        self._heading = -float(np.sign(self._start))
+        self._width = curve.width or abs(self._start)
+        if begun is None:
+            self._energy = 0.5 * here.inertia * float(curve.along @ rates) ** 2
+        else:
+            self._energy = begun.energy
         self._clock, self._found = self.t, [(here, self._energy, self.t)]
         self._count = node_count(self.rtol)
-        reach = float(np.arcsinh(abs(curve.beta) / self._width))
+        reach = float(np.arcsinh(abs(self._start) / self._width))
         allowed = PANEL_ERROR * self.rtol
         edges = panel_edges(reach, self._count, self._width, not self.exact, allowed)
-        for a, b in pairwise(self._heading * x for x in edges):
-            if self._clock < self.end:
-                self._panel(a, b)
+        at = self._heading * float(np.arcsinh(beta / self._width))
+        if begun is None:
+            at = edges[0]
+        for edge in edges[1:]:
+            while at < edge and self._clock < self.end:
+                at = self._panel(at, edge)
         if self._clock < self.end:
-            self._point(-curve.beta, self._energy, self._clock)
+            self._point(-self._start, self._energy, self._clock)
             if self._driven:
                 node, energy, _ = self._found.pop()
                 self._found.append((node, energy, float(node.place[-1])))
@@ -278,6 +329,17 @@ class PassageAlongCurve:
         self.states = np.array([state for state, _ in motion])
         self.rates = np.array([rate for _, rate in motion])
         self.states[0] = self.state
+
+    def _closes(self, beta: float) -> bool:
+        """Whether the closures are to hold at ``beta``, also where their residual counts as
+        zero: where it turns the curve by less than the tolerance, and at the ends."""
+        turned = self.rtol * beta**2 > self._curve.layer**2
+        return turned or not abs(beta) < abs(self._start)
+
+    def _rounded(self, beta: float) -> bool:
+        """Whether rounding turns the normals at ``beta``, on a curve that leads straight through
+        the critical configuration, by more than the tolerance."""
+        return self.exact and self.rtol * beta**2 < PLACE_ROUNDING
 
     def _predicted(
         self, beta: float, energy: float, mass: FloatArray
@@ -312,10 +374,16 @@ class PassageAlongCurve:
         return away - self._curve.hyperbola(node.beta)[0]
 
     def _evaluated(
-        self, place: FloatArray, beta: float, rates: FloatArray, t: float, closed: bool = False
+        self,
+        place: FloatArray,
+        beta: float,
+        rates: FloatArray,
+        t: float,
+        closed: bool = False,
+        known: bool = False,
     ) -> Node:
-        """The node next to ``place``, from one evaluation there with the ``rates`` (n,), in
-        units."""
+        """The node next to ``place``, from one evaluation there with the ``rates`` (n,), in units;
+        ``known``: it is there, and the rates are along the curve."""
         system, geometry, nv = self.system, self.critical.geometry, self._nv
         unit = geometry.coordinate_unit
         q, v = place[:-1] if self._driven else place, rates[:nv] * unit
@@ -324,10 +392,15 @@ class PassageAlongCurve:
         sigma = system.evaluate(t, np.concatenate([q, v])).sigma
         force = system.working_force(t, q, v) * unit
         inertial = system.inertial_force(q, v) * unit
-        step, tangent, matrix = self._curve.linearised(place, beta, closed)
+        if known:
+            geometry.closure(place)
+            step = turned = np.zeros(len(rates))
+            tangent = rates / float(self._curve.along @ rates)
+        else:
+            step, tangent, matrix = self._curve.linearised(place, beta, closed)
+            turned = self._curve.bend(place, rates, matrix)
         tangent = tangent / self._growth(place, tangent)
         M, own = geometry.mass(), tangent[:nv]
-        turned = self._curve.bend(place, rates, matrix)
         inertia = float(own @ M @ own)
         if self._driven:
             along = -turned[-1] / tangent[-1]
@@ -381,20 +454,32 @@ class PassageAlongCurve:
             and turned <= TURNED * self.rtol + rounding / distance
         )
 
-    def _panel(self, a: float, b: float) -> None:
-        """Go on along the panel [a, b] of xi."""
+    def _panel(self, a: float, b: float) -> float:
+        """Go on along the panel from ``a`` to ``b``, of xi times the heading, or only to a place
+        behind the end of the passage; where it led."""
         x, w, integrals = gauss_nodes(self._count)
-        xi = a + (b - a) * x
-        weights, slope = np.vstack([integrals, w]), self._width * np.cosh(xi) * (b - a)
-        start, betas = self._width * np.sinh(a), self._width * np.sinh(xi)
-        energy = self._energy + self._found[-1][0].power * (betas - start)
-        if not (energy > 0.0).all():
-            raise ValueError("the energy does not suffice to pass")
+        weights, own = np.vstack([integrals, w]), np.concatenate([[0.0], x, [1.0]])
         # Of the evaluation made last.
         mass = self.critical.geometry.mass()
-        predicted = [self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())]
+        while True:
+            xi = self._heading * (a + (b - a) * x)
+            slope = self._width * np.cosh(xi) * self._heading * (b - a)
+            betas = self._width * np.sinh(xi)
+            start = self._width * np.sinh(self._heading * a)
+            energy = self._energy + self._found[-1][0].power * (betas - start)
+            if not (energy > 0.0).all():
+                raise ValueError("the energy does not suffice to pass")
+            predicted = [
+                self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())
+            ]
+            t = self._clock + weights @ (slope / np.array([one[2] for one in predicted]))
+            if not t[-1] > self.end:
+                break
+            length = CUT * bisected(own, np.concatenate([[self._clock], t]), self.end)
+            if not length < CUT_FROM:
+                break
+            b = a + length * (b - a)
         places, rates = [one[0] for one in predicted], [one[1] for one in predicted]
-        t = self._clock + integrals @ (slope / np.array([one[2] for one in predicted]))
         nodes = [self._evaluated(*one) for one in zip(places, betas.tolist(), rates, t.tolist())]
         for _ in range(SWEEPS):
             energies = self._energy + weights @ (slope * [node.power for node in nodes])
@@ -422,20 +507,58 @@ class PassageAlongCurve:
         new = list(zip(nodes, energy.tolist(), t.tolist()))
         self._found += [one for one in new if one[-1] < self.end]
         if self._clock >= self.end:
-            # The end of the run or of its smooth interval lies in the panel.
-            own = np.concatenate([[0.0], x, [1.0]])
+            # The end of the run, or of its smooth interval, lies in the panel.
             clock = np.concatenate([[begin], times])
             at = bisected(own, clock, self.end)
             between = interpolated(own, np.concatenate([[energy_at_begin], energies]), at)
-            self._point(self._width * float(np.sinh(a + (b - a) * at)), between, self.end)
+            beta = self._width * float(np.sinh(self._heading * (a + (b - a) * at)))
+            if self._rounded(beta):
+                self._found.append((self._between(nodes, at, beta), between, self.end))
+            else:
+                self._point(beta, between, self.end)
+            if self._heading * beta < (1.0 - SMALLEST_REST) * abs(self._start):
+                self.rest = PlaceOnCurve(
+                    self.critical, self.exact, self._curve, self._start, beta, between
+                )
+        return b
+
+    def _between(self, nodes: list[Node], at: float, beta: float) -> Node:
+        """The node at ``beta``, a part ``at`` of the panel with the ``nodes``, by interpolation."""
+        x, critical, n = gauss_nodes(self._count)[0], self.critical, len(self._curve.along)
+        values = np.array(
+            [
+                [
+                    *critical.geometry.difference(critical.q, node.place),
+                    *node.tangent,
+                    *(node.inertia, node.power, node.sigma),
+                    *node.acceleration,
+                ]
+                for node in nodes
+            ]
+        )
+        found = np.array([interpolated(x, column, at) for column in values.T])
+        away, tangent, (inertia, power, sigma), acceleration = np.split(
+            found, [n, 2 * n, 2 * n + 3]
+        )
+        return Node(
+            place=critical.geometry.move(critical.q, away),
+            beta=beta,
+            tangent=tangent,
+            rates=tangent,
+            off=0.0,
+            inertia=float(inertia),
+            power=float(power),
+            acceleration=acceleration,
+            sigma=abs(float(sigma)),
+        )
 
     def _point(self, beta: float, energy: float, t: float) -> None:
         """Go on to ``beta``, where the motion has the kinetic ``energy`` (J) at ``t`` (s); a
-        residual that counts as zero is closed again."""
+        residual that counts as zero is closed again where it can be."""
         mass = self.critical.geometry.mass()
         place, rates, _ = self._predicted(beta, energy, mass)
         for _ in range(SWEEPS):
-            node = self._evaluated(place, beta, rates, t, closed=True)
+            node = self._evaluated(place, beta, rates, t, self._closes(beta))
             speed = self._speed(node, energy)
             if self._solved(node, speed):
                 break
@@ -507,6 +630,7 @@ class CriticalPassages:
         self._tolerance = tolerance
         self._known = self._quiet = False
         self._sigma = self._examine_below = np.inf
+        self._rest: PlaceOnCurve | None = None
         self.examined: list[ExaminedPassage] = []
 
     @cached_property
@@ -514,6 +638,11 @@ class CriticalPassages:
         """Whether the closed configurations are curves, which may be followed."""
         analysis = self._system.singularities
         return len(analysis.geometry(analysis.q0).unit) - analysis.rank == 1
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a passage stopped on its way; :meth:`steps_on` goes on with it."""
+        return self._rest is not None
 
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
@@ -578,16 +707,43 @@ class CriticalPassages:
         residual = critical.residual
         avoided = abs(residual) > self._tolerance
         steps: list[tuple[StepResult, float]] = []
-        if avoided or abs(residual) > DISTURBING * self._norm.rtol:
+        disturbs = abs(residual) > DISTURBING * self._norm.rtol
+        if avoided or disturbs or end < zero + ahead:
             try:
                 passage = PassageAlongCurve(
                     system, critical, t, state, end, not avoided, self._norm.rtol
                 )
-                steps = self._steps(passage)
+                steps = self._along(passage)
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
                 pass  # steps pass it as well as they can, and the message says so
         if self._known or steps:
             self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
+        return steps
+
+    def steps_on(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:
+        """As :meth:`steps_past`, on from where the passage stopped, at ``t`` (s)."""
+        begun, self._rest = self._rest, None
+        if begun is None:
+            return []
+        try:
+            return self._along(
+                PassageAlongCurve(
+                    self._system,
+                    begun.critical,
+                    t,
+                    state,
+                    end,
+                    begun.exact,
+                    self._norm.rtol,
+                    begun,
+                )
+            )
+        except (ValueError, EvaluationError, np.linalg.LinAlgError):
+            return []  # forces have changed, and it turns back
+
+    def _along(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:
+        steps = self._steps(passage)
+        self._rest = passage.rest
         if steps:
             self._known, self._quiet, self._examine_below = False, False, np.inf
             self._sigma = float(steps[-1][0].sigmas[-1])

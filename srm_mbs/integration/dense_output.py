@@ -283,6 +283,8 @@ class StepData:
     @property
     def stiff_intervals(self) -> list[tuple[float, float]]:
         """Starts and ends (s) of the intervals of stiff steps."""
+        if not self.stiff.any():
+            return []
         edges = np.flatnonzero(np.diff(self.stiff, prepend=0.0, append=0.0)).tolist()
         return list(zip(self.times[edges[::2]].tolist(), self.times[edges[1::2]].tolist()))
 

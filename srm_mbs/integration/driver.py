@@ -284,14 +284,25 @@ def integrate(
         return False
 
     def pass_critical(zero: float | None) -> bool:
-        """Make the passage expected at ``zero`` (s), if steps cannot; whether it was made."""
-        if zero is None or passages is None:
+        """Make the passage expected at ``zero`` (s), or go on with one that is under way, if steps
+        cannot make it; whether it was made."""
+        if passages is None or (zero is None and not passages.under_way):
             return False
         end = t_end if breakpoints is None else breakpoints.end
-        past = passages.steps_past(t, x, memory.rate, zero, end)
+        if zero is None:
+            past = passages.steps_on(t, x, end)
+        else:
+            past = passages.steps_past(t, x, memory.rate, zero, end)
         if past and not any(accept(step, t_new) for step, t_new in past):
             control.moved(t)
         return bool(past)
+
+    def restarted() -> IntegratorState:
+        """``memory`` with the first stage at t evaluated again."""
+        if breakpoints is not None:
+            return breakpoints.past_jump(t, x, memory)
+        system.begin_step(t, x)
+        return method.resume(system, t, x, memory, norm)
 
     try:
         if events is not None:
@@ -300,8 +311,15 @@ def integrate(
             if breakpoints is not None and t >= breakpoints.end:
                 if record.times:
                     record.breaks.append(len(record.times))
-                memory = breakpoints.next(t, x, memory)
+                on_curve = passages is not None and passages.under_way
+                memory = breakpoints.next(t, x, memory, evaluated=not on_curve)
                 control.set_target_time(breakpoints.end)
+            if passages is not None and passages.under_way:
+                if not pass_critical(None):
+                    memory = restarted()
+                elif record.stop is not None:
+                    break
+                continue
             limit = min(max_step, system.step_limit(x), jump.limit)
             proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:
@@ -355,11 +373,7 @@ def integrate(
                 break
             if jump.found() and t < (t_end if breakpoints is None else breakpoints.end):
                 record.breaks.append(len(record.times))
-                if breakpoints is None:
-                    system.begin_step(t, x)
-                    memory = method.resume(system, t, x, memory, norm)
-                else:
-                    memory = breakpoints.past_jump(t, x, memory)
+                memory = restarted()
             if sink is not None and len(record.steps) >= sink.block:
                 sink.take(record.data(method.scheme, system.tangent_size))
                 record.rest = t, x

@@ -24,6 +24,7 @@ from srm_mbs.integration.control.step_size import (
     StepSizeControl,
     initial_step,
 )
+from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
 from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
@@ -56,6 +57,12 @@ class IncrementalRun(ABC):
         self.method: Method = self.options.method
         self._evaluator: Any = self.system
         self._systems: tuple[Any, ...] = (self.system,)
+
+    def _passages(self) -> CriticalPassages | None:
+        options = self.options
+        return examined_passages(
+            self.system, self.method, self.norm, options.placement, options.singular_tolerance
+        )
 
     @property
     @abstractmethod
@@ -177,6 +184,7 @@ class KernelRun(IncrementalRun):
             first_step=1.0,
             max_step=options.longest_step,
             placed=options.placement,
+            singular_tolerance=None if self._passages() is None else options.singular_tolerance,
         )
         self._go_on = self._run.go_on
 
@@ -239,6 +247,7 @@ class ReferenceRun(IncrementalRun):
     _control: StepSizeControl
     _memory: IntegratorState
     _nearness: SingularProximity
+    _examined: CriticalPassages | None
     _wrappers: Sequence[ControlWrapper] = ()
     _steps = _rejected = _zone_steps = 0
     _placed = _replaced = 0
@@ -255,7 +264,7 @@ class ReferenceRun(IncrementalRun):
     def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
         _, _, self._placed, self._replaced, _ = self._counts()
         self._t, self._state, self._memory = t, state.copy(), memory
-        self._nearness = SingularProximity()
+        self._nearness, self._examined = SingularProximity(), self._passages()
         self._control, self._wrappers = placed_control(self.system, self.options, lambda: first)
 
     def _matters(self, fresh: IntegratorState, span: float) -> bool:
@@ -275,7 +284,10 @@ class ReferenceRun(IncrementalRun):
         forces_jumped = forces_jumped or not np.array_equal(force, self.held.values[-1])
         self.held.only(force)
         self.system.between(first, last)
-        if forces_jumped:
+        passages = self._examined
+        if passages is not None:
+            passages.examined.clear()
+        if forces_jumped and not (passages is not None and passages.under_way):
             self._memory = self._renewed(self._memory, end)
         self._control.set_target_time(end, (self._t, grid) if grid else None)
         record = integrate(
@@ -288,6 +300,7 @@ class ReferenceRun(IncrementalRun):
             self._t,
             end,
             max_step=self.options.longest_step,
+            passages=passages,
         )
         if record.times:
             self._t, self._state = record.times[-1], record.steps[-1].state
@@ -308,7 +321,9 @@ class ReferenceRun(IncrementalRun):
         # Controls refer to what they are for: not to be copied, but to be exchanged.
         shared = {id(other.system): self.system, id(self.method.scheme): self.method.scheme}
         self._memory = copy.deepcopy(other._memory, dict(shared))
-        self._control, self._wrappers = copy.deepcopy((other._control, other._wrappers), shared)
+        self._control, self._wrappers, self._examined = copy.deepcopy(
+            (other._control, other._wrappers, other._examined), shared
+        )
         _, _, placed, replaced, _ = self._counts()
         self._placed, self._replaced = -placed, -replaced
 

@@ -19,7 +19,13 @@ from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
-from srm_mbs.simulation.options import RunOptions, check_embedded, finite, positive
+from srm_mbs.simulation.options import (
+    SINGULAR_TOLERANCE,
+    RunOptions,
+    check_embedded,
+    finite,
+    positive,
+)
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
     check_consistent,
@@ -47,7 +53,7 @@ class Simulator:
     ----------
     mechanism
         From :func:`srm_mbs.load`, or built from a ``pin.Model``.  It starts in its initial state.
-    method, tableau, rtol, atol, max_step, placement, backend
+    method, tableau, rtol, atol, max_step, placement, backend, singular_tolerance
         As for :func:`srm_mbs.simulate`.
     step
         Longest inner step (s) of fixed steps, instead of step-size control: each call is divided
@@ -71,6 +77,7 @@ class Simulator:
         max_step: float | None = None,
         placement: str = "automatic",
         backend: str = "auto",
+        singular_tolerance: float = SINGULAR_TOLERANCE,
     ) -> None:
         given = locals()  # every other parameter is an option
         del given["self"], given["mechanism"]

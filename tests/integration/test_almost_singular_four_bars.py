@@ -44,11 +44,8 @@ def test_a_four_bar_next_to_its_change_point_follows_the_length_of_its_coupler(
 @pytest.mark.parametrize(("backend", "d"), GRID)
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-9, 1e-12])
 def test_couplers_of_any_difference_turn_the_corner(
-    name: str, d: float, rtol: float, backend: str, request: pytest.FixtureRequest
+    name: str, d: float, rtol: float, backend: str
 ) -> None:
-    if name == "parallelogram" and abs(d) == 1e-12 and rtol == 1e-12:
-        # Sixteen passages; rounding over the width of the layer (docs/limits.md) is the bound.
-        request.applymarker(pytest.mark.xfail(strict=False))
     check(name, d, rtol, backend)
 
 

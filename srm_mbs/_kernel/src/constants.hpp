@@ -96,8 +96,8 @@ namespace srm {
     /* Critical configurations: singularities/critical.py, critical_passages.py. */                \
     field(int, critical_iterations)                                                                \
     field(double, critical_difference)     /* step of the differences of G^T u (units) */          \
-    field(double, critical_converged)                                                              \
-    field(double, critical_accepted)                                                               \
+    field(double, critical_accepted)       /* size of the equations: the residual is known */      \
+    field(double, critical_converged)      /* and that at rounding */                              \
     field(double, critical_frozen)         /* step up to which the Hessian is kept (units) */      \
     field(double, critical_ridge)          /* added to the Hessian's diagonal */                   \
     field(double, critical_reach)          /* of the search (units) */                             \
@@ -120,6 +120,9 @@ namespace srm {
     field(double, passage_turned)          /* last relative change of rates, over rtol */          \
     field(double, place_rounding)          /* of a place (units^2), times its distance */          \
     field(double, extrapolated)            /* |beta| from which the deviation is known */          \
+    field(double, panel_cut)               /* length of a panel that ends in a stop */             \
+    field(double, panel_cut_from)          /* and that below which it is cut so */                 \
+    field(double, smallest_rest)           /* of a passage, over its whole */                      \
     field(double, expected_steps)          /* steps within which a zero of sigma is examined */   \
     field(double, expected_sigma)          /* sigma below which it is, wherever it lies */
 

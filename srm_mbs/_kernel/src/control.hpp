@@ -31,6 +31,7 @@ struct Proposal {
        the last one (s) or 0, its tries, state of the arrival. */                           \
     field(double, slope)                                                                    \
     field(double, zero)                                                                     \
+    field(double, expected) /* the zero that is examined (s), or NaN */                     \
     field(double, redo)                                                                     \
     field(int, redone)                                                                      \
     field(int, arrival)                                                                     \
@@ -189,6 +190,7 @@ public:
         arrival_ = static_cast<Arrival>(s.arrival);
         slope_ = s.slope;
         zero_ = s.zero;
+        expected_ = s.expected;
         redo_ = s.redo;
         redone_ = s.redone;
         turning_ = s.turning;
@@ -199,6 +201,7 @@ public:
         s.arrival = static_cast<int>(arrival_);
         s.slope = slope_;
         s.zero = zero_;
+        s.expected = expected_;
         s.redo = redo_;
         s.redone = redone_;
         s.turning = turning_;

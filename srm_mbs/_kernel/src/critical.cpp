@@ -87,10 +87,30 @@ public:
         closures_.evaluate(x_, time_);
         choose_rows();
         take_rows();
-        if (!start()) return false;
+        moved_.assign(n_, 0.0);
+        return start() && iterate(constants_.critical_accepted);
+    }
+
+    // Completes `found`, to rounding, and by the Hessian there.
+    bool complete() {
+        go_back();
+        iterate(constants_.critical_converged);
+        go_back();
+        if (!differentiate(true)) return false;
+        found.hessian = hessian_;
+        found.rows = chosen_;
+        return true;
+    }
+
+    CriticalConfiguration found;
+
+private:
+    // Newton's iteration from (q, u) until the equations are smaller than `converged`; whether they
+    // hold.
+    bool iterate(double converged) {
         const int size = n_ + rank_ + 1;
-        std::vector<double> value(size), matrix, moved(n_, 0.0);
-        double last_move = std::numeric_limits<double>::infinity(), best = last_move;
+        std::vector<double> value(size), matrix;
+        double best = std::numeric_limits<double>::infinity();
         for (int i = 0; i < constants_.critical_iterations; ++i) {
             fill_value(value);
             const double error = largest(value.data(), size);
@@ -102,16 +122,16 @@ public:
                 found.t = time_;
                 found.u = u_;
             }
-            if (error <= constants_.critical_converged) break;
-            if (last_move > constants_.critical_frozen && !differentiate()) return false;
+            if (error <= converged) break;
+            if (last_move_ > constants_.critical_frozen && !differentiate()) return false;
             fill_matrix(matrix);
             for (double& v : value) v = -v;
             if (!solve(matrix, value)) return false;
-            last_move = largest(value.data(), n_);
-            if (!(last_move < constants_.critical_reach)) return false;
+            last_move_ = largest(value.data(), n_);
+            if (!(last_move_ < constants_.critical_reach)) return false;
             closures_.move(value.data(), x_, time_);
-            add(1.0, value.data(), moved.data(), n_);
-            if (!(largest(moved.data(), n_) < constants_.critical_reach)) return false;
+            add(1.0, value.data(), moved_.data(), n_);
+            if (!(largest(moved_.data(), n_) < constants_.critical_reach)) return false;
             add(1.0, value.data() + n_, u_.data(), rank_);
             const double length = norm(u_.data(), rank_);
             for (double& u : u_) u /= length;
@@ -122,22 +142,15 @@ public:
         return best < constants_.critical_accepted;
     }
 
-    // Completes `found` by the Hessian there.
-    bool complete() {
+    void go_back() {
         x_ = found.x;
         time_ = found.t;
         u_ = found.u;
         closures_.evaluate(x_, time_);
         take_rows();
-        if (!differentiate()) return false;
-        found.hessian = hessian_;
-        found.rows = chosen_;
-        return true;
+        delta_ = found.residual;
     }
 
-    CriticalConfiguration found;
-
-private:
     void take_rows() {
         for (int i = 0; i < rank_; ++i) {
             g_[i] = closures_.g[chosen_[i]];
@@ -201,24 +214,30 @@ private:
         }
     }
 
-    // The Hessian of u . g, by differences of G^T u.
-    bool differentiate() {
+    // The Hessian of u . g, by differences of G^T u: for Newton's steps from here, or central ones.
+    bool differentiate(bool central = false) {
         hessian_.assign(static_cast<std::size_t>(n_) * n_, 0.0);
         std::vector<double> here(n_, 0.0), e(n_);
         for (int i = 0; i < rank_; ++i) add(u_[i], &G_[i * n_], here.data(), n_);
         for (int j = 0; j < n_; ++j) {
             std::fill(e.begin(), e.end(), 0.0);
-            e[j] = constants_.critical_difference;
-            std::vector<double> x(x_);
-            double time = time_;
-            closures_.move(e.data(), x, time);
-            closures_.evaluate(x, time);
-            for (int i = 0; i < rank_; ++i) {
-                const double* row = &closures_.G[chosen_[i] * n_];
-                for (int k = 0; k < n_; ++k) hessian_[k * n_ + j] += u_[i] * row[k];
+            const double length = constants_.critical_difference;
+            for (const double sign : {1.0, -1.0}) {
+                e[j] = sign * length;
+                if (sign < 0.0 && !central) break;
+                std::vector<double> x(x_);
+                double time = time_;
+                closures_.move(e.data(), x, time);
+                closures_.evaluate(x, time);
+                for (int i = 0; i < rank_; ++i) {
+                    const double* row = &closures_.G[chosen_[i] * n_];
+                    for (int k = 0; k < n_; ++k) hessian_[k * n_ + j] += sign * u_[i] * row[k];
+                }
             }
-            for (int k = 0; k < n_; ++k)
-                hessian_[k * n_ + j] = (hessian_[k * n_ + j] - here[k]) / e[j];
+            for (int k = 0; k < n_; ++k) {
+                double& value = hessian_[k * n_ + j];
+                value = central ? value / (2.0 * length) : (value - here[k]) / length;
+            }
         }
         return finite(hessian_.data(), n_ * n_);
     }
@@ -245,7 +264,8 @@ private:
     UnitClosures& closures_;
     const Constants& constants_;
     const int n_, all_, rank_;
-    std::vector<double> g_, G_, u_, hessian_, x_;
+    std::vector<double> g_, G_, u_, hessian_, x_, moved_;
+    double last_move_ = std::numeric_limits<double>::infinity();
     std::vector<int> chosen_;
     double time_ = 0.0, delta_ = 0.0;
 };

@@ -95,6 +95,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<SmoothIntervals>(m, "SmoothIntervals");
     bind_struct<Collocation>(m, "Collocation");
     bind_struct<RunOptions>(m, "RunOptions");
+    nb::class_<MotionAlongCurve>(m, "MotionAlongCurve");
     bind_struct<RunSnapshot>(m, "RunSnapshot");
     bind_struct<Curve>(m, "Curve");
     bind_struct<Anchor>(m, "Anchor");

@@ -49,13 +49,14 @@ void extend(Vector& basis, int n, int more) {
 // The curve of closed configurations beside a critical one: CurveThroughSaddle.
 class SaddleCurve {
 public:
-    SaddleCurve(UnitClosures& closures, const CriticalConfiguration& critical, const Vector& x, double t,
-          bool exact, const Constants& constants)
+    SaddleCurve(UnitClosures& closures, const MotionAlongCurve& motion, const Vector& x, double t,
+                const Constants& constants)
         : closures_(closures),
-          critical_(critical),
+          critical_(motion.critical),
           n_(closures.n),
-          rank_(static_cast<int>(critical.rows.size())),
-          exact_(exact) {
+          rank_(static_cast<int>(critical_.rows.size())),
+          exact_(motion.exact) {
+        const CriticalConfiguration& critical = critical_;
         if (n_ - rank_ != 1) throw NoPassage{};
         strong_ = critical.u;
         extend(strong_, rank_, rank_ - 1);
@@ -97,14 +98,20 @@ public:
         kept_ = positive ? of_low : of_high;
         along = positive ? of_high : of_low;
         const double of_kept = positive ? -low : high, of_along = positive ? high : -low;
-        level_ = exact ? 0.0 : 2.0 * std::abs(delta_) / of_kept;
+        level_ = exact_ ? 0.0 : 2.0 * std::abs(delta_) / of_kept;
         ratio_ = of_along / of_kept;
         width = std::sqrt(level_ / ratio_);
+        layer = std::sqrt(2.0 * std::abs(delta_) / of_along);
+        if (motion.begun) {
+            beta = motion.beta;
+            side = motion.side;
+            return;
+        }
         Vector away(n_), on(n_), slope(n_);
         closures_.difference(critical.x, critical.t, x, t, away.data());
         beta = dot(along.data(), away.data(), n_);
         const double beside = dot(kept_.data(), away.data(), n_);
-        sign_ = (exact ? beside * beta : beside) > 0.0 ? 1.0 : -1.0;
+        side = (exact_ ? beside * beta : beside) > 0.0 ? 1 : -1;
         hyperbola(beta, on, slope);
         const double distance = norm(away.data(), n_);
         add(-1.0, on.data(), away.data(), n_);
@@ -114,7 +121,7 @@ public:
     // The point of the hyperbola at `at`, as a displacement from q*, and its derivative.
     void hyperbola(double at, Vector& away, Vector& slope) const {
         double kept = std::sqrt(level_ + ratio_ * at * at), rise = ratio_ * at / kept;
-        const double sign = exact_ && at < 0.0 ? -sign_ : sign_;
+        const double sign = exact_ && at < 0.0 ? -side : side;
         kept *= sign;
         rise *= sign;
         for (int j = 0; j < n_; ++j) {
@@ -152,6 +159,8 @@ public:
     }
 
     double beta = 0.0, width = 0.0;
+    double layer = 0.0;  // the width, also if the residual counts as zero
+    int side = 1;
     Vector along;
 
 private:
@@ -185,7 +194,7 @@ private:
     const CriticalConfiguration& critical_;
     const int n_, rank_;
     const bool exact_;
-    double delta_ = 0.0, level_ = 0.0, ratio_ = 1.0, sign_ = 1.0;
+    double delta_ = 0.0, level_ = 0.0, ratio_ = 1.0;
     Vector strong_, kept_, values_, rows_, matrix_;
 };
 
@@ -205,12 +214,12 @@ struct Found {
 
 class Passage {
 public:
-    Passage(UnitClosures& closures, const CriticalConfiguration& critical, double t,
-            const Vector& state, double end, bool exact, double rtol,
-            const Collocation& collocation, const Constants& constants)
+    Passage(UnitClosures& closures, MotionAlongCurve& motion, double t, const Vector& state,
+            double end, double rtol, const Collocation& collocation, const Constants& constants)
         : closures_(closures),
           system_(closures.system),
-          critical_(critical),
+          critical_(motion.critical),
+          motion_(motion),
           constants_(constants),
           collocation_(collocation),
           count_(static_cast<int>(collocation.nodes.size())),
@@ -220,25 +229,31 @@ public:
           driven_(system_.driven()),
           rtol_(rtol),
           end_(end),
-          curve_(closures, critical, state, t, exact, constants) {
+          curve_(closures, motion, state, t, constants) {
         Vector rates(n_);
         for (int j = 0; j < nv_; ++j) rates[j] = state[nq_ + j] / closures.unit(j);
         if (driven_) rates[nv_] = 1.0 / closures.time_unit;
-        const double start = curve_.beta;
-        Node here = evaluated(state, t, start, rates, true);
+        const bool begun = motion.begun;
+        const double beta = curve_.beta, start = begun ? motion.start : beta;
+        motion.start = start;
+        Node here = evaluated(state, t, beta, rates, closes(beta), begun && rounded(beta));
         here.x = state;
         here.time = t;
-        if (!(dot(rates.data(), here.tangent.data(), n_) * start < 0.0)) throw NoPassage{};
+        if (!begun && !(dot(rates.data(), here.tangent.data(), n_) * start < 0.0))
+            throw NoPassage{};
         heading_ = start > 0.0 ? -1.0 : 1.0;
         width_ = curve_.width > 0.0 ? curve_.width : std::abs(start);
         const double speed = dot(curve_.along.data(), rates.data(), n_);
-        energy_ = 0.5 * here.inertia * speed * speed;
+        energy_ = begun ? motion.energy : 0.5 * here.inertia * speed * speed;
         clock_ = t;
         found_.push_back({std::move(here), energy_, t});
         const double reach = std::asinh(std::abs(start) / width_);
-        const Vector edges = panel_edges(reach, !exact);
-        for (std::size_t k = 0; k + 1 < edges.size() && clock_ < end_; ++k)
-            panel(heading_ * edges[k], heading_ * edges[k + 1]);
+        const Vector edges = panel_edges(reach, !motion.exact);
+        double at = begun ? heading_ * std::asinh(beta / width_) : edges.front();
+        motion.side = curve_.side;
+        motion.begun = false;
+        for (std::size_t k = 1; k < edges.size(); ++k)
+            while (at < edges[k] && clock_ < end_) at = panel(at, edges[k]);
         if (clock_ < end_) {
             point(-start, energy_, clock_);
             if (driven_) found_.back().t = found_.back().node.time;
@@ -263,11 +278,32 @@ public:
     }
 
 private:
-    // The node next to a place, from one evaluation there with the rates (n,), in units.
-    Node evaluated(const Vector& x, double t, double beta, const Vector& rates, bool closed) {
+    // Whether the closures are to hold at beta, also where their residual counts as zero: where it
+    // turns the curve by less than the tolerance, and at the ends.
+    bool closes(double beta) const {
+        return rtol_ * beta * beta > curve_.layer * curve_.layer ||
+               !(std::abs(beta) < std::abs(motion_.start));
+    }
+
+    // Whether rounding turns the normals at beta, on a curve that leads straight through the critical
+    // configuration, by more than the tolerance.
+    bool rounded(double beta) const {
+        return motion_.exact && constants_.place_rounding > rtol_ * beta * beta;
+    }
+
+    // The node next to a place, from one evaluation there with the rates (n,), in units; `known`: it
+    // is there, and the rates are along the curve.
+    Node evaluated(const Vector& x, double t, double beta, const Vector& rates, bool closed,
+                   bool known = false) {
         Node node;
-        Vector step;
-        curve_.linearise(x, t, beta, closed, step, node.tangent);
+        Vector step(n_, 0.0);
+        if (known) {
+            node.tangent = rates;
+            const double length = dot(curve_.along.data(), rates.data(), n_);
+            for (double& value : node.tangent) value /= length;
+        } else {
+            curve_.linearise(x, t, beta, closed, step, node.tangent);
+        }
         const double grown = growth(x, t, node.tangent);
         for (double& value : node.tangent) value /= grown;
         Vector state(x);
@@ -277,8 +313,9 @@ private:
         Vector bias(system_.bias());
         for (std::size_t i = 0; i < bias.size(); ++i)
             bias[i] *= system_.residual_scale(static_cast<int>(i));
-        Vector turned, own(nv_), mass(nv_), all(nv_), working(nv_), turning(nv_), inertial(nv_);
-        curve_.solve_bend(bias, turned);
+        Vector turned(n_, 0.0), own(nv_), mass(nv_), all(nv_), working(nv_), turning(nv_);
+        Vector inertial(nv_);
+        if (!known) curve_.solve_bend(bias, turned);
         for (int j = 0; j < nv_; ++j) {
             own[j] = node.tangent[j] * closures_.unit(j);
             turning[j] = turned[j] * closures_.unit(j);
@@ -408,22 +445,38 @@ private:
         return change <= (constants_.passage_turned * rtol_ + rounding / distance) * most;
     }
 
-    void panel(double a, double b) {
+    // Goes on along the panel from a to b, of xi times the heading, or only to a place behind the
+    // end of the passage; returns where it led.
+    double panel(double a, double b) {
         const Vector& x = collocation_.nodes;
-        const double start = width_ * std::sinh(a), power = found_.back().node.power;
+        const double start = width_ * std::sinh(heading_ * a), power = found_.back().node.power;
         Vector slope(count_), t(count_ + 1), energies(count_ + 1), times(count_ + 1);
         Vector works(count_), durations(count_);
         std::vector<Node> nodes(count_);
-        for (int i = 0; i < count_; ++i) {
-            const double xi = a + (b - a) * x[i], beta = width_ * std::sinh(xi);
-            const double energy = energy_ + power * (beta - start);
-            if (!(energy > 0.0)) throw NoPassage{};
-            double rate;
-            nodes[i] = predicted(beta, energy, rate);
-            slope[i] = width_ * std::cosh(xi) * (b - a);
-            durations[i] = slope[i] / rate;
+        Vector own{0.0};
+        own.insert(own.end(), x.begin(), x.end());
+        own.push_back(1.0);
+        const auto with_start = [](double first, const Vector& values) {
+            Vector out{first};
+            out.insert(out.end(), values.begin(), values.end());
+            return out;
+        };
+        for (;;) {
+            for (int i = 0; i < count_; ++i) {
+                const double xi = heading_ * (a + (b - a) * x[i]), beta = width_ * std::sinh(xi);
+                const double energy = energy_ + power * (beta - start);
+                if (!(energy > 0.0)) throw NoPassage{};
+                double rate;
+                nodes[i] = predicted(beta, energy, rate);
+                slope[i] = width_ * std::cosh(xi) * heading_ * (b - a);
+                durations[i] = slope[i] / rate;
+            }
+            integrate(durations, clock_, t);
+            if (!(t[count_] > end_)) break;
+            const double length = constants_.panel_cut * bisected(own, with_start(clock_, t), end_);
+            if (!(length < constants_.panel_cut_from)) break;
+            b = a + length * (b - a);
         }
-        integrate(durations, clock_, t);
         for (int i = 0; i < count_; ++i) nodes[i] = again(nodes[i], t[i], false);
         for (int sweep = 0;; ++sweep) {
             if (sweep == constants_.passage_sweeps) throw NoPassage{};
@@ -449,19 +502,60 @@ private:
         const double begin = clock_, energy_before = energy_;
         energy_ = energies[count_];
         clock_ = times[count_];
+        // The end of the run, or of its smooth interval, may lie in the panel.
+        const bool ends = clock_ >= end_;
+        double at = 0.0;
+        Node last;
+        if (ends) {
+            at = bisected(own, with_start(begin, times), end_);
+            motion_.beta = width_ * std::sinh(heading_ * (a + (b - a) * at));
+            motion_.energy = interpolated(own, with_start(energy_before, energies), at);
+            motion_.begun = heading_ * motion_.beta <
+                            (1.0 - constants_.smallest_rest) * std::abs(motion_.start);
+            if (rounded(motion_.beta)) last = between(nodes, at, motion_.beta);
+        }
         for (int i = 0; i < count_; ++i) {
             const double time = driven_ ? nodes[i].time : times[i];
             if (time < end_) found_.push_back({std::move(nodes[i]), energies[i], time});
         }
-        if (!(clock_ >= end_)) return;
-        // The end of the run or of its smooth interval lies in the panel.
-        Vector own{0.0}, clock{begin}, energetic{energy_before};
-        own.insert(own.end(), x.begin(), x.end());
-        own.push_back(1.0);
-        clock.insert(clock.end(), times.begin(), times.end());
-        energetic.insert(energetic.end(), energies.begin(), energies.end());
-        const double at = bisected(own, clock, end_);
-        point(width_ * std::sinh(a + (b - a) * at), interpolated(own, energetic, at), end_);
+        if (!ends) return b;
+        if (rounded(motion_.beta))
+            found_.push_back({std::move(last), motion_.energy, end_});
+        else
+            point(motion_.beta, motion_.energy, end_);
+        return b;
+    }
+
+    // The node at beta, a part `at` of the panel with the nodes, by interpolation.
+    Node between(const std::vector<Node>& nodes, double at, double beta) {
+        const Vector& x = collocation_.nodes;
+        Vector values(count_), away(n_);
+        std::vector<Vector> places(count_, Vector(n_));
+        for (int i = 0; i < count_; ++i)
+            closures_.difference(critical_.x, critical_.t, nodes[i].x, nodes[i].time,
+                                 places[i].data());
+        const auto through = [&](auto value_of) {
+            for (int i = 0; i < count_; ++i) values[i] = value_of(i);
+            return interpolated(x, values, at);
+        };
+        Node out;
+        out.beta = beta;
+        out.tangent.resize(n_);
+        out.acceleration.resize(nv_);
+        for (int j = 0; j < n_; ++j) {
+            away[j] = through([&](int i) { return places[i][j]; });
+            out.tangent[j] = through([&](int i) { return nodes[i].tangent[j]; });
+        }
+        for (int j = 0; j < nv_; ++j)
+            out.acceleration[j] = through([&](int i) { return nodes[i].acceleration[j]; });
+        out.rates = out.tangent;
+        out.inertia = through([&](int i) { return nodes[i].inertia; });
+        out.power = through([&](int i) { return nodes[i].power; });
+        out.sigma = std::abs(through([&](int i) { return nodes[i].sigma; }));
+        out.x = critical_.x;
+        out.time = critical_.t;
+        closures_.move(away.data(), out.x, out.time);
+        return out;
     }
 
     // start + the integrals of `values` (k,) up to the nodes and to the end (k + 1,).
@@ -472,13 +566,13 @@ private:
     }
 
     // Goes on to beta, where the motion has the kinetic energy (J) at t; a residual that counts as
-    // zero is closed again.
+    // zero is closed again where it can be.
     void point(double beta, double energy, double t) {
         double rate;
         Node node = predicted(beta, energy, rate);
         for (int sweep = 0;; ++sweep) {
             if (sweep == constants_.passage_sweeps) throw NoPassage{};
-            node = again(node, t, true);
+            node = again(node, t, closes(beta));
             rate = speed(node, energy);
             if (solved(node, rate)) break;
             set_rates(node, rate);
@@ -550,6 +644,7 @@ private:
     UnitClosures& closures_;
     System& system_;
     const CriticalConfiguration& critical_;
+    MotionAlongCurve& motion_;
     const Constants& constants_;
     const Collocation& collocation_;
     const int count_, nq_, nv_, n_;
@@ -562,16 +657,15 @@ private:
 
 }  // namespace
 
-std::vector<PassagePoint> passage_along_curve(UnitClosures& closures,
-                                              const CriticalConfiguration& critical, double t,
+std::vector<PassagePoint> passage_along_curve(System& system, MotionAlongCurve& motion, double t,
                                               const std::vector<double>& state, double end,
-                                              bool exact, double rtol,
-                                              const Collocation& collocation,
+                                              double rtol, const Collocation& collocation,
                                               const Constants& constants) {
+    UnitClosures closures(system, motion.time_unit);
     try {
-        return Passage(closures, critical, t, state, end, exact, rtol, collocation, constants)
-            .points();
+        return Passage(closures, motion, t, state, end, rtol, collocation, constants).points();
     } catch (const NoPassage&) {
+        motion.begun = false;
         return {};
     }
 }

@@ -27,14 +27,23 @@ struct PassagePoint {
     std::vector<double> rate;   // (2 nv,)
 };
 
-// The points of the motion from `state` at t past a critical configuration, along the curve of
+// A motion past a critical configuration, along a curve of closed configurations: PlaceOnCurve.
+struct MotionAlongCurve {
+    CriticalConfiguration critical;
+    double time_unit;
+    bool exact;          // the residual counts as zero
+    bool begun = false;  // the other fields are known
+    int side = 0;        // of the branches
+    double start = 0.0, beta = 0.0, energy = 0.0;
+};
+
+// The points of the motion from `state` at t past the critical configuration, along the curve of
 // closed configurations, up to the time `end`; the start is the first of them.  Empty if the motion
-// has no such passage.  Throws EvaluationError.  `exact`: the residual counts as zero.
-std::vector<PassagePoint> passage_along_curve(UnitClosures& closures,
-                                              const CriticalConfiguration& critical, double t,
+// has no such passage.  Throws EvaluationError.  `motion` is then where it stops at `end`; it has
+// not begun if it does not.
+std::vector<PassagePoint> passage_along_curve(System& system, MotionAlongCurve& motion, double t,
                                               const std::vector<double>& state, double end,
-                                              bool exact, double rtol,
-                                              const Collocation& collocation,
+                                              double rtol, const Collocation& collocation,
                                               const Constants& constants);
 
 }  // namespace srm

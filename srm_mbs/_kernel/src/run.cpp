@@ -114,6 +114,7 @@ double Run::direct_from() const {
 
 // Evaluates the first stage of an interval; whether it can be, and is accurate.
 bool Run::restart_interval() {
+    if (passage_) return true;
     system.begin_step(t_, state.data());
     try {
         system.evaluate(t_, state.data(), System::ZoneView{});
@@ -164,6 +165,7 @@ void Run::resume(double t, const std::vector<double>& from, IntegratorState know
     enter_interval();
     state = from;
     prepared_.clear();
+    passage_.reset();
     memory = std::move(known);
     control->resume(known_control);
 }
@@ -176,6 +178,10 @@ RunSnapshot Run::snapshot() const {
     control->save(out.control);
     out.open_residual = open_residual_;
     out.search_below = search_below_;
+    out.known = known_;
+    out.quiet = quiet_;
+    out.examine_below = examine_below_;
+    out.passage = passage_;
     return out;
 }
 
@@ -183,10 +189,20 @@ void Run::restore(const RunSnapshot& snapshot) {
     resume(snapshot.t, snapshot.state, snapshot.memory, snapshot.control);
     open_residual_ = snapshot.open_residual;
     search_below_ = snapshot.search_below;
+    known_ = snapshot.known;
+    quiet_ = snapshot.quiet;
+    examine_below_ = snapshot.examine_below;
+    passage_ = snapshot.passage;
 }
 
 Stop Run::attempt(StepDecision& decision) {
     if (!prepared_.empty()) return make_prepared();
+    if (passage_) {
+        follow(*std::exchange(passage_, std::nullopt));
+        if (!prepared_.empty()) return make_prepared();
+        // Forces have changed, and it turns back.
+        if (!restart_interval()) return Stop::breakpoint;
+    }
     const double limit =
         std::min({max_step_, system.step_limit(state.data()), jump_limit_});
     const Proposal proposal = control->propose(t_, limit, memory);
@@ -282,21 +298,29 @@ bool Run::examine(double zero) {
     const double residual = std::abs(critical->residual);
     if (!(residual > constants().rounded_residual)) return false;
     const bool avoided = residual > singular_tolerance_;
-    if (avoided || residual > constants().disturbing * rtol) {
-        try {
-            follow(passage_along_curve(closures, *critical, t_, state, intervals_.ends[interval_],
-                                       !avoided, rtol, collocation_, constants()));
-        } catch (const EvaluationError&) {
-            // Steps pass it as well as they can, and the message says so.
-        }
-    }
+    // Steps may pass a residual that is far below the tolerance, but not end beside it.
+    const bool disturbs = residual > constants().disturbing * rtol;
+    if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_))
+        follow({*critical, closures.time_unit, !avoided});
     known_ = known_ || !prepared_.empty();
     if (known_) examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});
     return !prepared_.empty();
 }
 
+// Prepares the steps of a passage up to the end of the interval; none if there is none, so that
+// steps make it as well as they can, and the message says so.
+void Run::follow(MotionAlongCurve motion) {
+    try {
+        prepare(passage_along_curve(system, motion, t_, state, intervals_.ends[interval_],
+                                    step.norm.rtol, collocation_, constants()));
+    } catch (const EvaluationError&) {
+        return;
+    }
+    if (motion.begun) passage_ = std::move(motion);
+}
+
 // Prepares the steps from point to point.
-void Run::follow(const std::vector<PassagePoint>& points) {
+void Run::prepare(const std::vector<PassagePoint>& points) {
     const int nv = system.nv, n = 2 * nv, stages = step.scheme.stages();
     const double first = step.scheme.b.front();
     std::vector<double> abscissae(step.scheme.c);
@@ -367,6 +391,7 @@ void Run::drop_records() {
 Stop Run::go_on(double end, double first, double last, bool forces_jump,
                 double grid, double seconds) {
     drop_records();
+    examined.clear();
     made_ = 0;
     t0_ = t_;
     smallest_ = constants().smallest_step * std::abs(end - t_);

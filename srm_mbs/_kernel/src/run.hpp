@@ -97,7 +97,12 @@ struct StepRecords {
     field(ControlState, control)                                                   \
     /* Thresholds that change over a run: see Run. */                              \
     field(double, open_residual)                                                   \
-    field(double, search_below)
+    field(double, search_below)                                                    \
+    /* Passages next to critical configurations: see Run. */                       \
+    field(bool, known)                                                             \
+    field(bool, quiet)                                                             \
+    field(double, examine_below)                                                   \
+    field(std::optional<MotionAlongCurve>, passage)
 
 // Everything that the next step depends on.
 struct RunSnapshot {
@@ -163,7 +168,8 @@ private:
     std::optional<double> crossing(const StepResult& result) const;
     bool examine(double zero);
     bool misses_jump(const Proposal& proposal, const StepResult& result);
-    void follow(const std::vector<PassagePoint>& points);
+    void follow(MotionAlongCurve motion);
+    void prepare(const std::vector<PassagePoint>& points);
     Stop make_prepared();
     void record(const StepResult& result, double t, int placement);
     void enter_interval();
@@ -204,6 +210,7 @@ private:
     double examine_below_ = std::numeric_limits<double>::infinity();
     // Steps along a curve that are still to be made, the next one last, and their ends.
     std::vector<std::pair<StepResult, double>> prepared_;
+    std::optional<MotionAlongCurve> passage_;  // one that is under way
 };
 
 }  // namespace srm

@@ -194,6 +194,8 @@ class CurveThroughSaddle:
         That of q.
     width
         |beta| at which the curve leaves its asymptotes; 0 if it leads straight through q*.
+    layer
+        As ``width``, also if the residual counts as zero.
     along : (n,)
         Direction of beta.
 
@@ -226,6 +228,7 @@ class CurveThroughSaddle:
         self._level = 0.0 if exact else 2.0 * abs(delta) / of_kept
         self._ratio = of_along / of_kept
         self.width = float(np.sqrt(self._level / self._ratio))
+        self.layer = float(np.sqrt(2.0 * abs(delta) / of_along))
         away = geometry.difference(critical.q, q)
         self.beta = float(self.along @ away)
         beside = float(self._kept @ away)

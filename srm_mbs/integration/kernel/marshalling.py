@@ -140,7 +140,7 @@ def constants() -> Any:
         # Critical configurations.
         critical_iterations=critical.ITERATIONS,
         critical_difference=critical.DIFFERENCE,
-        critical_converged=critical.DECIDED,
+        critical_converged=critical.CONVERGED,
         critical_accepted=critical.DECIDED,
         critical_frozen=critical.FROZEN,
         critical_ridge=critical.RIDGE,
@@ -164,6 +164,9 @@ def constants() -> Any:
         passage_turned=critical_passages.TURNED,
         place_rounding=critical_passages.PLACE_ROUNDING,
         extrapolated=critical_passages.EXTRAPOLATED,
+        panel_cut=critical_passages.CUT,
+        panel_cut_from=critical_passages.CUT_FROM,
+        smallest_rest=critical_passages.SMALLEST_REST,
         expected_steps=placement.EXPECTED_STEPS,
         expected_sigma=placement.EXPECTED_SIGMA,
     )
@@ -273,6 +276,7 @@ _CONTROL_START = {
     "index": 1,
     "slope": 0.0,
     "zero": np.nan,
+    "expected": np.nan,
     "redo": 0.0,
     "redone": 0,
     "arrival": 0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from enum import IntEnum
 from typing import Any
@@ -230,6 +231,10 @@ class CompiledRun:
                 control=marshalling.control_struct(h=first_step),
                 open_residual=driver.RESIDUAL_EXAMINED,
                 search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
+                known=False,
+                quiet=False,
+                examine_below=math.inf,
+                passage=None,
             )
         )
 

@@ -550,6 +550,9 @@ _EVALUATORS = {
 }
 
 
+_LAWFUL = LawEvaluator | TorsionSpringEvaluator | LimitSpringEvaluator
+
+
 @per_model
 def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
     """The force elements of ``mechanism``, resolved once; None if it has none."""
@@ -698,6 +701,39 @@ class ForceKinematics:
                 element.add(along, data, q, v, 0.0)
         between = [e for e in self._elements if isinstance(e, LawEvaluator)]
         return along, [e.laws(data, step.get(e)) for e in between]
+
+    def of_laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: Mapping[Evaluator, BushingStep] = MappingProxyType({}),
+    ) -> FloatArray:
+        """Generalised forces (nv,) of all elements with laws; ``step`` as for
+        :meth:`generalised`."""
+        tau = self.laws(data, q, v, step)[0]
+        for element in self._elements:
+            if isinstance(element, LawEvaluator):
+                element.apply(tau, data, element.laws(data, step.get(element)), step.get(element))
+        return tau
+
+    def without_laws(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """Generalised forces (nv,) of all other elements."""
+        tau = np.zeros(self._nv)
+        for element in self._elements:
+            if not isinstance(element, _LAWFUL):
+                element.add(tau, data, q, v, t)
+        return tau
+
+    @property
+    def has_laws(self) -> bool:
+        """Whether elements have laws."""
+        return any(isinstance(element, _LAWFUL) for element in self._elements)
+
+    @property
+    def law_count(self) -> int:
+        """Number of the laws of elements between links."""
+        return sum(e.law_count for e in self._elements if isinstance(e, LawEvaluator))
 
     def generalised_with(
         self,

@@ -330,6 +330,12 @@ class Mechanics(Manifold):
             acted[self._forces.coordinates()] = True
         return np.flatnonzero(acted)
 
+    @cached_property
+    def _joined(self) -> ForceKinematics | None:
+        """The elements, if the generalised forces of all laws are one law; see
+        :attr:`ClosedSystem.laws`."""
+        return None
+
     @property
     def laws(self) -> FloatArray:
         """Values (m,) of the laws of forces at the stage evaluated last: those of the coordinates
@@ -356,6 +362,8 @@ class Mechanics(Manifold):
         """Damping and friction, or what acts in place of the laws of the coordinates."""
         if self._applied is None:
             return self.damping_force(v) + self.friction_force(v)
+        if self._joined is not None:
+            return self._applied
         force = np.zeros(self.nv)
         force[self._law_coordinates] = self._applied[: len(self._law_coordinates)]
         return force
@@ -366,6 +374,8 @@ class Mechanics(Manifold):
         """The generalised forces (nv,) of the elements, or of what acts in place of their laws."""
         if self._applied is None:
             return forces.generalised(self.data, q, v, t, self._bushings)
+        if self._joined is not None:
+            return forces.without_laws(self.data, q, v, t)
         applied = self._applied[len(self._law_coordinates) :]
         return forces.generalised_with(self.data, q, v, t, applied, self._bushings)
 
@@ -529,6 +539,26 @@ class ClosedSystem(Mechanics):
         """The rows of closures and drives that are in use, with memory of their own."""
         curves = self.mechanism.drive_curves
         return _rows_in_use(self.mechanism).copy_workspace().follow(curves)
+
+    @cached_property
+    def _joined(self) -> ForceKinematics | None:
+        forces = self._forces
+        if forces is None or not forces.has_laws:
+            return None
+        count = len(self._law_coordinates) + forces.law_count
+        return forces if count > self.nv - self.structure.rank else None
+
+    @property
+    def laws(self) -> FloatArray:
+        """As for open mechanisms; but more laws than degrees of freedom are one, because closures
+        may take up forces far larger than those that move the mechanism: M (1 - P) M^-1 times
+        their generalised forces (nv,), which is what closures leave of them."""
+        if self._joined is None:
+            return super().laws
+        q, v = self._laws_at
+        force = self.damping_force(v) + self.friction_force(v)
+        force = force + self._joined.of_laws(self.data, q, v, self._bushings)
+        return self.projection.tangential_force(force)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""

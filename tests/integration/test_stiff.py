@@ -14,9 +14,19 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
-from tests.support.stiff import bushed_four_bar, bushed_reference, follower, rubbing
+from tests.support.reduced import slider_crank
+from tests.support.stiff import (
+    bushed_four_bar,
+    bushed_reference,
+    by_radau,
+    driven_reference,
+    follower,
+    guided_four_bar,
+    rubbing,
+)
 
 BACKENDS = ("kernel", "python")
 
@@ -137,6 +147,86 @@ def test_undamped_stiff_springs_stay_with_explicit_steps() -> None:
         assert np.array_equal(run.q, own.q)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_cost_does_not_grow_with_forces_that_closures_take_up(backend: str) -> None:
+    """A bushing with two directions on one degree of freedom: across the path of its point the
+    force is proportional to the damping, and no motion follows from it."""
+    steps, ends = [], []
+    for tau in (1e-4, 1e-6, 1e-8):
+        run = srm.simulate(guided_four_bar(tau), 0.15, tableau="rodas5p", backend=backend)
+        steps.append(run.stats.steps)
+        ends.append(end_of(run)[:3])
+    assert max(steps) < 1.6 * min(steps)
+    # The limit of infinite damping is met to the order of the time constant.
+    np.testing.assert_allclose(ends[1], ends[2], rtol=0.0, atol=1e-5)
+
+
+# Singular configurations, drives, friction that turns
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_a_stiff_motion_passes_a_singular_configuration(rtol: float, backend: str) -> None:
+    """Equal bars, driven from 45 to 137 degrees by an overdamped spring on the crank: the bars
+    fold at 90 degrees.  2 (4/3 + 4 sin^2) theta'' = ... - c theta' - k (theta - 2.4), by Radau."""
+    c, rest = 1e5, 2.4
+    spring = srm.TorsionSpring("crank", stiffness=5.0 * c, rest_angle=rest, damping=c)
+    mechanism = srm.load("slider_crank_whirl")
+    times = np.linspace(0.05, 0.5, 10)
+    run = srm.simulate(
+        replace(mechanism, forces=(spring,)), 0.5, t_eval=times, rtol=rtol, backend=backend
+    )
+    free = slider_crank()
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        torque = 0.5 * (-c * y[1] - 5.0 * c * (y[0] - rest))
+        return [y[1], free(t, y)[1] + torque / (4.0 / 3.0 + 4.0 * np.sin(y[0]) ** 2)]
+
+    expected = by_radau(field, [mechanism.q0[0], mechanism.v0[0]], times)
+    assert run.success
+    assert run.settings.stiff
+    assert run.q[0, 0] < 0.5 * np.pi < run.q[-1, 0]
+    np.testing.assert_allclose(run.q[:, 0], expected[:, 0], rtol=0.0, atol=20.0 * rtol)
+    np.testing.assert_allclose(run.v[:, 0], expected[:, 1], rtol=0.0, atol=100.0 * rtol)
+    assert run.stats.steps < 300
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_driven_stiff_mechanisms_follow_their_reduced_equations(backend: str) -> None:
+    tau, t_end = 1e-6, 0.2
+    mechanism = bushed_four_bar(tau)
+    drive = srm.Drive(srm.ConstantSpeed(float(mechanism.v0[0])), "crank")
+    run = srm.simulate(replace(mechanism, drives=(drive,)), t_end, rtol=1e-7, backend=backend)
+    assert run.settings.stiff
+    expected = driven_reference(mechanism, tau, t_end)
+    np.testing.assert_allclose(end_of(run)[:3], expected, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_friction_that_changes_its_direction_is_resolved(backend: str) -> None:
+    """A pendulum, at rest at the start, that turns back twice, v_s = 1e-4, and when it does."""
+    F, speed = 0.2, 1e-4
+    mechanism = rubbing("simple_pendulum", F, speed)
+    turning_back = srm.Event(lambda t, q, v: v[0])
+    run = srm.simulate(mechanism, 2.5, rtol=1e-7, events=turning_back, backend=backend)
+    model = mechanism.model
+    data = model.createData()
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        load = pin.computeGeneralizedGravity(model, data, y[:1])[0]
+        return [y[1], -load - F * np.tanh(y[1] / speed)]
+
+    start = [mechanism.q0[0], mechanism.v0[0]]
+    reference = solve_ivp(
+        field, (0.0, 2.5), start, "Radau", rtol=1e-9, atol=1e-11, events=lambda t, y: y[1]
+    )
+    assert run.t_events is not None
+    found = run.t_events[0]
+    assert len(found) == 2
+    np.testing.assert_allclose(found, reference.t_events[0][1:], rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(end_of(run), reference.y[:, -1], rtol=0.0, atol=1e-5)
+
+
 # Both backends
 
 
@@ -181,6 +271,36 @@ def test_kernel_and_reference_make_the_same_steps(name: str, tableau: str) -> No
     times = np.linspace(0.0, float(kernel.t[-1]), 41)
     for read, other in zip(kernel(times), reference(times)):
         np.testing.assert_allclose(read, other, rtol=0.0, atol=2e-4)
+
+
+# Sweeps and the command line
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_sweeps_make_stiff_runs_as_single_runs_do(tableau: str) -> None:
+    mechanism = bushed_four_bar(1e-6)
+    cases = [{"q0": mechanism.q0, "v0": factor * mechanism.v0} for factor in (1.0, 0.5)]
+    swept = srm.sweep(
+        mechanism, cases, 0.1, tableau=tableau, measure=lambda run: {"q": run.q[-1, 1]}
+    )
+    for case, own in zip(cases, swept.table["q"]):
+        start = mechanism.with_state(**case)
+        assert own == srm.simulate(start, 0.1, tableau=tableau).q[-1, 1]
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_the_command_line_takes_the_tableaus_for_stiff_problems(
+    tableau: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "run.npz"
+    shown = command(
+        "simulate", "flyball_governor", "--t-end", 0.1, "--tableau", tableau, "--out", out
+    )
+    saved = srm.load_solution(out)
+    own = srm.simulate(srm.load("flyball_governor"), 0.1, tableau=tableau)
+    assert saved.settings == own.settings
+    assert np.array_equal(saved.q, own.q)
+    assert ("Stiff, with steps of rodas5p" in shown) == (tableau == "auto")
 
 
 # What runs say

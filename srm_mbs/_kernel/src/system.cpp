@@ -373,7 +373,40 @@ int System::resolve_laws() {
         for (std::size_t i = 0; i < factors->size(); ++i)
             if ((*factors)[i] != 0.0) passive[i] = true;
     laws_.resolve(data_.forces, passive);
-    return laws_.count();
+    lawful_.clear();
+    lawless_.clear();
+    joined_.clear();
+    if (!closed_ || laws_.count() <= nv - structural_rank()) return laws_.count();
+    for (const ForceElement& e : data_.forces)
+        (e.kind == ForceKind::wrench || e.kind == ForceKind::joint_torque ? lawless_ : lawful_)
+            .push_back(e);
+    if (lawful_.empty()) return laws_.count();
+    joined_.resize(nv);
+    laws_.join(nv);
+    return nv;
+}
+
+// The forces of joined laws, or what acts in their place, and those of the other elements.
+void System::joined_forces(double t, const double* q) {
+    auto& w = *work_;
+    for (int i = 0; i < nv; ++i) {
+        joined_[i] = data_.damping.empty() ? 0.0 : -data_.damping[i] * v_[i];
+        if (!data_.friction.empty())
+            joined_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    }
+    add_forces(lawful_, data_.coincident, w, t, q, v_.data(), bushings_, joined_.data(), nullptr);
+    add_forces(lawless_, data_.coincident, w, t, q, v_.data(), bushings_, f_.data(), nullptr);
+    const double* acting = laws_.applied ? laws_.applied : joined_.data();
+    for (int i = 0; i < nv; ++i) f_[i] += acting[i];
+}
+
+// What closures leave of them: M (1 - P) M^-1 times the forces.
+void System::joined_values() {
+    std::copy(joined_.begin(), joined_.end(), white_.begin());
+    projection_->whiten_force(white_.data());
+    projection_->remove_normal(white_.data());
+    projection_->unwhiten(white_.data());
+    mass_times(white_.data(), laws_.values.data());
 }
 
 // The laws of coordinates, as far as they are damping and friction; applied ones act.
@@ -460,7 +493,8 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     std::copy(state + nq, state + nq + nv, w.v.data());
     std::copy(state + nq, state + nq + nv, v_.begin());
     std::fill(f_.begin(), f_.end(), 0.0);
-    if (!data_.damping.empty() && !laws_.applied)
+    const bool joined = tracks_laws_ && !joined_.empty();
+    if (!data_.damping.empty() && !laws_.applied && !joined)
         for (int i = 0; i < nv; ++i) f_[i] = -data_.damping[i] * v_[i];
     if (controller_) {
         controller_(t, state, state + nq, acted_.data());
@@ -468,11 +502,11 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     if (const double* force = held_force(t))
         for (int i = 0; i < nv; ++i) f_[i] += force[i];
-    if (!laws_.applied)
+    if (!laws_.applied && !joined)
         for (std::size_t i = 0; i < data_.friction.size(); ++i)
             f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
-    if (laws) passive_forces();
+    if (laws && !joined) passive_forces();
     if (!closed_ && laws && nv <= one_pass_size) {
         // The one pass over the tree that closures have costs less than three.
         pinocchio_model::compute_terms(w);
@@ -503,13 +537,16 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
-    if (!data_.forces.empty())
+    if (joined)
+        joined_forces(t, state);
+    else if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                    laws);
     update_closures(state, true);
     update_drives(t, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);
+    if (joined) joined_values();
     predicted_ = false;
     if (!p.rank_deficient || zone.history == nullptr) return;
     predicted_ = zone.predicts && zone.history->predict_near(t, prediction_.data());

@@ -209,7 +209,8 @@ public:
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
     // The laws of forces in linearly implicit steps: their number; their values, which evaluations
-    // find while they are tracked; what acts in their place, or, if null, they themselves.
+    // find while they are tracked; what acts in their place, or, if null, they themselves.  More
+    // laws than degrees of freedom are one: what closures leave of their generalised forces.
     int resolve_laws();
     void track_laws(bool tracked) {
         tracks_laws_ = tracked;
@@ -244,7 +245,12 @@ private:
     double first_ = -std::numeric_limits<double>::infinity();
     double last_ = std::numeric_limits<double>::infinity();
     void passive_forces();
+    void joined_forces(double t, const double* q);
+    void joined_values();
     ForceLaws laws_;
+    // Elements with laws, and the others, where the laws are joined.
+    std::vector<ForceElement> lawful_, lawless_;
+    std::vector<double> joined_;  // (nv,), generalised forces of joined laws; empty: they are not
     bool tracks_laws_ = false;
     std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;

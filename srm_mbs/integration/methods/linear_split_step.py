@@ -18,6 +18,8 @@ of its own: 0 = F(q, v) - y is linearised like the other equations (the same ref
 stages evaluate the forces with their own y, and what is nonlinear no longer contains c.  With
 L = dF/d delta and W = dD/dy the full J is that with y held, plus W L; what a stage's law lacks,
 r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) + L (K + w) - w_y.
+More laws than degrees of freedom are one, y = M (1 - P) M^-1 N F: closures take up the rest, which
+may grow with c.
 
 Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
 only stages of motions that linger next to a singular configuration are not solved by nodes of the

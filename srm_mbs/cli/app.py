@@ -109,7 +109,7 @@ def simulate(
         str | None,
         option(
             "NAME",
-            "Runge-Kutta scheme of the method.",
+            "Runge-Kutta scheme of the method; auto is dop853, and rodas5p where forces are stiff.",
             show_default="the method's: auto with psrm, tvd32 with srm",
         ),
     ] = None,

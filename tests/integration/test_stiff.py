@@ -29,6 +29,7 @@ from tests.support.stiff import (
 )
 
 BACKENDS = ("kernel", "python")
+SLOW_PYTHON = ("kernel", pytest.param("python", marks=pytest.mark.stress))
 
 
 def end_of(solution: srm.Solution) -> FloatArray:
@@ -147,7 +148,7 @@ def test_undamped_stiff_springs_stay_with_explicit_steps() -> None:
         assert np.array_equal(run.q, own.q)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
 def test_the_cost_does_not_grow_with_forces_that_closures_take_up(backend: str) -> None:
     """A bushing with two directions on one degree of freedom: across the path of its point the
     force is proportional to the damping, and no motion follows from it."""
@@ -202,7 +203,7 @@ def test_driven_stiff_mechanisms_follow_their_reduced_equations(backend: str) ->
     np.testing.assert_allclose(end_of(run)[:3], expected, rtol=0.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
 def test_friction_that_changes_its_direction_is_resolved(backend: str) -> None:
     """A pendulum, at rest at the start, that turns back twice, v_s = 1e-4, and when it does."""
     F, speed = 0.2, 1e-4

@@ -80,20 +80,40 @@ def bushed_forces(
     return forces
 
 
+def differenced(field: Callable[[float, FloatArray], Any]) -> Callable[..., FloatArray]:
+    """The Jacobian (n, n) of a field by one-sided differences.  The steps of SciPy's own grow
+    without limit in coordinates on which nothing depends."""
+
+    def jacobian(t: float, y: FloatArray) -> FloatArray:
+        here = np.asarray(field(t, y))
+        steps = 2.0**-26 * np.maximum(1.0, np.abs(y))
+        columns = [np.asarray(field(t, y + row)) - here for row in np.diag(steps)]
+        return np.column_stack(columns) / steps
+
+    return jacobian
+
+
 def by_radau(
     field: Callable[[float, FloatArray], Any], start: Any, times: Any, rtol: float = 1e-10
 ) -> FloatArray:
     """States (k, n) of y' = field(t, y) at ``times`` (k,) s."""
     run = solve_ivp(
-        field, (0.0, times[-1]), start, "Radau", t_eval=times, rtol=rtol, atol=0.1 * rtol
+        field,
+        (0.0, times[-1]),
+        start,
+        "Radau",
+        t_eval=times,
+        rtol=rtol,
+        atol=0.1 * rtol,
+        jac=differenced(field),
     )
     assert run.success
     states: FloatArray = run.y.T
     return states
 
 
-def bushed_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> FloatArray:
-    """Its state at ``t_end`` (s): Radau on Pinocchio's aba."""
+def bushed_field(mechanism: srm.Mechanism, tau: float) -> Callable[[float, FloatArray], FloatArray]:
+    """The derivative of its state (q, v), from Pinocchio's aba."""
     model = mechanism.model
     data, forces = model.createData(), bushed_forces(mechanism, tau)
 
@@ -101,7 +121,13 @@ def bushed_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> Floa
         q, v = y[: model.nq], y[model.nq :]
         return np.concatenate([v, pin.aba(model, data, q, v, forces(q, v))])
 
-    return by_radau(field, np.concatenate([mechanism.q0, mechanism.v0]), [t_end])[0]
+    return field
+
+
+def bushed_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> FloatArray:
+    """Its state at ``t_end`` (s), by Radau."""
+    start = np.concatenate([mechanism.q0, mechanism.v0])
+    return by_radau(bushed_field(mechanism, tau), start, [t_end])[0]
 
 
 def driven_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> FloatArray:

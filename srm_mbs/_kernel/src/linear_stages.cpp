@@ -82,6 +82,7 @@ void LinearStages::linearise(double t, double h, const double* state,
     rate_at(t, state, rate_.data());
     laws_ = system_.law_values();
     applied_ = laws.empty() ? laws_ : laws;
+    system_.law_accelerations(W_.data());
     system_.apply_laws(m ? applied_.data() : nullptr);
     std::fill(delta_.begin(), delta_.end(), 0.0);
     for (int j = 0; j < n; ++j) {
@@ -111,16 +112,6 @@ void LinearStages::linearise(double t, double h, const double* state,
         for (int i = 0; i < n; ++i)
             by_time_[i] =
                 (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
-    }
-    // Accelerations are linear in the laws that act.
-    const double change = std::max(1.0, largest(applied_.data(), m));
-    for (int k = 0; k < m; ++k) {
-        const double before = applied_[k];
-        applied_[k] += change;
-        rate_at(t, state, probe_.data());
-        applied_[k] = before;
-        for (int i = 0; i < nv; ++i)
-            W_[k * nv + i] = (probe_[nv + i] - rate_[nv + i]) / change;
     }
     for (int j = 0; j < n; ++j) {
         double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];

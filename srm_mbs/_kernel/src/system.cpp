@@ -409,6 +409,57 @@ void System::joined_values() {
     mass_times(white_.data(), laws_.values.data());
 }
 
+void System::factorise_mass() {
+    factors_.resize(static_cast<std::size_t>(nv) * nv);
+    pivots_.resize(nv);
+    const auto& M = work_->data.M;  // the upper triangle
+    for (int j = 0; j < nv; ++j)
+        for (int i = 0; i <= j; ++i) factors_[j * nv + i] = factors_[i * nv + j] = M(i, j);
+    if (!lu_factor(factors_.data(), nv, pivots_.data()))
+        throw EvaluationError{Failure::acceleration};
+}
+
+void System::law_accelerations(double* out) {
+    const int m = laws_.count();
+    auto& w = *work_;
+    const double* const applied = laws_.applied;
+    std::vector<double> unit(m), none(nv), force(nv);
+    const auto forces_with = [&](std::vector<double>& tau) {
+        laws_.applied = unit.data();
+        add_forces(data_.forces, data_.coincident, w, 0.0, w.q.data(), v_.data(), bushings_,
+                   tau.data(), &laws_);
+    };
+    if (!closed_ && nv > one_pass_size) {
+        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        factorise_mass();
+    }
+    if (joined_.empty()) forces_with(none);
+    for (int k = 0; k < m; ++k) {
+        std::fill(force.begin(), force.end(), 0.0);
+        unit[k] = 1.0;
+        if (joined_.empty()) {
+            forces_with(force);
+            for (int i = 0; i < nv; ++i)
+                force[i] += (laws_.of_coordinate(i) == k ? 1.0 : 0.0) - none[i];
+        } else {
+            force[k] = 1.0;
+        }
+        unit[k] = 0.0;
+        double* const a = out + static_cast<std::ptrdiff_t>(k) * nv;
+        if (closed_) {
+            projection_->whiten_force(force.data());
+            std::copy(force.begin(), force.end(), a);
+            projection_->unwhiten(a);
+            normal_part(a, force.data());
+            for (int i = 0; i < nv; ++i) a[i] -= force[i];
+        } else {
+            std::copy(force.begin(), force.end(), a);
+            lu_solve(factors_.data(), nv, pivots_.data(), a);
+        }
+    }
+    laws_.applied = applied;
+}
+
 // The laws of coordinates, as far as they are damping and friction; applied ones act.
 void System::passive_forces() {
     for (int i = 0; i < nv; ++i) {
@@ -513,12 +564,8 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         for (int i = 0; i < nv; ++i) rate_[i] = f_[i] - w.data.nle[i];
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, rate_.data(),
                        laws);
-        double M[one_pass_size * one_pass_size];
-        int pivots[one_pass_size];
-        for (int j = 0; j < nv; ++j)
-            for (int i = 0; i <= j; ++i) M[j * nv + i] = M[i * nv + j] = w.data.M(i, j);
-        if (!lu_factor(M, nv, pivots)) throw EvaluationError{Failure::acceleration};
-        lu_solve(M, nv, pivots, rate_.data());
+        factorise_mass();
+        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }

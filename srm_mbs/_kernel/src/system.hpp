@@ -218,6 +218,8 @@ public:
     }
     void apply_laws(const double* values) { laws_.applied = values; }
     const std::vector<double>& law_values() const { return laws_.values; }
+    // Derivatives (nv, count) of the accelerations by the laws that act, at the stage evaluated last.
+    void law_accelerations(double* out);
     bool has_friction() const { return !data_.friction.empty(); }
     // Error of the rate v of a coordinate from which its friction is another; infinite without.
     double friction_tolerance(int i, double v) const;
@@ -247,10 +249,13 @@ private:
     void passive_forces();
     void joined_forces(double t, const double* q);
     void joined_values();
+    void factorise_mass();
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;
     std::vector<double> joined_;  // (nv,), generalised forces of joined laws; empty: they are not
+    std::vector<double> factors_;  // (nv, nv), of M of an open tree
+    std::vector<int> pivots_;
     bool tracks_laws_ = false;
     std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;

@@ -14,6 +14,10 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.methods.base import ErrorNorm, Linearisation
+from srm_mbs.integration.methods.linear_split_step import LinearSplitStep, linearised
+from srm_mbs.integration.methods.tableaus import get_tableau
 from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
@@ -66,6 +70,65 @@ def test_stiff_forces_of_a_controller_leave_at_least_order_four(rate: float) -> 
         errors.append(abs(run.q[:, 0] - np.sin(run.t)).max())
     assert errors[-1] < 1e-5
     assert fitted_order(steps, errors) >= 3.9
+
+
+# Linearisation
+
+ROBOTS = Path(__file__).parents[1] / "data" / "robots"
+
+
+def coupled_panda() -> srm.Mechanism:
+    """An arm with damping, friction and a spring, whose first joints are coupled."""
+    arm = srm.load(ROBOTS / "example_robot_data" / "panda.urdf")
+    model, names = arm.model.copy(), arm.joint_names
+    rubs = np.arange(model.nv) < 5
+    model.damping, model.friction = np.where(rubs, 30.0, 0.0), np.where(rubs, 5.0, 0.0)
+    links = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
+    spring = srm.SpringDamper(
+        srm.Anchor(links[1]), srm.Anchor(links[-1]), stiffness=2e3, damping=5.0, rest_length=0.2
+    )
+    gear = srm.LoopClosure("coupling", joints=(names[0], names[1]), ratio=0.5)
+    return replace(arm, model=model, forces=(spring,), loops=(gear,))
+
+
+@pytest.mark.parametrize(
+    "mechanism",
+    [
+        lambda: srm.load(ROBOTS / "dm_control" / "humanoid.xml"),
+        lambda: srm.load(ROBOTS / "example_robot_data" / "simple_humanoid.urdf"),
+        coupled_panda,
+    ],
+    ids=["free joint, damped", "composite joints", "coupling, spring, friction"],
+)
+def test_closed_form_derivatives_are_those_of_differences(
+    mechanism: Callable[[], srm.Mechanism], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = make_system(mechanism())
+    n = system.tangent_size
+    norm = ErrorNorm(np.full(n, 1e-6), 1e-6)
+    random = 0.3 * np.random.default_rng(0).standard_normal(n)
+    start = np.concatenate([system.mechanism.q0, system.mechanism.v0])
+    state = system.retract(start, random)
+    memory = LinearSplitStep(get_tableau("rodas5p")).start(system, 0.0, state, norm)
+
+    def found() -> Linearisation:
+        return linearised(system, 0.0, 1e-3, state, memory, norm, None)
+
+    closed = found()
+    assert system.derivatives(state, closed.rate[system.nv :]) is not None
+    monkeypatch.setattr(type(system), "derivatives", lambda *_: None)
+    differences = found()
+    for name in ("J", "by_laws", "by_coordinates"):
+        own, other = getattr(closed, name), getattr(differences, name)
+        np.testing.assert_allclose(
+            own, other, rtol=1e-6, atol=1e-6 * np.abs(other).max(initial=1.0)
+        )
+
+
+def test_a_linearisation_in_closed_form_takes_no_evaluation_for_each_coordinate() -> None:
+    run = srm.simulate(coupled_panda(), 0.2, tableau="rodas5p")
+    tried = run.stats.steps + run.stats.rejected
+    assert run.stats.evaluations < 12 * tried
 
 
 # Accuracy and cost
@@ -251,6 +314,7 @@ def cases() -> dict[str, tuple[srm.Mechanism, dict[str, Any]]]:
         "friction": (rubbing("four_bar", 2.0, 1e-3), {"t_end": 6.0, "rtol": 1e-8}),
         "governor": (srm.load("flyball_governor"), {}),
         "controller": (follower_mechanism, {"controller": force}),
+        "coupling": (coupled_panda(), {"t_end": 0.02}),
         "sampled": (bushed_four_bar(1e-6), {"controller": swaying, "sample_time": 5e-2}),
         "user force": (replace(driven, forces=(own,)), {"t_end": 0.1}),
         "Lie group": (replace(ring, model=damped), {}),

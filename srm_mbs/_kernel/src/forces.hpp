@@ -50,6 +50,9 @@ struct ForceElement {
     void check() const;
 };
 
+// Whether an element acts at points of links, not on the coordinate of a joint.
+bool acts_between_links(const ForceElement& element);
+
 // Whether an element is a bushing that has a moment.
 bool turns(const ForceElement& element);
 

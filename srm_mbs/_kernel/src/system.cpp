@@ -9,6 +9,7 @@
 #include <pinocchio/algorithm/joint-configuration.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea-derivatives.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
 #include "errors.hpp"
@@ -188,6 +189,7 @@ System::System(const void* model, SystemData data, Controller controller)
     nv = work_->model.nv;
     closed_ = data_.structural_rank > 0;
     flat_ = nq == nv;
+    between_links_ = std::any_of(data_.forces.begin(), data_.forces.end(), acts_between_links);
     if (closed_)
         projection_ = make_projection(data_.structural_rank, data_.sigma_ref, pattern(),
                                       // A joint that mimics another adds entries off the tree.
@@ -535,13 +537,8 @@ void System::tree_terms(const double* state) {
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
 }
 
-void System::evaluate(double t, const double* state, const ZoneView& zone) {
-    ++evaluations;
-    t = std::min(std::max(t, first_), last_);
-    if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
-    auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
-    std::copy(state + nq, state + nq + nv, w.v.data());
+// The velocities, and the forces along coordinates but those of elements.
+void System::coordinate_forces(double t, const double* state) {
     std::copy(state + nq, state + nq + nv, v_.begin());
     std::fill(f_.begin(), f_.end(), 0.0);
     const bool joined = tracks_laws_ && !joined_.empty();
@@ -556,8 +553,65 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     if (!laws_.applied && !joined)
         for (std::size_t i = 0; i < data_.friction.size(); ++i)
             f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    if (tracks_laws_ && !joined) passive_forces();
+}
+
+void System::applied_forces(double t, const double* state, double* out) {
+    auto& w = *work_;
+    t = std::min(std::max(t, first_), last_);
+    coordinate_forces(t, state);
+    if (!data_.forces.empty()) {
+        if (between_links_) {
+            move_bodies(state);
+            pinocchio::computeJointJacobians(w.model, w.data);
+        }
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                   tracks_laws_ ? &laws_ : nullptr);
+    }
+    std::copy(f_.begin(), f_.end(), out);
+}
+
+// With ID the inverse dynamics, N the M-orthonormal normals of closures whose G is constant, and
+// A = M^-1 - N N^T: da = A (df - dID).
+bool System::derivatives(const double* state, const double* a, double* by_forces, double* by_q,
+                         double* by_v) {
+    using Matrix = Eigen::MatrixXd;
+    auto& w = *work_;
+    if (!data_.closures.empty() || !joined_.empty() || rank_deficient() || !w.model.mimicking_joints.empty() ||
+        !w.model.gravity.angular().isZero(0.0))
+        return false;
+    Matrix M = Matrix::Zero(nv, nv), dq(M), dv(M), N;
+    if (closed_) {
+        N.resize(nv, rank());
+        projection_->normals(N.data());
+    }
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    std::copy(a, a + nv, w.tau.data());
+    pinocchio::computeRNEADerivatives(w.model, w.data, Argument(w.q), Argument(w.v),
+                                      Argument(w.tau), Eigen::Ref<Matrix>(dq),
+                                      Eigen::Ref<Matrix>(dv), Eigen::Ref<Matrix>(M));
+    const Eigen::LLT<Matrix, Eigen::Upper> factors(M);
+    if (factors.info() != Eigen::Success) throw EvaluationError{Failure::acceleration};
+    Eigen::Map<Matrix> A(by_forces, nv, nv);
+    A.setIdentity();
+    factors.solveInPlace(A);
+    if (closed_) A.noalias() -= N * N.transpose();
+    Eigen::Map<Matrix>(by_q, nv, nv).noalias() = -A * dq;
+    Eigen::Map<Matrix>(by_v, nv, nv).noalias() = -A * dv;
+    return true;
+}
+
+void System::evaluate(double t, const double* state, const ZoneView& zone) {
+    ++evaluations;
+    t = std::min(std::max(t, first_), last_);
+    if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    coordinate_forces(t, state);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
-    if (laws && !joined) passive_forces();
+    const bool joined = laws && !joined_.empty();
     if (!closed_ && laws && nv <= one_pass_size) {
         // The one pass over the tree that closures have costs less than three.
         pinocchio_model::compute_terms(w);

@@ -220,6 +220,17 @@ public:
     const std::vector<double>& law_values() const { return laws_.values; }
     // Derivatives (nv, count) of the accelerations by the laws that act, at the stage evaluated last.
     void law_accelerations(double* out);
+    // Number of the law of a coordinate, or -1.
+    int law_of_coordinate(int i) const { return laws_.of_coordinate(i); }
+    // At the stage evaluated last, with the accelerations a (nv,): their derivatives (nv, nv), column
+    // by column, by the forces, and by the chart coordinates while the forces are held.  False if
+    // only differences give them.  Other terms of the stage are lost.
+    bool derivatives(const double* state, const double* a, double* by_forces, double* by_q,
+                     double* by_v);
+    // All forces (nv,) but those of inertia, gravity and closures, and the values of the laws.
+    void applied_forces(double t, const double* state, double* out);
+    // Whether the laws, each of its own coordinate, are all that makes them depend on the state.
+    bool separate_forces() const { return !controller_ && !between_links_; }
     bool has_friction() const { return !data_.friction.empty(); }
     // Error of the rate v of a coordinate from which its friction is another; infinite without.
     double friction_tolerance(int i, double v) const;
@@ -247,6 +258,7 @@ private:
     double first_ = -std::numeric_limits<double>::infinity();
     double last_ = std::numeric_limits<double>::infinity();
     void passive_forces();
+    void coordinate_forces(double t, const double* state);
     void joined_forces(double t, const double* q);
     void joined_values();
     void factorise_mass();
@@ -262,7 +274,7 @@ private:
     Controller controller_;
     std::unique_ptr<pinocchio_model::Workspace> work_;
     std::unique_ptr<Projection> projection_;
-    bool closed_, flat_, predicted_ = false;
+    bool closed_, flat_, between_links_, predicted_ = false;
     std::vector<BushingStep> bushings_;  // in the step that is made
     std::vector<double> g_, bias_, pushed_, f_, v_, rate_, prediction_, white_, acted_;
 };

@@ -12,11 +12,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
-from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import (
     AssemblyError,
@@ -126,38 +124,12 @@ def _without_locked(
     return lock_joints(model, list(description.lock), frozen), q, v, guess
 
 
-def friction_time(model: pin.Model, q: FloatArray, friction_speed: float) -> float:
-    """Shortest time (s) in which friction stops a slow joint of the open tree at q (nq,).
-
-    1 over the largest eigenvalue of M^-1 diag(F)/v_s, with the friction speed v_s (rad/s, m/s);
-    infinite without friction.  Steps of explicit schemes stay below a few times it while a joint
-    rests.
-
-    Raises
-    ------
-    EvaluationError
-        If the mass matrix is not positive definite.
-    """
-    rough = np.flatnonzero(model.friction)
-    if not rough.size:
-        return np.inf
-    U = cholesky(pin.crba(model, workspace(model), q))
-    roots = np.zeros((model.nv, rough.size), order="F")
-    roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / friction_speed)
-    return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)
-
-
-def _friction_note(model: pin.Model, q: FloatArray, friction_speed: float) -> tuple[str, ...]:
-    try:
-        time = friction_time(model, q, friction_speed)
-    except EvaluationError:  # in gimbal lock, which is reported elsewhere
-        time = np.inf
-    if time == np.inf:
+def _friction_note(model: pin.Model, friction_speed: float) -> tuple[str, ...]:
+    if not model.friction.any():
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
-        f"{friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
-        f"{6.0 * time:.0e} s, in proportion to v_s: set it with friction_speed",
+        f"{friction_speed:g} rad/s or m/s: set it with friction_speed",
     )
 
 
@@ -229,7 +201,7 @@ def unassembled(
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(*reading.notes, *built.notes, *_friction_note(model, start, friction_speed)),
+        notes=(*reading.notes, *built.notes, *_friction_note(model, friction_speed)),
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
@@ -271,6 +272,42 @@ def _in_gimbal_lock(source: Source, why: str) -> InputError:
     )
 
 
+ROTOR_INERTIA = 1e-9
+"""Inertia of a rotor on a damped joint without any in one direction, over the composite inertia:
+less than tolerances show, and enough for accelerations to be above rounding."""
+
+
+def _with_rotors(mechanism: Mechanism) -> Mechanism:
+    """The mechanism with rotors on damped joints that move no inertia at the start, and a note.
+
+    Damping d alone determines the motion along such a direction, as for d -> 0 of the inertia.
+    """
+    model, source = mechanism.model, mechanism.source
+    armature, names = np.array(model.armature), []
+    for _ in range(model.njoints):
+        path = None if source is None else source.urdf_path
+        at = undetermined_joint(model, mechanism.q0, path, ROTOR_INERTIA)
+        if at is None:
+            break
+        own = slice(model.idx_vs[at], model.idx_vs[at] + model.nvs[at])
+        if not model.damping[own].all():
+            break
+        if not names:
+            model = model.copy()
+        names.append(model.names[at])
+        composite = np.diag(pin.crba(model, workspace(model), mechanism.q0))
+        armature[own] += 2.0 * ROTOR_INERTIA * composite[own]
+        model.armature = armature
+    if not names:
+        return mechanism
+    note = (
+        f"the inertia that {', '.join(map(repr, names))} moves vanishes in one direction at the "
+        f"start: damping determines the motion there, and a rotor of {2.0 * ROTOR_INERTIA:g} of "
+        "what the joint carries is added; give the links at its end a moment of inertia"
+    )
+    return replace(mechanism, model=model, notes=(*mechanism.notes, note))
+
+
 def assembled(reading: Reading) -> Mechanism:
     """The mechanism with its loops closed.
 
@@ -297,6 +334,7 @@ def assembled(reading: Reading) -> Mechanism:
         raise
     except EvaluationError as error:
         raise _in_gimbal_lock(source, str(error)) from error
+    mechanism = _with_rotors(mechanism)
     joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
     if joint is not None:
         raise _in_gimbal_lock(

@@ -481,3 +481,44 @@ def test_a_stiff_dae_is_solved() -> None:
     assert run.success
     assert abs(run.x[-1, 0] - np.cos(2.0)) < 1e-5
     assert run.stats.steps < 500
+
+
+# Directions without inertia
+
+HEAD = """<robot name="head"><link name="base"/><link name="yoke"/>
+<link name="head"><inertial><origin xyz="0.02 0 0.1"/><mass value="1.3"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="roll" type="continuous"><parent link="base"/><child link="yoke"/>
+<axis xyz="1 0 0"/>{dynamics}</joint>
+<joint name="yaw" type="continuous"><parent link="yoke"/><child link="head"/>
+<axis xyz="0 0 1"/>{dynamics}</joint></robot>"""
+"""A point mass in the plane of two axes: it moves along one direction only."""
+
+
+def test_damping_moves_a_joint_that_has_no_inertia_at_the_start(tmp_path: Path) -> None:
+    (tmp_path / "head.urdf").write_text(HEAD.format(dynamics='<dynamics damping="0.5"/>'))
+    path = tmp_path / "head.toml"
+    path.write_text('format = 1\nurdf = "head.urdf"\ngravity = [3.0, 4.0, -9.81]\n')
+    mechanism = srm.load(path)
+    (note,) = mechanism.notes
+    assert "'roll' moves vanishes in one direction" in note
+    run = srm.simulate(mechanism, 1.0, rtol=1e-7)
+    model = mechanism.model.copy()
+    model.armature = np.full(2, 1e-8)
+    data = model.createData()
+
+    def field(t: float, y: FloatArray) -> FloatArray:
+        q, v = y[:2], y[2:]
+        q = np.ravel(np.column_stack([np.cos(q), np.sin(q)]))
+        return np.concatenate([v, pin.aba(model, data, q, v, -0.5 * v)])
+
+    reference = solve_ivp(field, (0.0, 1.0), np.zeros(4), method="Radau", rtol=1e-9, atol=1e-11)
+    angles = [run.joint(name)[0][-1] for name in ("roll", "yaw")]
+    np.testing.assert_allclose(angles, reference.y[:2, -1], rtol=0.0, atol=1e-6)
+
+
+def test_without_damping_such_a_start_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "head.urdf"
+    path.write_text(HEAD.format(dynamics=""))
+    with pytest.raises(srm.InputError, match="the joint 'roll' moves no inertia there"):
+        srm.load(path)

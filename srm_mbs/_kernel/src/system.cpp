@@ -577,9 +577,8 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
                          double* by_v) {
     using Matrix = Eigen::MatrixXd;
     auto& w = *work_;
-    if (!data_.closures.empty() || !joined_.empty() || rank_deficient() || !w.model.mimicking_joints.empty() ||
-        !w.model.gravity.angular().isZero(0.0))
-        return false;
+    if (!data_.closures.empty() || !joined_.empty() || rank_deficient()) return false;
+    if (!w.model.mimicking_joints.empty() || !w.model.gravity.angular().isZero(0.0)) return false;
     Matrix M = Matrix::Zero(nv, nv), dq(M), dv(M), N;
     if (closed_) {
         N.resize(nv, rank());
